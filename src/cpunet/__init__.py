@@ -1,0 +1,36 @@
+"""cpunet: make simulated germanium-detector pulses look measured.
+
+The package is a row of rooms through which data flow one way:
+``pulses`` (containers, files, preparation) → ``networks`` → ``training`` →
+``translation`` → ``analysis`` → ``jobs`` → ``cli``.  See ``docs/design.md``.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+__version__ = version("cpunet")
+__all__ = ["IREN", "REN", "Pulses", "__version__", "open_pulses"]
+
+if TYPE_CHECKING:
+    from cpunet.pulses.container import Pulses
+    from cpunet.pulses.reading import open_pulses
+    from cpunet.translation.translator import IREN, REN
+
+
+def __getattr__(name: str) -> Any:
+    # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
+    if name in ("REN", "IREN"):
+        from cpunet.translation import translator
+
+        return getattr(translator, name)
+    if name == "Pulses":
+        from cpunet.pulses.container import Pulses
+
+        return Pulses
+    if name == "open_pulses":
+        from cpunet.pulses.reading import open_pulses
+
+        return open_pulses
+    raise AttributeError(f"module 'cpunet' has no attribute {name!r}")

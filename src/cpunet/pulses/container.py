@@ -1,0 +1,133 @@
+"""One container for a set of pulses, whatever file or simulator they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Pulses:
+    """A set of equally long, equally sampled pulses and what is known of each.
+
+    Parameters
+    ----------
+    waveforms
+        Float32 array of shape ``(n, length)``: ADC counts for raw traces, units
+        of the full charge for simulated and prepared pulses.
+    dt_ns
+        Sampling period in ns, the same for all pulses.
+    energy_kev
+        Energy of each pulse in keV; NaN where it is not known.
+    event_number
+        The source's own number of each event.
+    peak
+        Name of the gamma line each energy falls on (``"FEP"``, …), ``""`` for none.
+
+    Raises
+    ------
+    CpunetError
+        If shapes disagree or the sampling period is not a positive number.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pulses = Pulses.of(np.zeros((3, 8)), dt_ns=16, energy_kev=[1592.5, 2103.5, 2614.5])
+    >>> len(pulses), pulses.length
+    (3, 8)
+    >>> pulses[pulses.energy_kev > 2000].event_number
+    array([1, 2])
+    """
+
+    waveforms: FloatArray
+    dt_ns: float
+    energy_kev: npt.NDArray[np.float64]
+    event_number: npt.NDArray[np.int64]
+    peak: npt.NDArray[np.str_]
+
+    def __post_init__(self) -> None:
+        if self.waveforms.ndim != 2:
+            raise CpunetError(
+                f"waveforms have shape {self.waveforms.shape}; expected (pulses, samples)"
+            )
+        n = len(self.waveforms)
+        for name in ("energy_kev", "event_number", "peak"):
+            shape = getattr(self, name).shape
+            if shape != (n,):
+                raise CpunetError(f"{name} has shape {shape} beside {n} waveforms")
+        if not (np.isfinite(self.dt_ns) and self.dt_ns > 0):
+            raise CpunetError(f"the sampling period is {self.dt_ns} ns; expected more than 0")
+
+    @classmethod
+    def of(
+        cls,
+        waveforms: npt.ArrayLike,
+        *,
+        dt_ns: float,
+        energy_kev: npt.ArrayLike | None = None,
+        event_number: npt.ArrayLike | None = None,
+        peak: npt.ArrayLike | None = None,
+    ) -> Pulses:
+        """Build a set from anything array-like, with defaults for what is not known."""
+        values = np.asarray(waveforms, dtype=np.float32)
+        n = len(values)
+        return cls(
+            waveforms=values,
+            dt_ns=float(dt_ns),
+            energy_kev=(
+                np.full(n, np.nan) if energy_kev is None else np.asarray(energy_kev, float)
+            ),
+            event_number=(
+                np.arange(n) if event_number is None else np.asarray(event_number, np.int64)
+            ),
+            peak=np.full(n, "") if peak is None else np.asarray(peak, np.str_),
+        )
+
+    def __len__(self) -> int:
+        return len(self.waveforms)
+
+    @property
+    def length(self) -> int:
+        """Samples per pulse."""
+        return int(self.waveforms.shape[1])
+
+    def __getitem__(self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Pulses:
+        """The pulses of a slice, a mask or a list of rows."""
+        return Pulses(
+            waveforms=self.waveforms[which],
+            dt_ns=self.dt_ns,
+            energy_kev=self.energy_kev[which],
+            event_number=self.event_number[which],
+            peak=self.peak[which],
+        )
+
+    def with_waveforms(self, waveforms: FloatArray) -> Pulses:
+        """The same events with other waveforms."""
+        return replace(self, waveforms=waveforms)
+
+    @classmethod
+    def concatenate(cls, sets: Sequence[Pulses]) -> Pulses:
+        """Join sets of the same length and sampling into one."""
+        if not sets:
+            raise CpunetError("no sets of pulses to join")
+        first = sets[0]
+        for other in sets[1:]:
+            if (other.length, other.dt_ns) != (first.length, first.dt_ns):
+                raise CpunetError(
+                    f"cannot join {other.length} samples of {other.dt_ns} ns "
+                    f"to {first.length} samples of {first.dt_ns} ns"
+                )
+        return cls(
+            waveforms=np.concatenate([s.waveforms for s in sets]),
+            dt_ns=first.dt_ns,
+            energy_kev=np.concatenate([s.energy_kev for s in sets]),
+            event_number=np.concatenate([s.event_number for s in sets]),
+            peak=np.concatenate([s.peak for s in sets]),
+        )

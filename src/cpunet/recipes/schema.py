@@ -1,0 +1,155 @@
+"""Every setting of a run, validated: one small class per room.
+
+The numbers live in the YAML files beside this module; a field without a value
+in the recipe that needs it is an error, and so is one that nobody reads.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Config(BaseModel):
+    """Base of all settings: unknown keys are refused, values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PeakConfig(Config):
+    """A gamma line and the half-width of the energy window around it, in keV."""
+
+    energy_kev: Positive
+    half_width_kev: Positive
+
+
+class PreparationConfig(Config):
+    """From raw trace to the window a network sees (paper, section 3.3).
+
+    Lengths are in samples of the record.  ``max_padding_before`` and
+    ``max_padding_after`` say how many samples of a *measured* window may lie
+    outside its record and be filled with the edge value; simulated pulses are
+    padded without limit, since nothing but charge moves in them.
+    """
+
+    samples_before: Count
+    samples_after: Count
+    align_fraction: Annotated[float, Field(gt=0, le=1)]
+    baseline_samples: Count
+    tail_samples: Count
+    tail_level: Positive
+    decay_fit_samples: Annotated[int, Field(ge=3)]
+    max_padding_before: Annotated[int, Field(ge=0)]
+    max_padding_after: Annotated[int, Field(ge=0)]
+    saturation_run: Count
+
+    @property
+    def length(self) -> int:
+        """Samples of a prepared pulse."""
+        return self.samples_before + self.samples_after
+
+    @model_validator(mode="after")
+    def _fits(self) -> PreparationConfig:
+        if self.baseline_samples >= self.samples_before:
+            raise ValueError("baseline_samples must be fewer than samples_before")
+        if max(self.tail_samples, self.decay_fit_samples) > self.samples_after:
+            raise ValueError("tail_samples and decay_fit_samples must fit in samples_after")
+        return self
+
+
+class CutConfig(Config):
+    """Half-widths of the quality cuts, in robust standard deviations of the data.
+
+    Median and MAD of the set itself give the windows, so that no constant of
+    one detector enters.
+    """
+
+    decay_sigmas: Positive
+    chi2_sigmas: Positive
+    baseline_sigmas: Positive
+
+
+class PunetConfig(Config):
+    """The Positional U-Net (paper, section 2.2.1)."""
+
+    name: Literal["punet"]
+    width: Count
+    dropout: Annotated[float, Field(ge=0, lt=1)]
+
+
+class GruConfig(Config):
+    """The GRU discriminator with attention (paper, section 2.2.2)."""
+
+    name: Literal["gru"]
+    embedding_rows: Annotated[int, Field(ge=2)]
+    embedding_dim: Count
+    hidden: Count
+
+
+class LossConfig(Config):
+    """Weights of the eight losses and of the three windows of the L1 terms."""
+
+    baseline_len: Count
+    rising_edge_len: Count
+    tail_len: Count
+    baseline_weight: NonNegative
+    rising_edge_weight: NonNegative
+    tail_weight: NonNegative
+    cycle_weight: NonNegative
+    identity_weight: NonNegative
+    adversarial_weight: NonNegative
+
+
+class TrainingConfig(Config):
+    """The loop: how long, how fast, how often."""
+
+    iterations: Count
+    decay_start: Annotated[int, Field(ge=0)]
+    batch_size: Annotated[int, Field(ge=2)]
+    rate_generators: Positive
+    rate_discriminators: Positive
+    betas: tuple[float, float]
+    weight_decay: NonNegative
+    max_grad_norm: Positive
+    discriminator_interval: Count
+    log_interval: Count
+    losses: LossConfig
+
+
+class ScoreConfig(Config):
+    """Histograms and resampling of the comparison of two distributions."""
+
+    max_bins: Annotated[int, Field(ge=2)]
+    bootstraps: Annotated[int, Field(ge=2)]
+    drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
+    edge_samples: Count
+
+
+class Recipe(Config):
+    """All that determines a run but its files, its seed and its device."""
+
+    name: str
+    description: str
+    peaks: dict[str, PeakConfig]
+    preparation: PreparationConfig
+    cuts: CutConfig
+    generator: PunetConfig
+    discriminator: GruConfig
+    training: TrainingConfig
+    scores: ScoreConfig
+
+    @model_validator(mode="after")
+    def _windows_cover(self) -> Recipe:
+        losses = self.training.losses
+        covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
+        if covered != self.preparation.length:
+            raise ValueError(
+                f"the loss windows cover {covered} samples, "
+                f"a prepared pulse has {self.preparation.length}"
+            )
+        return self
