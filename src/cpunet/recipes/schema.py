@@ -33,8 +33,9 @@ class PreparationConfig(Config):
 
     Lengths are in samples of the record.  ``max_padding_before`` and
     ``max_padding_after`` say how many samples of a *measured* window may lie
-    outside its record and be filled with the edge value; simulated pulses are
-    padded without limit, since nothing but charge moves in them.
+    outside its record, and are filled with the baseline and with the last value;
+    simulated pulses are padded without limit, since nothing but charge moves in
+    them.  ``saturation_run`` equal samples at the top make a trace saturated.
     """
 
     samples_before: Count
@@ -75,20 +76,33 @@ class CutConfig(Config):
 
 
 class PunetConfig(Config):
-    """The Positional U-Net (paper, section 2.2.1)."""
+    """The Positional U-Net (paper, section 2.2.1).
+
+    ``residual`` makes the network a correction added to its input, zero at the
+    start of the training, instead of having it learn the identity first.
+    """
 
     name: Literal["punet"]
-    width: Count
+    width: Annotated[int, Field(ge=2, multiple_of=2)]
     dropout: Annotated[float, Field(ge=0, lt=1)]
+    residual: bool
 
 
 class GruConfig(Config):
-    """The GRU discriminator with attention (paper, section 2.2.2)."""
+    """The GRU discriminator with attention (paper, section 2.2.2).
+
+    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more
+    make it that many times faster, on the same embedded samples.  The table of
+    vectors spans ``value_range``, or each pulse's own minimum to maximum (the
+    paper's choice, blind to the pulse height) if that is null.
+    """
 
     name: Literal["gru"]
     embedding_rows: Annotated[int, Field(ge=2)]
     embedding_dim: Count
     hidden: Count
+    samples_per_step: Count
+    value_range: tuple[float, float] | None
 
 
 class LossConfig(Config):
@@ -106,7 +120,12 @@ class LossConfig(Config):
 
 
 class TrainingConfig(Config):
-    """The loop: how long, how fast, how often."""
+    """The loop: how long, how fast, how often.
+
+    The generators that are kept are running averages of the trained ones, with
+    ``average_decay`` per iteration (0: the last weights, as in the paper); their
+    batch-norm statistics are taken anew over ``statistics_batches``.
+    """
 
     iterations: Count
     decay_start: Annotated[int, Field(ge=0)]
@@ -117,6 +136,8 @@ class TrainingConfig(Config):
     weight_decay: NonNegative
     max_grad_norm: Positive
     discriminator_interval: Count
+    average_decay: Annotated[float, Field(ge=0, lt=1)]
+    statistics_batches: Count
     log_interval: Count
     losses: LossConfig
 

@@ -1,0 +1,1 @@
+"""Pulses from files, prepared, cut and written again."""

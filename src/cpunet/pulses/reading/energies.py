@@ -1,0 +1,139 @@
+"""Which number is a pulse's energy in keV: a column, another file's, or the amplitude."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.reading.columns import ENERGY_UNITS, Column, require_length, shortened
+
+_USUAL = ("energy_kev", "energy_keV", "energy")
+# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units.
+_NAMED_IN_KEV = re.compile(r"(_cal|kev)$", re.IGNORECASE)
+
+# The first samples of a trace, before any pulse, for the amplitude's baseline.
+_BASELINE_FRACTION = 0.05
+_BASELINE_SAMPLES = 10
+
+
+@dataclass(frozen=True)
+class Energies:
+    """A rule that gives each pulse its energy in keV.
+
+    Parameters
+    ----------
+    description
+        The rule in words, for reports.
+    kev_per_unit
+        Factor from the column's values, or from the amplitude in ADC, to keV;
+        None if energies are not known.
+    column
+        Where the values are read; None to take the amplitude.
+    """
+
+    description: str
+    kev_per_unit: float | None = None
+    column: Column | None = None
+
+    def of(self, start: int, waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Energies in keV of the pulses from row `start` on; NaN where not known."""
+        if self.kev_per_unit is None:
+            return np.full(len(waveforms), np.nan)
+        if self.column is None:
+            return self.kev_per_unit * amplitude(waveforms)
+        values = self.column.read(start, start + len(waveforms))
+        return self.kev_per_unit * np.asarray(values, np.float64)
+
+
+def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Maximum over the mean of the first twentieth (10 samples at least), per trace.
+
+    Examples
+    --------
+    >>> amplitude(np.repeat(np.array([[3, 8]], np.float32), 50, axis=1))
+    array([5.])
+    """
+    n_baseline = max(_BASELINE_SAMPLES, round(_BASELINE_FRACTION * waveforms.shape[1]))
+    baseline = waveforms[:, :n_baseline].mean(axis=1, dtype=np.float64)
+    # A trace of infinities has no amplitude; preparation counts it.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(waveforms.max(axis=1) - baseline)
+
+
+def resolve_energies(
+    path: Path,
+    columns: Mapping[str, Column],
+    *,
+    energy: str | None,
+    kev_per_adc: float | None,
+    n_pulses: int | None,
+) -> Energies:
+    """Choose the rule for a file's energies.
+
+    Without `energy` the column ``energy_kev``, ``energy_keV`` or ``energy`` is
+    taken if it is in energy units, or if `kev_per_adc` calibrates it; else the
+    amplitude times `kev_per_adc`; else energies are not known.  `energy` names
+    another column, or ``FILE:path/to/column``.
+
+    Raises
+    ------
+    CpunetError
+        If the column is not there, has another length than the waveforms, is not
+        in energy units although asked for, or is in keV beside `kev_per_adc`.
+    """
+    if energy is None:
+        usual = next((name for name in _USUAL if name in columns), None)
+        if usual is not None:
+            rule = _calibrated(path, usual, columns[usual], kev_per_adc)
+            if rule is not None:
+                require_length(path, usual, columns[usual], n_pulses)
+                return rule
+        if kev_per_adc is not None:
+            return Energies(f"amplitude x {kev_per_adc:g} keV/ADC", kev_per_adc)
+        found = f" (column {usual} is not in energy units)" if usual else ""
+        return Energies(f"not known{found}")
+    column = _named_column(path, columns, energy)
+    require_length(path, energy, column, n_pulses)
+    rule = _calibrated(path, energy, column, kev_per_adc)
+    if rule is None:
+        units = f"in {column.units}" if column.units else "without units"
+        raise CpunetError(
+            f"{path}: column {energy} is {units}, no energy in keV; "
+            "add --kev-per-adc (1 if it is in keV)"
+        )
+    return rule
+
+
+def _calibrated(
+    path: Path, name: str, column: Column, kev_per_adc: float | None
+) -> Energies | None:
+    units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
+    if units in ENERGY_UNITS:
+        if kev_per_adc is not None:
+            raise CpunetError(
+                f"{path}: column {name} is in {units} already; drop --kev-per-adc"
+            )
+        return Energies(f"column {name} [{units}]", ENERGY_UNITS[units], column)
+    if kev_per_adc is not None:
+        return Energies(f"column {name} x {kev_per_adc:g} keV/ADC", kev_per_adc, column)
+    return None
+
+
+def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Column:
+    if energy in columns:
+        return columns[energy]
+    file, colon, inner = energy.rpartition(":")
+    if not colon:
+        raise CpunetError(
+            f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
+        )
+    # Late, since the LH5 library takes seconds to load and most files do without.
+    from cpunet.pulses.reading.hdf5 import column_of
+
+    return column_of(Path(file), inner)

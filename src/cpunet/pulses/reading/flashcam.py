@@ -1,0 +1,132 @@
+"""Pulses of FlashCam digitiser files (``.fcio``), through the ``fcio`` library."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from fcio import FCIO, Tags, fcio_open
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.reading.columns import MemoryColumn, shortened
+from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+
+
+class FlashCamSource(PulseSource):
+    """The traces of one channel; `table` is its index where there are several.
+
+    Full and sparse events both count; an event without the channel is passed
+    over.  The energy of the digitiser's own filter is not an energy in keV and
+    not read.
+    """
+
+    def __init__(self, options: ReadOptions) -> None:
+        with _opened(options.path) as stream:
+            config = stream.config
+            n_channels = int(config.adcs)
+            length = int(config.eventsamples)
+            period_ns = np.asarray(float(config.sampling_period_ns))
+        self._channel = _channel(options, n_channels)
+        layout = Layout(
+            format="FlashCam",
+            table=str(self._channel),
+            n_pulses=None,
+            length=length,
+            period_name="sampling period",
+            period=MemoryColumn(period_ns, "ns") if period_ns > 0 else None,
+        )
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        waveforms: list[npt.NDArray[np.uint16]] = []
+        numbers: list[int] = []
+        with _opened(self.path) as stream:
+            for trace, number in self._events(stream):
+                waveforms.append(trace)
+                numbers.append(number)
+                if len(numbers) == size:
+                    yield Traces(np.stack(waveforms), np.asarray(numbers))
+                    waveforms, numbers = [], []
+        if numbers:
+            yield Traces(np.stack(waveforms), np.asarray(numbers))
+
+    def _events(self, stream: FCIO) -> Iterator[tuple[npt.NDArray[np.uint16], int]]:
+        # The last record of a cut-off file looks like an event: give each event
+        # only when the next record, or the regular end, has been met.
+        last: tuple[npt.NDArray[np.uint16], int] | None = None
+        any_record = False
+        while stream.get_record():
+            any_record = True
+            if last is not None:
+                yield last
+            last = self._event(stream)
+        # The library calls it an error, too, if nothing follows the configuration.
+        if stream.tag < 0 and any_record:
+            after = "" if last is None else f"event {last[1]}: "
+            raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
+        if last is not None:
+            yield last
+
+    def _event(self, stream: FCIO) -> tuple[npt.NDArray[np.uint16], int] | None:
+        if stream.tag not in (Tags.Event, Tags.SparseEvent):
+            return None
+        event: Any = stream.event
+        rows = np.flatnonzero(event.trace_list == self._channel)
+        if rows.size == 0:
+            return None
+        number = int(event.eventnumber)
+        trace = event.trace[rows[0]].copy()
+        if len(trace) != self.length:
+            raise CpunetError(
+                f"{self.path}: event {number}: {len(trace)} samples, before it {self.length}; "
+                "split the file by length"
+            )
+        return trace, number
+
+
+def _channel(options: ReadOptions, n_channels: int) -> int:
+    known = [str(channel) for channel in range(n_channels)]
+    if options.table is None:
+        if n_channels == 1:
+            return 0
+        raise CpunetError(
+            f"{options.path}: {n_channels} channels ({shortened(known)}); "
+            "choose one with --table"
+        )
+    if options.table not in known:
+        raise CpunetError(
+            f"{options.path}: no channel {options.table}; there are {shortened(known)}"
+        )
+    return int(options.table)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[FCIO]:
+    try:
+        with _quiet():
+            stream = fcio_open(str(path))
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
+    try:
+        yield stream
+    finally:
+        stream.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hide what the C library prints: a harmless warning about older files."""
+    kept = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(sink)
+        os.close(kept)

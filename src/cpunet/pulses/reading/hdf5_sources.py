@@ -1,0 +1,94 @@
+"""Pulses of LH5 files (the waveform tables of LEGEND's software) and of other HDF5."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import lh5
+import numpy as np
+import numpy.typing as npt
+from lgdo import VectorOfVectors
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.reading.hdf5 import columns_of, opened
+from cpunet.pulses.reading.hdf5_tables import WaveformColumn, choose_waveforms
+from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+
+
+def open_hdf5(options: ReadOptions) -> PulseSource:
+    """Open the chosen waveforms of an HDF5 file, LH5 or not (see `open_pulses`)."""
+    with opened(options.path) as file:
+        chosen = choose_waveforms(options.path, file, options.table)
+    return Lh5Source(options, chosen) if chosen.is_lh5 else Hdf5Source(options, chosen)
+
+
+class Lh5Source(PulseSource):
+    """A waveform table ``{t0, dt, values}``, plain or encoded, and its sister columns."""
+
+    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+        self._values = f"{chosen.path}/values"
+        with opened(options.path) as file:
+            n_pulses = lh5.read_n_rows(self._values, file) or 0
+            first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
+            layout = Layout(
+                format="LH5",
+                table=chosen.path,
+                n_pulses=n_pulses,
+                length=first.shape[1],
+                columns=columns_of(options.path, file[chosen.table or "/"]),
+                period_name=f"{chosen.path}/dt",
+                period=columns_of(options.path, file[chosen.path]).get("dt"),
+            )
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        with opened(self.path) as file:
+            for start in range(0, self.n_pulses or 0, size):
+                yield Traces(self._rows(file, start, size, self.length))
+
+    def _rows(
+        self, file: h5py.File, start: int, size: int, length: int | None
+    ) -> npt.NDArray[Any]:
+        # lh5 decodes LEGEND's encoded waveforms; it reads only the rows asked for.
+        values = lh5.read(self._values, file, start_row=start, n_rows=size)
+        if not isinstance(values, VectorOfVectors):
+            return np.asarray(values.nda)
+        lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
+        expected = int(lengths[0]) if length is None else length
+        if (other := lengths != expected).any():
+            first = int(other.argmax())
+            raise CpunetError(
+                f"{file.filename}: event {start + first}: {lengths[first]} samples, before it "
+                f"{expected}; split the file by length"
+            )
+        flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
+        return flat.reshape(len(lengths), expected)
+
+
+class Hdf5Source(PulseSource):
+    """A dataset of two dimensions (event, sample), and the columns beside it."""
+
+    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+        self._values = chosen.path
+        with opened(options.path) as file:
+            dataset = file[chosen.path]
+            columns = columns_of(options.path, file[chosen.table or "/"])
+            period_name = "dt_ns" if "dt_ns" in columns else "dt"
+            layout = Layout(
+                format="HDF5",
+                table=chosen.path,
+                n_pulses=dataset.shape[0],
+                length=dataset.shape[1],
+                columns=columns,
+                period_name=period_name,
+                period=columns.get(period_name),
+            )
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        with opened(self.path) as file:
+            dataset = file[self._values]
+            for start in range(0, self.n_pulses or 0, size):
+                yield Traces(dataset[start : start + size])

@@ -1,0 +1,74 @@
+"""Open a file of pulses of any known format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cpunet.pulses.reading.recognition import recognise
+from cpunet.pulses.reading.source import PulseSource, ReadOptions
+
+
+def open_pulses(
+    path: str | Path,
+    *,
+    table: str | None = None,
+    energy: str | None = None,
+    kev_per_adc: float | None = None,
+    dt_ns: float | None = None,
+) -> PulseSource:
+    """Open a file of pulses; its format is found by its content.
+
+    Read are LH5 (waveform tables, also encoded ones) and other HDF5, FlashCam
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, and siggen's ``.spe`` and text.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        Where the waveforms are: a table or waveform column of an LH5 file, a
+        group or dataset of an HDF5 file, an array of an ``.npz``, a channel
+        of an ``.fcio``.  Needed only where there are several.
+    energy
+        Column of the energies, or ``FILE:path/to/column`` for a column of another
+        HDF5 file of the same events, such as LEGEND's hit tier.
+    kev_per_adc
+        Calibration: keV per unit of the energy column, or of the amplitude
+        (maximum over baseline) if there is no such column.
+    dt_ns
+        Sampling period in ns, where the file does not tell.
+
+    Returns
+    -------
+    PulseSource
+        Gives blocks of `Pulses` with energies in keV (NaN where not known).
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, foreign, damaged or without pulses, if a choice is
+        open or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
+    """
+    options = ReadOptions(Path(path), table, energy, kev_per_adc, dt_ns)
+    # Formats are imported when met: the LH5 library alone takes seconds to load.
+    match recognise(options.path):
+        case "hdf5":
+            from cpunet.pulses.reading.hdf5_sources import open_hdf5
+
+            return open_hdf5(options)
+        case "fcio":
+            from cpunet.pulses.reading.flashcam import FlashCamSource
+
+            return FlashCamSource(options)
+        case "npz" | "npy":
+            from cpunet.pulses.reading.arrays import ArraySource
+
+            return ArraySource(options)
+        case "spe":
+            from cpunet.pulses.reading.siggen import SpectrumSource
+
+            return SpectrumSource(options)
+        case "text":
+            from cpunet.pulses.reading.siggen import TextSource
+
+            return TextSource(options)

@@ -1,0 +1,95 @@
+"""Which format a file has: its first bytes tell, its name may contradict them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Literal
+
+from cpunet.errors import CpunetError
+
+Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "text"]
+
+_NAMES: dict[Format, str] = {
+    "hdf5": "HDF5",
+    "fcio": "FlashCam",
+    "spe": "spectrum",
+    "npz": "NumPy",
+    "npy": "NumPy",
+    "text": "text",
+}
+_SUFFIXES: dict[str, Format] = {
+    ".lh5": "hdf5",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".hdf": "hdf5",
+    ".fcio": "fcio",
+    ".spe": "spe",
+    ".npz": "npz",
+    ".npy": "npy",
+}
+_HEAD_BYTES = 520
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
+
+
+def recognise(path: Path) -> Format:
+    """Find the format of a file by its content.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file, or it is a folder, empty, of no known format,
+        or not what its suffix says.
+    """
+    head = _head(path)
+    found = _by_content(head, path)
+    claimed = _SUFFIXES.get(path.suffix.lower())
+    # Plain text passes for anything, so it must not be named as something else.
+    if found == "text" and claimed is not None:
+        found = None
+    if found is not None:
+        return found
+    if claimed is not None:
+        raise CpunetError(
+            f"{path}: not a {_NAMES[claimed]} file, despite its name; "
+            "give a file of pulses or correct its suffix"
+        )
+    raise CpunetError(
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
+        "or siggen's .spe or text"
+    )
+
+
+def _head(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise CpunetError(f"{path}: is a folder; give a file of pulses")
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise CpunetError(f"{path}: no such file; check the name") from None
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    if not head:
+        raise CpunetError(f"{path}: is empty; copy or write it again")
+    return head
+
+
+def _by_content(head: bytes, path: Path) -> Format | None:
+    # MATLAB keeps 512 bytes of its own before the HDF5 part.
+    if _HDF5 in (head[:8], head[512:520]):
+        return "hdf5"
+    if head.startswith(b"\x93NUMPY"):
+        return "npy"
+    if head.startswith(b"PK\x03\x04"):
+        return "npz"
+    # The FCIO library itself unpacks these two, going by the name.
+    if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "fcio"
+    # Fortran's record marks around the 24 bytes of a Radware header.
+    if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
+        return "spe"
+    if set(head) <= _TEXT_BYTES:
+        return "text"
+    return None

@@ -1,0 +1,188 @@
+"""A file of pulses, whatever its format: what it holds, and its blocks of pulses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.columns import Column, require_length
+from cpunet.pulses.reading.energies import resolve_energies
+from cpunet.pulses.reading.sampling import resolve_sampling
+
+_EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user says of a file (see `open_pulses`)."""
+
+    path: Path
+    table: str | None = None
+    energy: str | None = None
+    kev_per_adc: float | None = None
+    dt_ns: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("--kev-per-adc", self.kev_per_adc), ("--dt-ns", self.dt_ns)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise CpunetError(f"{self.path}: {name} is {value}; expected more than 0")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a format's reader found in a file, before any waveform is read.
+
+    Parameters
+    ----------
+    format
+        Name of the format.
+    table
+        Where in the file the waveforms are.
+    n_pulses
+        Number of pulses; None if only a scan of the file would tell.
+    length
+        Samples per pulse.
+    columns
+        Per-event values beside the waveforms, by name.
+    period_name
+        Name of the column with the sampling period.
+    period
+        The sampling period, if the file tells.
+    """
+
+    format: str
+    table: str
+    n_pulses: int | None
+    length: int
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    period_name: str = "dt"
+    period: Column | None = None
+
+
+@dataclass(frozen=True)
+class Traces:
+    """Some raw waveforms (one per row), with event numbers if the format brings them."""
+
+    waveforms: npt.NDArray[Any]
+    event_number: npt.NDArray[np.int64] | None = None
+
+
+class PulseSource(ABC):
+    """An opened file of pulses: iterate over `blocks`, or `read` it whole.
+
+    Nothing stays open between blocks but what the running iteration needs, so
+    memory does not grow with the file and sources need not be closed.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        The file.
+    dt_ns : float
+        Sampling period in ns.
+    n_pulses : int or None
+        Number of pulses; None where only a scan would tell.
+    length : int
+        Samples per pulse.
+    """
+
+    def __init__(self, options: ReadOptions, layout: Layout) -> None:
+        if layout.n_pulses == 0 or layout.length == 0:
+            raise CpunetError(
+                f"{options.path}: {layout.table or layout.format} holds no pulses; "
+                "give a file with events"
+            )
+        self.path = options.path
+        self.n_pulses = layout.n_pulses
+        self.length = layout.length
+        self._layout = layout
+        self._sampling = resolve_sampling(
+            options.path,
+            layout.period_name,
+            layout.period,
+            dt_ns=options.dt_ns,
+            n_pulses=layout.n_pulses,
+        )
+        self.dt_ns = self._sampling.dt_ns
+        self._energies = resolve_energies(
+            options.path,
+            layout.columns,
+            energy=options.energy,
+            kev_per_adc=options.kev_per_adc,
+            n_pulses=layout.n_pulses,
+        )
+        self._number_column = next((n for n in _EVENT_NUMBERS if n in layout.columns), None)
+        if self._number_column is not None:
+            column = layout.columns[self._number_column]
+            require_length(options.path, self._number_column, column, layout.n_pulses)
+
+    @abstractmethod
+    def _traces(self, size: int) -> Iterator[Traces]:
+        """Raw waveforms in the order of the file, `size` rows at a time."""
+
+    def blocks(self, size: int = 4096) -> Iterator[Pulses]:
+        """Give the pulses of the file in order, at most `size` at a time.
+
+        Raises
+        ------
+        CpunetError
+            If the file is damaged or turns out to hold no pulses, or if its events
+            differ in length or sampling.
+        """
+        if size < 1:
+            raise ValueError(f"block size is {size}; expected at least 1")
+        start = 0
+        for traces in self._traces(size):
+            yield self._pulses(start, traces)
+            start += len(traces.waveforms)
+        if start == 0:
+            raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
+        column = self._energies.column
+        if column is not None and not column.constant and len(column) != start:
+            raise CpunetError(
+                f"{self.path}: {start} waveforms, but {len(column)} energies; "
+                "give the energies of the same events"
+            )
+
+    def read(self) -> Pulses:
+        """All pulses of the file at once; for files that fit in memory."""
+        return Pulses.concatenate(list(self.blocks()))
+
+    def describe(self) -> dict[str, Any]:
+        """What the file says of itself without reading its waveforms."""
+        return {
+            "format": self._layout.format,
+            "table": self._layout.table,
+            "columns": sorted(self._layout.columns),
+            "n_pulses": self.n_pulses,
+            "length": self.length,
+            "dt_ns": self.dt_ns,
+            "energy": self._energies.description,
+        }
+
+    def _pulses(self, start: int, traces: Traces) -> Pulses:
+        waveforms = np.asarray(traces.waveforms, np.float32)
+        stop = start + len(waveforms)
+        numbers = traces.event_number
+        if self._number_column is not None:
+            numbers = self._layout.columns[self._number_column].read(start, stop)
+        elif numbers is None:
+            numbers = np.arange(start, stop)
+        energy_kev = self._energies.of(start, waveforms)
+        if len(energy_kev) != len(waveforms):
+            raise CpunetError(
+                f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
+                "give the energies of the same events"
+            )
+        event_number = np.asarray(numbers, np.int64)
+        self._sampling.check(start, event_number)
+        return Pulses.of(
+            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number
+        )

@@ -1,0 +1,241 @@
+"""Pulses into LH5 files, block by block, as LEGEND's software reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import lh5
+import numpy as np
+import numpy.typing as npt
+from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
+
+from cpunet.errors import CpunetError
+from cpunet.files import refuse_existing, written_aside
+from cpunet.pulses.container import Pulses
+
+Columns = Mapping[str, tuple[npt.ArrayLike, str]]
+
+# Chunks of whole traces, so that a block of events is read without unpacking others.
+_CHUNK_BYTES = 1 << 18
+
+
+class PulseWriter:
+    """An LH5 file in the making: append blocks of pulses, leave the ``with`` block.
+
+    The table holds ``waveform`` (t0, dt, values; times in ns), ``energy`` (keV) and
+    ``event_number``, and whatever columns each block brings; all is compressed as
+    the LH5 library does.  The file appears whole at the end, or not at all.
+
+    Parameters
+    ----------
+    path
+        The file to write.
+    table
+        Where in it the table goes.
+    waveform_units
+        Units of the samples: ``"ADC"``, or ``""`` for units of the full charge.
+    t0_ns
+        Time of the first sample in ns.
+    attrs
+        Attributes of the table, such as where the pulses come from.
+    force
+        Whether to replace an existing file.
+
+    Raises
+    ------
+    CpunetError
+        If the file exists (without `force`) or cannot be written, if blocks differ
+        in length, sampling or columns, or if there were none.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> pulses = Pulses.of(np.zeros((2, 8)), dt_ns=16, energy_kev=[1592.5, 2614.5])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with PulseWriter(Path(folder) / "pulses.lh5") as writer:
+    ...         writer.append(pulses, columns={"drift_time": ([250.0, 300.0], "ns")})
+    ...     lh5.read("geds/sim/drift_time", Path(folder) / "pulses.lh5").nda.tolist()
+    [250.0, 300.0]
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        table: str = "geds/sim",
+        waveform_units: str = "",
+        t0_ns: float = 0.0,
+        attrs: Mapping[str, str | float] | None = None,
+        force: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self.n_pulses = 0
+        self._table = table.strip("/")
+        if not self._table:
+            raise CpunetError(f"{path}: the table has no name; give one such as geds/sim")
+        self._waveform_units = waveform_units
+        self._t0_ns = t0_ns
+        self._attrs = dict(attrs or {})
+        self._shape: tuple[int, float, tuple[str, ...]] | None = None
+        self._stack = ExitStack()
+        self._file: h5py.File | None = None
+        refuse_existing(self.path, force=force)
+
+    def __enter__(self) -> Self:
+        aside = self._stack.enter_context(written_aside(self.path))
+        self._file = self._stack.enter_context(h5py.File(aside, "w"))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None and self.n_pulses == 0:
+            with self._stack:
+                raise CpunetError(f"{self.path}: no pulses to write; nothing was written")
+        self._stack.__exit__(kind, error, trace)
+
+    def append(self, pulses: Pulses, columns: Columns | None = None) -> None:
+        """Add a block of pulses.
+
+        Parameters
+        ----------
+        pulses
+            The block; an empty one adds nothing.
+        columns
+            More values per event: name → (array of shape ``(n,)``, units).
+        """
+        if self._file is None:
+            raise ValueError("append outside of the writer's with block")
+        extra = dict(columns or {})
+        self._require_same(pulses, extra)
+        if len(pulses) == 0:
+            return
+        content = {
+            "waveform": self._waveforms(pulses),
+            "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
+            "event_number": Array(pulses.event_number),
+        }
+        for name, (values, units) in extra.items():
+            content[name] = self._column(name, values, units, len(pulses))
+        block = Table(col_dict=content, attrs=dict(self._attrs))
+        group, _, name = self._table.rpartition("/")
+        lh5.write(block, name, self._file, group=group or "/", wo_mode="append")
+        self.n_pulses += len(pulses)
+
+    def _waveforms(self, pulses: Pulses) -> WaveformTable:
+        n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
+        values = ArrayOfEqualSizedArrays(
+            nda=pulses.waveforms,
+            attrs={
+                "units": self._waveform_units,
+                "hdf5_settings": {"chunks": (n_rows, pulses.length)},
+            },
+        )
+        return WaveformTable(
+            t0=np.full(len(pulses), self._t0_ns),
+            t0_units="ns",
+            dt=np.full(len(pulses), pulses.dt_ns),
+            dt_units="ns",
+            values=values,
+        )
+
+    def _column(self, name: str, values: npt.ArrayLike, units: str, n: int) -> Array:
+        array = np.asarray(values)
+        if array.shape != (n,):
+            raise CpunetError(
+                f"{self.path}: column {name} has shape {array.shape} beside {n} pulses; "
+                "give one value per pulse"
+            )
+        return Array(array, attrs={"units": units} if units else {})
+
+    def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
+        taken = {"waveform", "energy", "event_number"} & set(extra)
+        if taken:
+            raise CpunetError(
+                f"{self.path}: column {taken.pop()} is the pulses' own; choose another name"
+            )
+        shape = (pulses.length, pulses.dt_ns, tuple(sorted(extra)))
+        if self._shape is None:
+            self._shape = shape
+        if shape != self._shape:
+            raise CpunetError(
+                f"{self.path}: a block of {_in_words(shape)} after one of "
+                f"{_in_words(self._shape)}; write them to separate files"
+            )
+
+
+def write_pulses(
+    path: str | Path,
+    blocks: Pulses | Iterable[Pulses],
+    *,
+    table: str = "geds/sim",
+    waveform_units: str = "",
+    t0_ns: float = 0.0,
+    columns: Columns | None = None,
+    attrs: Mapping[str, str | float] | None = None,
+    force: bool = False,
+) -> int:
+    """Write pulses to an LH5 file (see `PulseWriter`), one block or many in turn.
+
+    Parameters
+    ----------
+    path
+        The file to write.
+    blocks
+        Pulses, all at once or in blocks; only one block is held at a time.
+    table, waveform_units, t0_ns, attrs, force
+        As for `PulseWriter`.
+    columns
+        More values per event, for all blocks together: name → (array of shape
+        ``(total,)``, units).
+
+    Returns
+    -------
+    int
+        Number of pulses written.
+
+    Raises
+    ------
+    CpunetError
+        As `PulseWriter`; also if a column is longer or shorter than all pulses.
+    """
+    extra = {name: (np.asarray(v), units) for name, (v, units) in (columns or {}).items()}
+    writer = PulseWriter(
+        path,
+        table=table,
+        waveform_units=waveform_units,
+        t0_ns=t0_ns,
+        attrs=attrs,
+        force=force,
+    )
+    with writer:
+        for block in _in_turn(blocks):
+            rows = slice(writer.n_pulses, writer.n_pulses + len(block))
+            writer.append(block, {name: (v[rows], u) for name, (v, u) in extra.items()})
+        for name, (values, _) in extra.items():
+            if len(values) != writer.n_pulses:
+                raise CpunetError(
+                    f"{path}: column {name} has {len(values)} values beside "
+                    f"{writer.n_pulses} pulses; give one value per pulse"
+                )
+    return writer.n_pulses
+
+
+def _in_turn(blocks: Pulses | Iterable[Pulses]) -> Iterator[Pulses]:
+    if isinstance(blocks, Pulses):
+        yield blocks
+    else:
+        yield from blocks
+
+
+def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:
+    length, dt_ns, names = shape
+    return f"{length} samples of {dt_ns:g} ns with columns {', '.join(names) or '(none)'}"

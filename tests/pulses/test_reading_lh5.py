@@ -1,0 +1,312 @@
+"""LH5 files: found by themselves, decoded, with the right units, in bounded memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lgdo import Array, Scalar, Table, VectorOfVectors, WaveformTable
+from lh5.compression import ULEB128ZigZagDiff
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.reading import open_pulses
+
+RNG = np.random.default_rng(1)
+N, LENGTH = 23, 40
+
+
+def waveform_table(values, dt=16.0, units="ns"):
+    return WaveformTable(
+        t0=np.zeros(len(values)), t0_units="ns", dt=np.broadcast_to(dt, len(values)).copy(),
+        dt_units=units, values=values,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def raw():
+    return RNG.integers(0, 60000, (N, LENGTH), dtype=np.uint16)
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "pulses.lh5"
+
+
+def test_a_single_table_is_found_and_read_in_blocks(file, raw):
+    energy = RNG.uniform(0, 3000, N)
+    table = Table(
+        col_dict={
+            "waveform": waveform_table(raw),
+            "energy": Array(energy, attrs={"units": "keV"}),
+            "eventnumber": Array(np.arange(N) * 7),
+        }
+    )
+    lh5.write(table, "raw", file, group="geds")
+    source = open_pulses(file)
+    assert (source.n_pulses, source.length, source.dt_ns) == (N, LENGTH, 16.0)
+    blocks = list(source.blocks(5))
+    assert [len(block) for block in blocks] == [5, 5, 5, 5, 3]
+    pulses = source.read()
+    np.testing.assert_array_equal(pulses.waveforms, raw)
+    np.testing.assert_array_equal(pulses.energy_kev, energy)
+    np.testing.assert_array_equal(pulses.event_number, np.arange(N) * 7)
+    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), raw)
+    told = source.describe()
+    assert told["format"] == "LH5"
+    assert told["table"] == "geds/raw/waveform"
+    assert told["columns"] == ["energy", "eventnumber"]
+
+
+@pytest.mark.parametrize(
+    ("dt", "units", "dt_ns"), [(16, "ns", 16), (0.016, "us", 16), (1.6e-8, "s", 16)]
+)
+def test_the_units_of_the_sampling_period_count(file, raw, dt, units, dt_ns):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw, dt, units)}), "t", file)
+    assert open_pulses(file).dt_ns == pytest.approx(dt_ns)
+
+
+@pytest.mark.parametrize(("units", "factor"), [("keV", 1), ("MeV", 1000), ("eV", 1e-3)])
+def test_the_units_of_the_energy_count(file, raw, units, factor):
+    energy = Array(np.linspace(1, 2, N), attrs={"units": units})
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw), "energy": energy}), "t", file)
+    np.testing.assert_allclose(
+        open_pulses(file).read().energy_kev, factor * np.linspace(1, 2, N)
+    )
+    with pytest.raises(CpunetError, match=rf"in {units} already; drop --kev-per-adc"):
+        open_pulses(file, kev_per_adc=0.1)
+
+
+def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
+    columns = {
+        "waveform": waveform_table(raw),
+        "energy": Array(np.arange(N, dtype=np.uint16), attrs={"units": "ADC"}),
+        "trapE": Array(np.arange(N) + 1.0),
+        "trapE_cal": Array(np.arange(N) + 2.0),
+    }
+    lh5.write(Table(col_dict=columns), "t", file)
+    assert np.isnan(open_pulses(file).read().energy_kev).all()
+    calibrated = open_pulses(file, kev_per_adc=0.5).read().energy_kev
+    np.testing.assert_array_equal(calibrated, 0.5 * np.arange(N))
+    for name, units in (("energy", "in ADC"), ("trapE", "without units")):
+        with pytest.raises(CpunetError, match=rf"column {name} is {units}.*--kev-per-adc"):
+            open_pulses(file, energy=name)
+    named = open_pulses(file, energy="trapE", kev_per_adc=2.0).read().energy_kev
+    np.testing.assert_array_equal(named, 2.0 * (np.arange(N) + 1))
+    in_kev = open_pulses(file, energy="trapE_cal").read().energy_kev
+    np.testing.assert_array_equal(in_kev, np.arange(N) + 2)
+    with pytest.raises(CpunetError, match=r"no column nope.*energy, trapE, trapE_cal"):
+        open_pulses(file, energy="nope")
+
+
+def test_without_a_column_the_amplitude_is_calibrated(file):
+    values = np.full((N, 200), 100, np.uint16)
+    values[:, 150] = 100 + np.arange(N)
+    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "t", file)
+    energies = open_pulses(file, kev_per_adc=0.25).read().energy_kev
+    np.testing.assert_allclose(energies, 0.25 * np.arange(N))
+
+
+def test_energies_of_another_file(file, tmp_path, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="ch1")
+    hit = tmp_path / "hit.lh5"
+    lh5.write(Table(col_dict={"E_cal": Array(np.arange(N) * 1.5)}), "hit", hit, group="ch1")
+    lh5.write(Table(col_dict={"E_cal": Array(np.arange(3.0))}), "short", hit, group="ch1")
+    blocks = list(open_pulses(file, energy=f"{hit}:ch1/hit/E_cal").blocks(4))
+    energies = np.concatenate([block.energy_kev for block in blocks])
+    np.testing.assert_array_equal(energies, np.arange(N) * 1.5)
+    with pytest.raises(CpunetError, match=rf"has 3 values beside {N} waveforms"):
+        open_pulses(file, energy=f"{hit}:ch1/short/E_cal")
+    with pytest.raises(CpunetError, match=r"hit.lh5: no column ch1/hit/x; there are E_cal"):
+        open_pulses(file, energy=f"{hit}:ch1/hit/x")
+    with pytest.raises(CpunetError, match=r"gone.lh5: no such file"):
+        open_pulses(file, energy=f"{tmp_path / 'gone.lh5'}:ch1/hit/x")
+
+
+def test_several_tables_need_a_choice(file, raw):
+    for channel in range(9):
+        table = Table(col_dict={"waveform": waveform_table(raw + np.uint16(channel))})
+        lh5.write(table, "raw", file, group=f"ch{channel}")
+    message = r"9 tables of waveforms \(ch0/raw, .*ch5/raw and 3 more\).*--table"
+    with pytest.raises(CpunetError, match=message):
+        open_pulses(file)
+    with pytest.raises(CpunetError, match=r"no table ch11/raw; there are ch0/raw"):
+        open_pulses(file, table="ch11/raw")
+    for name in ("ch3/raw", "/ch3/raw/", "ch3", "ch3/raw/waveform"):
+        values = open_pulses(file, table=name).read().waveforms
+        np.testing.assert_array_equal(values, raw + np.uint16(3))
+
+
+def test_of_several_columns_the_full_record_is_taken(file, raw):
+    presummed = raw[:, ::4].astype(np.uint32)
+    columns = {
+        "waveform_presummed": waveform_table(presummed, 64.0),
+        "waveform_windowed": waveform_table(raw),
+    }
+    lh5.write(Table(col_dict=columns), "raw", file)
+    assert open_pulses(file).describe()["table"] == "raw/waveform_windowed"
+    other = open_pulses(file, table="raw/waveform_presummed")
+    assert (other.dt_ns, other.length) == (64.0, 10)
+
+
+def test_one_table_under_two_names_is_one(file, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="ch1")
+    with h5py.File(file, "a") as h5:
+        h5["alias"] = h5["ch1"]
+        h5["soft"] = h5py.SoftLink("/ch1/raw")
+        h5["broken"] = h5py.SoftLink("/nowhere")
+        h5["ch1/circle"] = h5["/"]
+    assert open_pulses(file).n_pulses == N
+    np.testing.assert_array_equal(open_pulses(file, table="soft").read().waveforms, raw)
+
+
+def test_encoded_waveforms_are_decoded(file, raw):
+    table = waveform_table(raw)
+    table.values.attrs["compression"] = ULEB128ZigZagDiff()
+    lh5.write(Table(col_dict={"waveform": table}), "raw", file)
+    with h5py.File(file) as h5:
+        assert "encoded_data" in h5["raw/waveform/values"]
+    source = open_pulses(file)
+    assert source.length == LENGTH
+    got = np.concatenate([block.waveforms for block in source.blocks(6)])
+    np.testing.assert_array_equal(got, raw)
+
+
+def test_ragged_waveforms_are_refused_if_they_differ(file):
+    even = VectorOfVectors([[1, 2, 3, 4]] * 5, dtype=np.uint16)
+    odd = VectorOfVectors([[1, 2, 3, 4]] * 4 + [[1, 2]], dtype=np.uint16)
+    for name, values in (("even", even), ("odd", odd)):
+        table = WaveformTable(
+            t0=np.zeros(5), t0_units="ns", dt=np.full(5, 16.0), dt_units="ns", values=values
+        )
+        lh5.write(Table(col_dict={"waveform": table}), name, file)
+    assert [len(b) for b in open_pulses(file, table="even").blocks(2)] == [2, 2, 1]
+    np.testing.assert_array_equal(
+        open_pulses(file, table="even").read().waveforms[4], [1, 2, 3, 4]
+    )
+    with pytest.raises(CpunetError, match=r"event 4: 2 samples, before it 4"):
+        open_pulses(file, table="odd").read()
+
+
+def test_a_period_that_changes_names_the_event(file, raw):
+    dt = np.full(N, 16.0)
+    dt[17] = 8.0
+    columns = {
+        "waveform": waveform_table(raw, dt),
+        "event_number": Array(np.arange(N) + 1000),
+    }
+    lh5.write(Table(col_dict=columns), "raw", file)
+    with pytest.raises(CpunetError, match=r"event 1017: sampling period 8 ns, before it 16 ns"):
+        list(open_pulses(file).blocks(4))
+
+
+@pytest.mark.parametrize("dt", [np.nan, 0.0, -16.0])
+def test_a_period_that_is_no_period_is_refused(file, raw, dt):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw, dt)}), "raw", file)
+    with pytest.raises(CpunetError, match=r"pulses.lh5: event 0: the sampling period is"):
+        open_pulses(file)
+
+
+def test_the_users_period_must_agree(file, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
+    assert open_pulses(file, dt_ns=16).dt_ns == 16
+    with pytest.raises(CpunetError, match=r"every 16 ns, but --dt-ns says 10; drop"):
+        open_pulses(file, dt_ns=10)
+
+
+def test_a_period_without_units_needs_the_user(file, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw, 16.0, "")}), "raw", file)
+    with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give --dt-ns"):
+        open_pulses(file)
+    assert open_pulses(file, dt_ns=16).dt_ns == 16
+
+
+def test_no_waveforms_lists_what_there_is(file):
+    lh5.write(Table(col_dict={"edep": Array(np.arange(3.0))}), "det1", file, group="stp")
+    with pytest.raises(CpunetError, match=r"no waveforms in it; it holds stp/det1"):
+        open_pulses(file)
+
+
+def test_no_events_is_an_error(file):
+    lh5.write(Table(col_dict={"waveform": waveform_table(np.zeros((0, 8)))}), "raw", file)
+    with pytest.raises(CpunetError, match=r"raw/waveform holds no pulses"):
+        open_pulses(file)
+
+
+def test_nan_samples_are_passed_on(file):
+    values = np.ones((3, 8), np.float32)
+    values[1, 2] = np.nan
+    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
+    pulses = open_pulses(file, kev_per_adc=1.0).read()
+    assert np.isnan(pulses.waveforms[1, 2])
+    assert np.isnan(pulses.energy_kev).tolist() == [False, True, False]
+
+
+def test_scalars_beside_the_waveforms_do_not_disturb(file, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="geds")
+    lh5.write(Scalar(3.5), "geds/note", file)
+    assert open_pulses(file).n_pulses == N
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(size=st.integers(1, 40))
+def test_any_block_size_gives_the_same_pulses(tmp_path_factory, size):
+    file = tmp_path_factory.mktemp("sizes") / "pulses.lh5"
+    values = np.arange(N * 5, dtype=np.float32).reshape(N, 5)
+    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
+    blocks = list(open_pulses(file).blocks(size))
+    assert max(len(block) for block in blocks) <= size
+    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), values)
+    assert np.concatenate([b.event_number for b in blocks]).tolist() == list(range(N))
+
+
+def test_memory_does_not_grow_with_the_file(file):
+    n, length, size = 20_000, 500, 250
+    # Sixteen-bit traces of 20 MB, twice that as float32; a block needs 0.5 MB.
+    lh5.write(
+        Table(col_dict={"waveform": waveform_table(np.zeros((n, length), np.uint16))}),
+        "r",
+        file,
+    )
+    source = open_pulses(file)
+    next(source.blocks(size))
+    tracemalloc.start()
+    try:
+        assert sum(len(block) for block in source.blocks(size)) == n
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 5e6
+
+
+@pytest.mark.parametrize(
+    ("name", "length"), [("waveform_windowed", 1400), ("waveform_presummed", 781)]
+)
+def test_measured_encoded_waveforms(reference_data: Path, name, length):
+    """Both codecs of LEGEND; the truth is the flat baseline and the DAQ's own value of it."""
+    (path,) = (reference_data / "real").glob("l200-p14*raw.lh5")
+    source = open_pulses(path, table=f"ch1107202/raw/{name}")
+    pulses = source.read()
+    assert pulses.waveforms.shape == (2, length)
+    with h5py.File(path) as h5:
+        daq = h5["ch1107202/raw/baseline"][:].astype(float)
+        rate = h5["ch1107202/raw/presum_rate"][:] if name == "waveform_presummed" else 1
+    start = pulses.waveforms[:, :100].mean(axis=1) / rate
+    np.testing.assert_allclose(start, daq, rtol=0.01)
+
+
+def test_measured_traces_with_energies_of_the_hit_tier(reference_data: Path):
+    (raw_file,) = (reference_data / "real").glob("l200-p03*raw.lh5")
+    (hit_file,) = (reference_data / "real").glob("l200-p03*hit.lh5")
+    column = "ch1084803/hit/cuspEmax_ctc_cal"
+    pulses = open_pulses(raw_file, table="ch1084803/raw", energy=f"{hit_file}:{column}").read()
+    with h5py.File(hit_file) as h5:
+        np.testing.assert_array_equal(pulses.energy_kev, h5[column][:])
+    with h5py.File(raw_file) as h5:
+        np.testing.assert_array_equal(pulses.waveforms, h5["ch1084803/raw/waveform/values"][:])
+        np.testing.assert_array_equal(pulses.event_number, h5["ch1084803/raw/eventnumber"][:])

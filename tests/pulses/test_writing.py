@@ -1,0 +1,144 @@
+"""Written files, read by the LH5 library and by ourselves."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from lgdo import Table, WaveformTable
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.writing import PulseWriter, write_pulses
+
+
+def some(n=6, length=20, dt_ns=16.0, start=0):
+    rng = np.random.default_rng(n + start)
+    return Pulses.of(
+        rng.normal(size=(n, length)),
+        dt_ns=dt_ns,
+        energy_kev=rng.uniform(0, 3000, n),
+        event_number=np.arange(start, start + n),
+    )
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    waveforms=arrays(np.float32, array_shapes(min_dims=2, max_dims=2, max_side=12)),
+    dt_ns=st.floats(0.1, 1e4),
+    size=st.integers(1, 12),
+    data=st.data(),
+)
+def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_ns, size, data):
+    path = tmp_path_factory.mktemp("round") / "pulses.lh5"
+    n = len(waveforms)
+    energy = data.draw(arrays(np.float64, n))
+    numbers = data.draw(arrays(np.int64, n))
+    pulses = Pulses.of(waveforms, dt_ns=dt_ns, energy_kev=energy, event_number=numbers)
+    blocks = (pulses[start : start + size] for start in range(0, n, size))
+    columns = {"drift_time": (np.arange(n) * 1.5, "ns"), "is_valid": (numbers > 0, "")}
+    assert write_pulses(path, blocks, columns=columns, t0_ns=-8.0) == n
+
+    table = lh5.read("geds/sim", path)
+    assert isinstance(table, Table)
+    assert isinstance(table.waveform, WaveformTable)
+    np.testing.assert_array_equal(table.waveform.values.nda, waveforms)
+    assert table.waveform.values.nda.dtype == np.float32
+    assert (table.waveform.dt.nda == dt_ns).all()
+    assert (table.waveform.t0.nda == -8.0).all()
+    assert (table.waveform.dt_units, table.waveform.t0_units) == ("ns", "ns")
+    np.testing.assert_array_equal(table.energy.nda, energy)
+    assert table.energy.attrs["units"] == "keV"
+    np.testing.assert_array_equal(table.event_number.nda, numbers)
+    np.testing.assert_array_equal(table.drift_time.nda, np.arange(n) * 1.5)
+    assert table.drift_time.attrs["units"] == "ns"
+    np.testing.assert_array_equal(table.is_valid.nda, numbers > 0)
+
+    again = open_pulses(path).read()
+    np.testing.assert_array_equal(again.waveforms, waveforms)
+    np.testing.assert_array_equal(again.energy_kev, energy)
+    np.testing.assert_array_equal(again.event_number, numbers)
+    assert again.dt_ns == pytest.approx(dt_ns)
+
+
+def test_units_attributes_and_compression(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    write_pulses(path, some(), table="ch7/raw", waveform_units="ADC", attrs={"run": "r001"})
+    table = lh5.read("ch7/raw", path)
+    assert table.waveform.values_units == "ADC"
+    assert table.attrs["run"] == "r001"
+    assert lh5.ls(path, "ch7/") == ["ch7/raw"]
+    with h5py.File(path) as h5:
+        values = h5["ch7/raw/waveform/values"]
+        assert (values.compression, values.shuffle) == ("gzip", True)
+        assert values.chunks[1] == 20
+
+
+def test_an_existing_file_is_kept_unless_forced(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    write_pulses(path, some(3))
+    with pytest.raises(CpunetError, match="exists already; choose another name"):
+        write_pulses(path, some(4))
+    assert open_pulses(path).n_pulses == 3
+    write_pulses(path, some(4), force=True)
+    assert open_pulses(path).n_pulses == 4
+
+
+def test_a_failure_leaves_no_file(tmp_path):
+    def failing():
+        yield some()
+        raise CpunetError("the source broke")
+
+    with pytest.raises(CpunetError, match="the source broke"):
+        write_pulses(tmp_path / "pulses.lh5", failing())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("blocks", [[], [some(0)]])
+def test_no_pulses_leave_no_file(tmp_path, blocks):
+    with pytest.raises(CpunetError, match=r"pulses.lh5: no pulses to write"):
+        write_pulses(tmp_path / "pulses.lh5", blocks)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("other", [some(length=21), some(dt_ns=8.0)])
+def test_blocks_must_fit_together(tmp_path, other):
+    with pytest.raises(CpunetError, match="write them to separate files"):
+        write_pulses(tmp_path / "pulses.lh5", [some(), other])
+
+
+def test_columns_must_fit(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    for n in (5, 7):
+        with pytest.raises(CpunetError, match=r"column a has (shape|7)"):
+            write_pulses(path, [some(3), some(3, start=3)], columns={"a": (np.arange(n), "")})
+    with pytest.raises(CpunetError, match="column energy is the pulses' own"):
+        write_pulses(path, some(), columns={"energy": (np.arange(6), "keV")})
+    with PulseWriter(path) as writer:
+        writer.append(some(), {"a": (np.arange(6), "")})
+        with pytest.raises(CpunetError, match="separate files"):
+            writer.append(some())
+    assert open_pulses(path).n_pulses == 6
+
+
+def test_empty_blocks_between_others_add_nothing(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    assert write_pulses(path, [some(0), some(2), some(0), some(3, start=2)]) == 5
+    assert open_pulses(path).read().event_number.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
+    block = some(250, 500)  # 0.5 MB
+    tracemalloc.start()
+    try:
+        write_pulses(tmp_path / "pulses.lh5", (block for _ in range(30)))
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()

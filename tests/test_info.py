@@ -1,0 +1,97 @@
+"""What `describe` says of files and run folders."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.info import describe
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes.schema import PeakConfig
+
+LINES = {
+    "FEP": PeakConfig(energy_kev=2614.511, half_width_kev=5),
+    "SEP": PeakConfig(energy_kev=2103.511, half_width_kev=5),
+    "DEP": PeakConfig(energy_kev=1592.511, half_width_kev=5),
+}
+
+
+def test_a_file_of_pulses(tmp_path):
+    waveforms = np.tile(np.arange(20.0), (6, 1))
+    waveforms[1, 3] = np.nan
+    waveforms[2, 4] = np.inf
+    waveforms[3] = 7.0
+    waveforms[4, 0] = -3.0
+    energies = [2614.0, 2615.0, 2103.0, 500.0, np.nan, 100.0]
+    path = tmp_path / "pulses.lh5"
+    write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=energies))
+    assert describe(path, peaks=LINES) == {
+        "kind": "pulses",
+        "path": str(path),
+        "format": "LH5",
+        "table": "geds/sim/waveform",
+        "columns": ["energy", "event_number"],
+        "n_pulses": 6,
+        "length": 20,
+        "dt_ns": 16.0,
+        "energy": "column energy [keV]",
+        "energy_kev": [100.0, 2615.0],
+        "n_without_energy": 1,
+        "peaks": {"FEP": 2, "SEP": 1, "DEP": 0},
+        "samples": [-3.0, 19.0],
+        "n_not_finite": 2,
+        "n_constant": 1,
+    }
+
+
+def test_nothing_known_is_none(tmp_path):
+    np.save(tmp_path / "pulses.npy", np.full((2, 20), np.nan))
+    told = describe(tmp_path / "pulses.npy", dt_ns=16)
+    assert (told["energy_kev"], told["samples"], told["peaks"]) == (None, None, {})
+    assert (told["n_not_finite"], told["n_constant"]) == (2, 0)
+    json.dumps(told)
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    block = Pulses.of(np.zeros((4096, 100)), dt_ns=16)  # 1.6 MB as float32
+    write_pulses(tmp_path / "pulses.lh5", (block for _ in range(12)))
+    tracemalloc.start()
+    try:
+        assert describe(tmp_path / "pulses.lh5")["n_pulses"] == 12 * 4096
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_run_folder(tmp_path):
+    content = {"recipe": {"name": "paper"}, "seed": 7, "seconds": 12.5, "device": "cpu"}
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    assert describe(tmp_path) == {"kind": "run", "path": str(tmp_path), **content}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "a folder without run.json; give the folder of a run, or a file"),
+        ("{", r"run.json: cannot be read \([^\n]*\); the run is damaged"),
+        ("[1]", r"run.json: holds no run"),
+    ],
+)
+def test_folders_that_are_no_runs(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "run.json").write_text(text)
+    with pytest.raises(CpunetError, match=message):
+        describe(tmp_path)
+
+
+def test_reference_pulses(reference_data: Path):
+    told = describe(reference_data / "closure" / "data.lh5", peaks=LINES)
+    assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
+    assert min(told["peaks"].values()) > 500
+    assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
