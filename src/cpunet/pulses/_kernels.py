@@ -1,0 +1,368 @@
+"""Compiled loops of the preparation: one raw trace in, one window and its numbers out.
+
+All sums are taken in float64; a trace is read where it lies, never copied.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+# Stable codes of the reasons a trace is refused here (`preparation.Rejection` names them).
+ACCEPTED = 0
+NAN = 1
+CONSTANT = 2
+SATURATED = 3
+WINDOW_OUTSIDE_RECORD = 4
+NO_AMPLITUDE = 5
+TAIL_NOT_POSITIVE = 6
+
+# Columns of the table of numbers kept for each pulse.
+BASELINE, SCALE, ALIGN_SAMPLE, BASELINE_RMS, BASELINE_SLOPE, TAIL_SLOPE, CHI2 = range(7)
+N_COLUMNS = 7
+
+# The alignment moves the baseline window and the baseline moves the 99.9 % threshold,
+# by a thousandth of its own change: two rounds settle all but exact ties.
+_ROUNDS = 4
+# Noise alone makes a maximum of three to four RMS in a thousand samples.
+_MIN_AMPLITUDE_RMS = 8.0
+# An earlier pulse disturbs one part of a baseline; the quietest part tells the noise.
+_PARTS = 4
+# Chance below which equal samples at the maximum cannot be the noise's doing.
+_FLAT_BY_CHANCE = 1e-6
+# A smooth maximum that looks flat because of the ADC's steps falls by about eight
+# steps over the next equally long stretch; a clipped one by far more.
+_FLAT_BY_STEPS = 16.0
+# Values that differ by float32 rounding, in units of the amplitude, count as equal.
+_ROUNDING = 2.0 * 2.0**-23
+
+
+class Settings(NamedTuple):
+    """The preparation settings in the form the compiled loop takes them."""
+
+    simulated: bool
+    samples_before: int
+    samples_after: int
+    align_fraction: float
+    baseline_samples: int
+    tail_samples: int
+    tail_level: float
+    decay_fit_samples: int
+    max_padding_before: int
+    max_padding_after: int
+    saturation_run: int
+
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+# Called on finite values only, so that the comparisons may be vectorised.
+_compiled_finite = njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc"}
+)
+
+
+@_compiled
+def _all_finite(trace):  # type: ignore[no-untyped-def]
+    bad = False
+    for value in trace:
+        bad |= (value - value) != 0
+    return not bad
+
+
+@_compiled_finite
+def _lowest(trace):  # type: ignore[no-untyped-def]
+    lowest = trace[0]
+    for value in trace:
+        lowest = min(lowest, value)
+    return lowest
+
+
+@_compiled_finite
+def _highest(trace):  # type: ignore[no-untyped-def]
+    highest = trace[0]
+    for value in trace:
+        highest = max(highest, value)
+    return highest
+
+
+@_compiled_finite
+def _mean(trace):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for value in trace:
+        total += np.float64(value)
+    return total / len(trace)
+
+
+@_compiled
+def _first_at(trace, level):  # type: ignore[no-untyped-def]
+    sample = 0
+    while trace[sample] != level:
+        sample += 1
+    return sample
+
+
+@_compiled
+def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
+    """Fraction of neighbouring samples that are equal, and the smallest step else."""
+    equal, step = 1, math.inf  # one to begin with: a chance is never quite zero
+    for i in range(1, len(trace)):
+        difference = abs(trace[i] - trace[i - 1])
+        if difference == 0:
+            equal += 1
+        else:
+            step = min(step, difference)
+    return equal / len(trace), step
+
+
+@_compiled
+def _longest_run(trace, top, first, shortest):  # type: ignore[no-untyped-def]
+    """Length and end of the longest run of `top`, if there is one of `shortest` samples."""
+    longest = end = 0
+    for sample in range(first, len(trace), shortest):  # no such run fits between these
+        if trace[sample] == top:
+            start = stop = sample
+            while start > first and trace[start - 1] == top:
+                start -= 1
+            while stop < len(trace) and trace[stop] == top:
+                stop += 1
+            if stop - start > longest:
+                longest, end = stop - start, stop
+    return longest, end
+
+
+@_compiled
+def _is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore[no-untyped-def]
+    """Whether the top of a measured trace is flat as neither noise nor ADC steps make it.
+
+    `quiet` samples at the trace's beginning tell how often noise makes two neighbours
+    equal.  Where it mostly does (coarse steps, or no noise), the fall after the flat
+    top decides: clipping cuts off far more than one step.
+    """
+    longest, end = _longest_run(trace, top, top_sample, saturation_run)
+    if longest < saturation_run:
+        return False
+    if top == 65535 or top == 16383 or top == 4095:  # full scale of 16, 14 and 12 bits
+        return True
+    chance, _ = _equal_neighbours(trace[:quiet])
+    if chance ** (longest - 1) < _FLAT_BY_CHANCE:
+        return True
+    _, step = _equal_neighbours(trace)
+    fall = top - trace[min(end + longest, len(trace)) - 1]
+    return chance > 0.5 and fall > _FLAT_BY_STEPS * step
+
+
+@_compiled
+def _crossing(trace, top_sample, threshold):  # type: ignore[no-untyped-def]
+    """The sample after the last one below `threshold` before the maximum."""
+    sample = top_sample
+    while sample >= 0 and trace[sample] >= threshold:
+        sample -= 1
+    return sample + 1
+
+
+@_compiled
+def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: ignore[no-untyped-def]
+    """The aligned sample; `preferred` if rounding alone could move it there or away.
+
+    Without this, one prepared pulse in ten thousand would shift by a sample when
+    prepared again.
+    """
+    threshold = base + fraction * (top - base)
+    slack = _ROUNDING * (top - base)
+    first = _crossing(trace, top_sample, threshold - slack)
+    last = _crossing(trace, top_sample, threshold + slack)
+    if first <= preferred <= last:
+        return preferred
+    return _crossing(trace, top_sample, threshold)
+
+
+@_compiled
+def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
+    """Samples of the record in the baseline part of a window; one at least."""
+    first = min(max(start, 0), length - 1)
+    return first, min(max(start + s.baseline_samples, first + 1), length)
+
+
+@_compiled
+def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
+    """Align, take the baseline of that window, and align again until nothing moves."""
+    length = len(trace)
+    if s.simulated:
+        base = np.float64(_lowest(trace))
+    else:
+        base = _mean(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
+    align = -1
+    for _ in range(_ROUNDS):
+        refined = _align_sample(
+            trace, base, top, top_sample, s.align_fraction, s.samples_before
+        )
+        if refined == align:
+            break
+        align = refined
+        start, stop = align - s.samples_before, min(align + s.samples_after, length)
+        if top_sample >= stop:
+            top = np.float64(_highest(trace[align:stop]))
+            top_sample = align + _first_at(trace[align:stop], top)
+        if s.simulated:
+            base = np.float64(_lowest(trace[max(start, 0) : stop]))
+        else:
+            first, last = _baseline_stretch(length, start, s)
+            base = _mean(trace[first:last])
+    return align, base, top
+
+
+@_compiled_finite
+def _line(values):  # type: ignore[no-untyped-def]
+    """Mean, slope per sample and RMS about the line of equally spaced values."""
+    n = len(values)
+    if n < 3:
+        return _mean(values) if n else 0.0, 0.0, 0.0
+    mean, centre = _mean(values), 0.5 * (n - 1)
+    moment = squares = 0.0
+    for i in range(n):
+        deviation = values[i] - mean
+        moment += (i - centre) * deviation
+        squares += deviation * deviation
+    slope = moment / (n * (n * n - 1.0) / 12.0)
+    return mean, slope, math.sqrt(max(squares - slope * moment, 0.0) / (n - 2))
+
+
+@_compiled
+def _quietest_rms(baseline):  # type: ignore[no-untyped-def]
+    """RMS about a line in the quietest of a few parts of the baseline."""
+    size = len(baseline) // _PARTS
+    quietest = math.inf
+    for part in range(_PARTS):
+        _, _, rms = _line(baseline[part * size : (part + 1) * size])
+        quietest = min(quietest, rms)
+    return quietest
+
+
+@_compiled_finite
+def _residual_squares(tail, logs, mean, slope):  # type: ignore[no-untyped-def]
+    """Squared residuals of the logarithm, each in units of one over the value."""
+    centre, squares = 0.5 * (len(tail) - 1), 0.0
+    for i in range(len(tail)):
+        squares += ((logs[i] - mean - slope * (i - centre)) * tail[i]) ** 2
+    return squares
+
+
+@_compiled
+def _tail_fit(tail, rms, logs):  # type: ignore[no-untyped-def]
+    """Slope per sample of the logarithm and reduced chi-square; NaN slope if not positive."""
+    if _lowest(tail) <= 0:
+        return math.nan, math.nan
+    for i in range(len(tail)):
+        logs[i] = math.log(tail[i])
+    mean, slope, _ = _line(logs)
+    if rms == 0:
+        return slope, math.nan
+    # The error of a logarithm is the error of the value divided by the value.
+    squares = _residual_squares(tail, logs, mean, slope)
+    return slope, squares / (rms * rms * (len(tail) - 2))
+
+
+@_compiled
+def _tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
+    """Mean of the `tail_samples` before `stop`; the last value stands for what is missing."""
+    total = 0.0
+    for i in range(stop - tail_samples, stop):
+        total += np.float64(trace[min(i, len(trace) - 1)])
+    return total / tail_samples
+
+
+@_compiled
+def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
+    """Write `(trace - base) / scale`; 0 before the record, its last value after."""
+    length = len(trace)
+    first, stop = max(0, -start), min(len(window), length - start)
+    factor = 1.0 / scale
+    window[:first] = 0
+    for i in range(first, stop):
+        window[i] = (trace[start + i] - base) * factor
+    window[stop:] = (trace[length - 1] - base) * factor
+
+
+@_compiled
+def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-def]
+    """Fill `window` and `numbers` from one trace and return its code."""
+    if not _all_finite(trace):
+        return NAN
+    length, top = len(trace), np.float64(_highest(trace))
+    if top == _lowest(trace):
+        return CONSTANT
+    top_sample = _first_at(trace, top)
+    quiet = min(s.baseline_samples, max(2, top_sample // 2), length)
+    if not s.simulated and _is_saturated(trace, quiet, top, top_sample, s.saturation_run):
+        return SATURATED
+
+    align, base, top = _aligned(trace, top, top_sample, s)
+    start = align - s.samples_before
+    stop = align + s.samples_after
+    first, last = _baseline_stretch(length, start, s)
+    mean, slope, rms = _line(trace[first:last])
+    if s.simulated:
+        scale = top - base
+    else:
+        if top - mean < _MIN_AMPLITUDE_RMS * _quietest_rms(trace[first:last]):
+            return NO_AMPLITUDE
+        if start < -s.max_padding_before or stop > length + s.max_padding_after:
+            return WINDOW_OUTSIDE_RECORD
+        if start + s.baseline_samples <= 0:  # nothing to take the baseline from
+            return WINDOW_OUTSIDE_RECORD
+        base = mean
+        scale = (_tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
+        if not scale > 0:
+            return NO_AMPLITUDE
+
+    _fill(trace, start, base, scale, window)
+    tail_slope, chi2 = _tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
+    if math.isnan(tail_slope):
+        return TAIL_NOT_POSITIVE
+    numbers[BASELINE], numbers[SCALE], numbers[ALIGN_SAMPLE] = base, scale, align
+    numbers[BASELINE_RMS], numbers[BASELINE_SLOPE] = rms / scale, slope / scale
+    numbers[TAIL_SLOPE], numbers[CHI2] = tail_slope, chi2
+    return ACCEPTED
+
+
+@_compiled
+def _prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
+    """Prepare all traces; those accepted fill the first rows, whose number is returned."""
+    logs = np.empty(s.decay_fit_samples)
+    kept = 0
+    for i in range(len(waveforms)):
+        codes[i] = _prepare_one(waveforms[i], s, windows[kept], numbers[kept], logs)
+        kept += codes[i] == ACCEPTED
+    return kept
+
+
+def prepare_block(
+    waveforms: npt.NDArray[np.float32], settings: Settings
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32], npt.NDArray[np.float64]]:
+    """Prepare every trace of a block.
+
+    Parameters
+    ----------
+    waveforms
+        Raw traces, shape ``(n, length)`` with at least one sample each.
+    settings
+        What to do with them.
+
+    Returns
+    -------
+    tuple
+        Codes ``(n,)``, and of the accepted traces the windows ``(kept, samples_before
+        + samples_after)`` and numbers ``(kept, N_COLUMNS)``, with slopes per sample.
+    """
+    n = len(waveforms)
+    length = settings.samples_before + settings.samples_after
+    windows = np.empty((n, length), np.float32)
+    numbers = np.empty((n, N_COLUMNS))
+    codes = np.empty(n, np.uint8)
+    kept = _prepare_block(np.ascontiguousarray(waveforms), settings, windows, numbers, codes)
+    # Gives the unused rows back without copying the others.
+    windows.resize((kept, length), refcheck=False)
+    return codes, windows, numbers[:kept]

@@ -1,0 +1,139 @@
+"""Quality cuts that remove pile-up, decaying baselines and outliers (paper, section 3.3).
+
+The windows are medians plus or minus a number of robust standard deviations
+(1.4826 MAD) of the set itself, so that no constant of one detector enters.
+
+Noise in ADC counts is the same for all pulses of a channel, so the error of a slope
+of a normalised pulse goes as 1/amplitude.  Slopes are therefore compared as they
+would be at the set's median amplitude, which makes one window fit all energies.
+Chi-square is compared as if every pulse had the median noise: a pulse that sits in
+its own baseline window would otherwise excuse its bad fit by its large "noise".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.preparation import FloatColumn, Prepared, Rejection
+from cpunet.recipes.schema import Config, CutConfig
+
+# Below this many pulses the MAD says nothing and no window is drawn.
+_FEWEST = 10
+_SIGMA_PER_MAD = 1.4826
+_FLOAT32_ROUNDING = 2.0**-23
+
+
+class CutWindow(Config):
+    """One accepted interval; a bound of None does not bound.
+
+    ``tail_slope`` and ``baseline_slope`` are in 1/ms at the median amplitude,
+    ``baseline`` in units of the raw trace, ``chi2`` without unit.
+    """
+
+    name: str
+    centre: float
+    low: float | None
+    high: float | None
+
+
+class CutWindows(Config):
+    """The windows of a set, with what its pulses are compared at.
+
+    Parameters
+    ----------
+    amplitude, noise
+        Median scale and median baseline RMS of the set, in units of the raw trace.
+    windows
+        In the order in which they are applied.
+    """
+
+    amplitude: float
+    noise: float
+    windows: tuple[CutWindow, ...]
+
+
+def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
+    """Draw the windows from the set's own medians and MADs.
+
+    Parameters
+    ----------
+    prepared
+        Measured pulses of one channel.  Of several energies at once only if
+        prepared from raw traces: pulses scaled before hide how their noise differs.
+    config
+        Half-widths in robust standard deviations.
+
+    Returns
+    -------
+    CutWindows
+        For ``tail_slope``, ``chi2`` (upper bound only), ``baseline`` and
+        ``baseline_slope``; none from fewer than ten pulses.
+
+    Raises
+    ------
+    CpunetError
+        If the set is empty.
+    """
+    if not len(prepared):
+        raise CpunetError("no pulses to draw quality cuts from; select more energies or files")
+    amplitude = float(np.median(prepared.scale))
+    noise = float(np.median(prepared.baseline_rms * prepared.scale))
+    sigmas = {
+        "tail_slope": config.decay_sigmas,
+        "chi2": config.chi2_sigmas,
+        "baseline": config.baseline_sigmas,
+        "baseline_slope": config.baseline_sigmas,
+    }
+    windows = []
+    for name, k in sigmas.items():
+        values, weights = _values(prepared, name, amplitude, noise)
+        finite = np.isfinite(values)
+        if finite.sum() < _FEWEST:
+            continue
+        centre = float(np.median(values[finite]))
+        deviations = np.abs((values - centre) * weights)[finite]
+        # A baseline is no outlier for differing by less than one sample's noise.
+        floor = noise if name == "baseline" else 0.0
+        rounding = _FLOAT32_ROUNDING * float(np.median(np.abs(values[finite])))
+        sigma = max(_SIGMA_PER_MAD * float(np.median(deviations)), floor, rounding)
+        low = None if name == "chi2" else centre - k * sigma
+        windows.append(CutWindow(name=name, centre=centre, low=low, high=centre + k * sigma))
+    return CutWindows(amplitude=amplitude, noise=noise, windows=tuple(windows))
+
+
+def compared(prepared: Prepared, cuts: CutWindows, window: CutWindow) -> FloatColumn:
+    """Each pulse's value in the form that `window` bounds, for cutting and for figures."""
+    values, weights = _values(prepared, window.name, cuts.amplitude, cuts.noise)
+    return window.centre + (values - window.centre) * weights
+
+
+def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
+    """Drop the pulses outside a window and count each under the first that it fails.
+
+    A value that does not exist (chi-square without noise) fails no window.
+    """
+    reasons: npt.NDArray[np.uint8] = np.zeros(len(prepared), np.uint8)
+    for window in cuts.windows:
+        values = compared(prepared, cuts, window)
+        outside = np.zeros(len(prepared), bool)
+        if window.low is not None:
+            outside |= values < window.low
+        if window.high is not None:
+            outside |= values > window.high
+        reasons[outside & (reasons == Rejection.ACCEPTED)] = Rejection[window.name.upper()]
+    return prepared.rejected(reasons)
+
+
+def _values(
+    prepared: Prepared, name: str, amplitude: float, noise: float
+) -> tuple[FloatColumn, FloatColumn]:
+    """A parameter and the factor by which deviations of each pulse count."""
+    values: FloatColumn = getattr(prepared, name)
+    if name in ("tail_slope", "baseline_slope"):
+        return values, prepared.scale / amplitude
+    if name == "chi2":
+        rms = prepared.baseline_rms * prepared.scale
+        values = values * (rms / noise) ** 2 if noise > 0 else np.full_like(values, np.nan)
+    return values, np.ones_like(values)

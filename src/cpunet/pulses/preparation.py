@@ -1,0 +1,248 @@
+"""From raw traces to the aligned, normalised windows that a network sees.
+
+The definition is that of the paper (Bhimani et al. 2026, section 3.3): measured
+traces are aligned at 99.9 % of their maximum, lose their baseline and are scaled
+to a fixed level of their last samples; simulated pulses are aligned alike and
+scaled to 0…1.  Nothing is skipped silently: each trace gets a `Rejection`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses import _kernels
+from cpunet.pulses.container import Pulses
+from cpunet.recipes.schema import PreparationConfig
+
+Kind = Literal["simulated", "measured"]
+FloatColumn = npt.NDArray[np.float64]
+Codes = npt.NDArray[np.uint8]
+
+
+class Rejection(IntEnum):
+    """Why a pulse was dropped; the values and labels are stored and never change.
+
+    Examples
+    --------
+    >>> Rejection(4).label
+    'window_outside_record'
+    """
+
+    ACCEPTED = _kernels.ACCEPTED
+    NAN = _kernels.NAN
+    CONSTANT = _kernels.CONSTANT
+    SATURATED = _kernels.SATURATED
+    WINDOW_OUTSIDE_RECORD = _kernels.WINDOW_OUTSIDE_RECORD
+    NO_AMPLITUDE = _kernels.NO_AMPLITUDE
+    TAIL_NOT_POSITIVE = _kernels.TAIL_NOT_POSITIVE
+    ENERGY_UNKNOWN = 16
+    ENERGY_OUTSIDE_SELECTION = 17
+    TAIL_SLOPE = 32
+    CHI2 = 33
+    BASELINE = 34
+    BASELINE_SLOPE = 35
+
+    @property
+    def label(self) -> str:
+        """The name used in counts and reports."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Prepared pulses, how each was made, and what became of those not among them.
+
+    ``pulses.waveforms = (raw - baseline) / scale``, one row per accepted pulse.
+
+    Parameters
+    ----------
+    pulses
+        The accepted pulses, windows of shape ``(n, samples_before + samples_after)``.
+    index
+        Row of each in the source.
+    baseline, scale
+        Of the raw trace, in its units.
+    align_sample
+        Sample of the raw trace that became sample ``samples_before``.
+    baseline_rms
+        RMS of the raw baseline window about a straight line, divided by `scale`.
+    baseline_slope
+        Slope of that line divided by `scale`, in 1/ms.
+    tail_slope
+        Slope of the logarithm of the tail, in 1/ms: negative for a decay.
+    chi2
+        Reduced chi-square of that fit, with `baseline_rms` as the error of each
+        sample; NaN for pulses without noise.
+    codes
+        A `Rejection` for every row read, accepted or not.
+    first_index
+        Row of the source that ``codes[0]`` belongs to.
+    """
+
+    pulses: Pulses
+    index: npt.NDArray[np.int64]
+    baseline: FloatColumn
+    scale: FloatColumn
+    align_sample: npt.NDArray[np.int64]
+    baseline_rms: FloatColumn
+    baseline_slope: FloatColumn
+    tail_slope: FloatColumn
+    chi2: FloatColumn
+    codes: Codes
+    first_index: int = 0
+
+    def __len__(self) -> int:
+        return len(self.pulses)
+
+    @property
+    def n_read(self) -> int:
+        """Pulses looked at, accepted or not."""
+        return len(self.codes)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Number of rejected pulses by reason, for the reasons that occurred."""
+        counts = np.bincount(self.codes, minlength=1)
+        return {
+            Rejection(int(code)).label: int(counts[code])
+            for code in np.flatnonzero(counts)
+            if code
+        }
+
+    def __getitem__(
+        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
+    ) -> Prepared:
+        """The pulses of a slice, a mask or a list of rows.
+
+        Leaving pulses out this way is a choice, not a rejection: `codes` and the
+        counts stay those of everything read.
+        """
+        columns = {name: getattr(self, name)[which] for name in _PER_PULSE}
+        return replace(self, **columns)
+
+    def rejected(self, reasons: Codes) -> Prepared:
+        """Drop the pulses with a reason other than ``Rejection.ACCEPTED`` and count them.
+
+        Parameters
+        ----------
+        reasons
+            One `Rejection` for each of the pulses.
+        """
+        if not reasons.any():
+            return self
+        codes = self.codes.copy()
+        codes[self.index - self.first_index] = reasons
+        return replace(self[reasons == Rejection.ACCEPTED], codes=codes)
+
+    @classmethod
+    def concatenate(cls, sets: Sequence[Prepared]) -> Prepared:
+        """Join sets in the order they were read.
+
+        Rows are counted on from set to set: for consecutive blocks of a file they
+        stay the rows of that file, for several files they are rows of the sequence.
+
+        Raises
+        ------
+        CpunetError
+            If there is no set, or lengths or sampling periods differ.
+        """
+        pulses = Pulses.concatenate([s.pulses for s in sets])
+        first = sets[0].first_index
+        starts = first + np.cumsum([0, *(s.n_read for s in sets[:-1])])
+        shifted = [
+            s.index + (start - s.first_index) for s, start in zip(sets, starts, strict=True)
+        ]
+        joined = {
+            name: np.concatenate([getattr(s, name) for s in sets])
+            for name in (*_PER_PULSE, "codes")
+            if name not in ("pulses", "index")
+        }
+        return cls(pulses=pulses, index=np.concatenate(shifted), first_index=first, **joined)
+
+
+_PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name not in ("codes", "first_index"))
+
+
+def prepare(
+    pulses: Pulses, config: PreparationConfig, kind: Kind, first_index: int = 0
+) -> Prepared:
+    """Align, cut out and normalise every pulse (paper, section 3.3).
+
+    The time that becomes sample ``samples_before`` is the first sample after the
+    last one below ``align_fraction`` of the maximum.  A *measured* window loses the
+    mean of its first ``baseline_samples`` and is scaled so that its last
+    ``tail_samples`` average ``tail_level``.  A *simulated* one is scaled from its
+    lowest and highest value to 0…1.  Before the record the window is filled with 0,
+    after it with the record's last value; a measured window may need no more of this
+    than the ``max_padding`` settings allow.  Preparing prepared pulses changes nothing.
+
+    Parameters
+    ----------
+    pulses
+        Raw traces of any length, in any units.
+    config
+        Lengths in samples, fractions and levels.
+    kind
+        Which of the two normalisations.
+    first_index
+        Row of the first pulse in its source.
+
+    Returns
+    -------
+    Prepared
+        The accepted pulses; ``codes`` says for each input what became of it.
+
+    Raises
+    ------
+    CpunetError
+        If the traces have no samples.
+
+    Examples
+    --------
+    >>> from cpunet.recipes.schema import PreparationConfig
+    >>> config = PreparationConfig(
+    ...     samples_before=4, samples_after=4, align_fraction=0.999, baseline_samples=2,
+    ...     tail_samples=1, tail_level=0.8, decay_fit_samples=3, max_padding_before=0,
+    ...     max_padding_after=0, saturation_run=4)
+    >>> raw = Pulses.of([[0, 0.5, 2, 2, 2], [1, 1, 1, 1, 1]], dt_ns=16)
+    >>> prepared = prepare(raw, config, "simulated")
+    >>> prepared.pulses.waveforms.tolist()
+    [[0.0, 0.0, 0.0, 0.25, 1.0, 1.0, 1.0, 1.0]]
+    >>> prepared.rejections
+    {'constant': 1}
+    """
+    if pulses.length == 0:
+        raise CpunetError("the pulses have no samples; give traces of at least one sample")
+    settings = _kernels.Settings(
+        simulated=kind == "simulated",
+        **config.model_dump(include=set(_kernels.Settings._fields)),
+    )
+    codes, windows, numbers = _kernels.prepare_block(pulses.waveforms, settings)
+    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
+    per_ms = 1e6 / pulses.dt_ns
+    return Prepared(
+        pulses=Pulses(
+            waveforms=windows,
+            dt_ns=pulses.dt_ns,
+            energy_kev=pulses.energy_kev[rows],
+            event_number=pulses.event_number[rows],
+            peak=pulses.peak[rows],
+        ),
+        index=first_index + rows,
+        baseline=numbers[:, _kernels.BASELINE].copy(),
+        scale=numbers[:, _kernels.SCALE].copy(),
+        align_sample=numbers[:, _kernels.ALIGN_SAMPLE].astype(np.int64),
+        baseline_rms=numbers[:, _kernels.BASELINE_RMS].copy(),
+        baseline_slope=numbers[:, _kernels.BASELINE_SLOPE] * per_ms,
+        tail_slope=numbers[:, _kernels.TAIL_SLOPE] * per_ms,
+        chi2=numbers[:, _kernels.CHI2].copy(),
+        codes=codes,
+        first_index=first_index,
+    )

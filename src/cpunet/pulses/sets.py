@@ -1,0 +1,157 @@
+"""A file of raw pulses becomes one prepared set, block by block.
+
+Only the windows of accepted pulses are kept, so memory grows with what is used of a
+file and not with the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
+from cpunet.recipes.schema import PreparationConfig
+
+# Traces held at a time: 20 to 130 MB for the record lengths in use.
+BLOCK_SIZE = 4096
+
+Select = Callable[[FloatColumn], npt.NDArray[np.bool_]]
+PeakNames = Callable[[FloatColumn], npt.NDArray[np.str_]]
+
+_REMEDIES = {
+    Rejection.NAN: "check how the file was written",
+    Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
+    Rejection.SATURATED: "select lower energies or another channel",
+    Rejection.WINDOW_OUTSIDE_RECORD: (
+        "give longer records or allow more max_padding_before and max_padding_after"
+    ),
+    Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
+    Rejection.TAIL_NOT_POSITIVE: "select higher energies",
+    Rejection.ENERGY_UNKNOWN: "give calibrated energies or select no peaks",
+    Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
+}
+
+
+class Source(Protocol):
+    """Anything that yields raw pulses in blocks, as the readers do."""
+
+    @property
+    def path(self) -> Path:
+        """The file, for messages."""
+
+    @property
+    def dt_ns(self) -> float:
+        """Sampling period in ns."""
+
+    def blocks(self, size: int, /) -> Iterator[Pulses]:
+        """The file's pulses in order, at most `size` at a time."""
+
+
+def load_prepared(
+    source: Source,
+    config: PreparationConfig,
+    kind: Kind,
+    *,
+    select: Select | None = None,
+    peaks: PeakNames | None = None,
+    limit: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Prepared:
+    """Read, select, prepare and collect the pulses of a file.
+
+    Parameters
+    ----------
+    source
+        Where the raw pulses come from.
+    config, kind
+        As for `prepare`.
+    select
+        From energies in keV to a mask of those wanted; without it, all are, even
+        those whose energy is not known.
+    peaks
+        From energies in keV to the name of the peak of each.
+    limit
+        Stop reading once this many pulses were accepted.
+    progress
+        Called after each block with the number of pulses read since the last call.
+
+    Returns
+    -------
+    Prepared
+        The accepted pulses of the file; every pulse read has a code.
+
+    Raises
+    ------
+    CpunetError
+        If no pulse is left: the message names the file, counts by reason, and what to do.
+    """
+    sets: list[Prepared] = []
+    n_read = n_kept = 0
+    for block in source.blocks(BLOCK_SIZE):
+        part = _prepare_selected(block, config, kind, select, peaks, n_read)
+        n_read += len(block)
+        if limit is not None and n_kept + len(part) >= limit:
+            part = _shortened(part, limit - n_kept)
+        n_kept += len(part)
+        sets.append(part)
+        if progress is not None:
+            progress(len(block))
+        if limit is not None and n_kept >= limit:
+            break
+    if not n_kept:
+        raise CpunetError(_nothing_left(source, sets))
+    return Prepared.concatenate(sets)
+
+
+def _prepare_selected(
+    block: Pulses,
+    config: PreparationConfig,
+    kind: Kind,
+    select: Select | None,
+    peaks: PeakNames | None,
+    first_index: int,
+) -> Prepared:
+    """Prepare the selected pulses of a block; the others get their code."""
+    codes: Codes = np.zeros(len(block), np.uint8)
+    if select is not None:
+        known = np.isfinite(block.energy_kev)
+        codes[known] = np.where(
+            select(block.energy_kev[known]),
+            Rejection.ACCEPTED,
+            Rejection.ENERGY_OUTSIDE_SELECTION,
+        )
+        codes[~known] = Rejection.ENERGY_UNKNOWN
+    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
+    selected = block[rows]
+    if peaks is not None:
+        selected = replace(selected, peak=peaks(selected.energy_kev))
+    part = prepare(selected, config, kind)
+    codes[rows] = part.codes
+    return replace(
+        part, index=first_index + rows[part.index], codes=codes, first_index=first_index
+    )
+
+
+def _shortened(part: Prepared, n: int) -> Prepared:
+    """The first `n` pulses, as if nothing had been read after them."""
+    n_read = int(part.index[n - 1]) + 1 - part.first_index
+    return replace(part[:n], codes=part.codes[:n_read])
+
+
+def _nothing_left(source: Source, sets: list[Prepared]) -> str:
+    codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
+    if not len(codes):
+        return f"{source.path}: holds no pulses; choose another file or table"
+    counts = np.bincount(codes)
+    reasons = ", ".join(
+        f"{counts[c]} {Rejection(int(c)).label}" for c in np.flatnonzero(counts)
+    )
+    remedy = _REMEDIES[Rejection(int(counts.argmax()))]
+    return f"{source.path}: none of {len(codes)} pulses can be used ({reasons}); {remedy}"

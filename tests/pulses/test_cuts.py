@@ -1,0 +1,144 @@
+"""Quality cuts: outliers put in are found, the rest stays, whatever the energies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.cuts import CutWindows, apply_cuts, compared, fit_cuts
+from cpunet.pulses.preparation import Prepared, prepare
+from cpunet.recipes.schema import CutConfig, PreparationConfig
+
+PREPARATION = PreparationConfig(
+    samples_before=400,
+    samples_after=400,
+    align_fraction=0.999,
+    baseline_samples=200,
+    tail_samples=5,
+    tail_level=0.80,
+    decay_fit_samples=300,
+    max_padding_before=200,
+    max_padding_after=0,
+    saturation_run=4,
+)
+CUTS = CutConfig(decay_sigmas=6.0, chi2_sigmas=6.0, baseline_sigmas=6.0)
+Array = npt.NDArray[np.float64]
+
+
+def pulse(start: float, tau_samples: float = 3750.0) -> Array:
+    t = np.maximum(np.arange(1200) - start, 0)
+    return np.asarray((1 - np.exp(-((t / 20) ** 2))) * np.exp(-t / tau_samples))
+
+
+def traces(amplitudes: Array, seed: int = 0) -> Array:
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 10, (len(amplitudes), 1200))
+    offsets = rng.normal(14_000, 30, (len(amplitudes), 1))
+    return np.asarray(offsets + amplitudes[:, None] * pulse(560) + noise)
+
+
+def prepared_of(raw: Array) -> Prepared:
+    return prepare(Pulses.of(raw, dt_ns=16), PREPARATION, "measured")
+
+
+@pytest.fixture(scope="module")
+def spoiled() -> Prepared:
+    """Five hundred clean pulses of all energies and five outliers at known rows."""
+    rng = np.random.default_rng(3)
+    raw = traces(rng.uniform(2_000, 40_000, 500))
+    raw[10] += 3_000 * np.exp(-np.arange(1200) / 3750)  # on the tail of an earlier pulse
+    raw[20] += 1_000 * pulse(260)  # pile-up in the baseline window
+    raw[30] += 500 * pulse(800)  # pile-up on the tail, too small to move the maximum
+    raw[40] += 900  # another baseline level
+    raw[50, 560:] = 14_000 + 20_000 * pulse(560, 3000)[560:]  # another decay
+    return prepared_of(raw)
+
+
+def test_outliers_are_found_and_clean_pulses_stay(spoiled: Prepared) -> None:
+    cut = apply_cuts(spoiled, fit_cuts(spoiled, CUTS))
+    assert set(spoiled.index) - set(cut.index) == {10, 20, 30, 40, 50}
+    assert set(cut.rejections) <= {"tail_slope", "chi2", "baseline", "baseline_slope"}
+    assert len(cut) + sum(cut.rejections.values()) == cut.n_read == 500
+
+
+def test_windows_survive_json_and_are_in_the_units_they_state(spoiled: Prepared) -> None:
+    cuts = fit_cuts(spoiled, CUTS)
+    assert CutWindows.model_validate_json(cuts.model_dump_json()) == cuts
+    windows = {window.name: window for window in cuts.windows}
+    assert -1e3 / windows["tail_slope"].centre == pytest.approx(60.0, rel=0.01)  # us
+    assert windows["chi2"].low is None
+    assert windows["baseline"].centre == pytest.approx(14_000, abs=10)
+    assert cuts.noise == pytest.approx(10, rel=0.05)
+    values = compared(spoiled, cuts, windows["baseline_slope"])
+    inside = (windows["baseline_slope"].low < values) & (
+        values < windows["baseline_slope"].high
+    )
+    assert inside.sum() >= 497
+
+
+def test_windows_of_one_set_apply_to_another(spoiled: Prepared) -> None:
+    cuts = fit_cuts(spoiled, CUTS)
+    other = prepared_of(traces(np.full(100, 30_000.0), seed=9))
+    assert len(apply_cuts(other, cuts)) == 100
+    slower = prepared_of(traces(np.full(20, 30_000.0)) + 3_000 * pulse(-500))
+    assert len(apply_cuts(slower, cuts)) == 0
+
+
+@settings(max_examples=15, deadline=None)
+@given(gain=st.floats(0.05, 20), offset=st.floats(-1e4, 1e4))
+def test_gain_and_offset_do_not_matter(spoiled: Prepared, gain: float, offset: float) -> None:
+    changed = prepared_of(gain * (_raw(spoiled) + offset))
+    kept = apply_cuts(changed, fit_cuts(changed, CUTS))
+    assert set(range(500)) - set(kept.index) == {10, 20, 30, 40, 50}
+
+
+def _raw(prepared: Prepared) -> Array:
+    """The spoiled traces again, from windows: what preparation did is undone."""
+    windows = prepared.pulses.waveforms.astype(float)
+    return np.asarray(windows * prepared.scale[:, None] + prepared.baseline[:, None])
+
+
+def test_pulses_without_noise_lose_nothing() -> None:
+    raw = np.linspace(1_000, 2_000, 50)[:, None] * pulse(560)
+    prepared = prepared_of(raw)
+    cuts = fit_cuts(prepared, CUTS)
+    assert len(apply_cuts(prepared, cuts)) == 50
+
+
+def test_prepared_pulses_of_one_energy_can_be_cut_again() -> None:
+    once = prepared_of(traces(np.full(300, 30_000.0)))
+    again = prepared_of(once.pulses.waveforms.astype(float))
+    assert len(apply_cuts(again, fit_cuts(again, CUTS))) == 300
+
+
+def test_too_few_pulses_draw_no_windows() -> None:
+    few = prepared_of(traces(np.full(9, 20_000.0)))
+    assert fit_cuts(few, CUTS).windows == ()
+    assert apply_cuts(few, fit_cuts(few, CUTS)) is few
+
+
+def test_an_empty_set_is_refused(spoiled: Prepared) -> None:
+    with pytest.raises(CpunetError, match="no pulses"):
+        fit_cuts(spoiled[:0], CUTS)
+
+
+@pytest.mark.parametrize("name", ["closure", "closure-shifted"])
+def test_known_contamination(name: str, reference_data: Path) -> None:
+    with h5py.File(reference_data / name / "data.lh5") as file:
+        raw = file["geds/raw/waveform/values"][:]
+    flag = np.load(reference_data / name / "data_labels.npz")["flag"]
+    prepared = prepared_of(raw)
+    cut = apply_cuts(prepared, fit_cuts(prepared, CUTS))
+    kept = np.isin(np.arange(len(raw)), cut.index)
+    assert kept[flag == 0].mean() > 0.995
+    assert (~kept[flag == 1]).mean() > 0.7  # decaying baselines
+    # A third of the pile-up is outside the window or within the charge collection.
+    assert (~kept[flag == 2]).mean() > 0.6

@@ -1,0 +1,339 @@
+"""Preparation against a plain NumPy reading of its definition, and its invariances."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Prepared, Rejection, prepare
+from cpunet.recipes.schema import PreparationConfig
+
+CONFIG = PreparationConfig(
+    samples_before=400,
+    samples_after=400,
+    align_fraction=0.999,
+    baseline_samples=200,
+    tail_samples=5,
+    tail_level=0.80,
+    decay_fit_samples=300,
+    max_padding_before=200,
+    max_padding_after=0,
+    saturation_run=4,
+)
+DT_NS = 16.0
+Array = npt.NDArray[np.float64]
+
+
+def measured(
+    *,
+    n: int = 1,
+    length: int = 1200,
+    start: float = 560.0,
+    amplitude: float = 20_000.0,
+    rise: float = 25.0,
+    tau_us: float = 60.0,
+    noise: float = 8.0,
+    offset: float = 14_000.0,
+    seed: int = 0,
+) -> Array:
+    """Traces of a smooth charge pulse behind a resistive-feedback preamplifier."""
+    rng = np.random.default_rng(seed)
+    t = np.maximum(np.arange(length) - start, 0)
+    pulse = (1 - np.exp(-((t / rise) ** 2))) * np.exp(-t * DT_NS / (1e3 * tau_us))
+    return np.asarray(np.rint(offset + amplitude * pulse + rng.normal(0, noise, (n, length))))
+
+
+def simulated(*, n: int = 1, length: int = 225, seed: int = 0) -> Array:
+    """Monotone charge pulses that start anywhere and end flat."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(length)
+    drift = rng.uniform(10, 100, (n, 1))
+    x = np.clip((t - rng.uniform(0, 20, (n, 1))) / drift, 0, 1)
+    return np.asarray(x**2 * (3 - 2 * x))
+
+
+def prepared_of(raw: npt.ArrayLike, kind: str = "measured", **changes: object) -> Prepared:
+    config = CONFIG.model_copy(update=changes)
+    return prepare(Pulses.of(raw, dt_ns=DT_NS), config, kind)  # type: ignore[arg-type]
+
+
+def by_definition(trace: Array) -> tuple[Array, int]:
+    """The definition for measured pulses, read literally, for one float64 trace."""
+    base = trace[:200].mean()
+    for _ in range(3):
+        top = int(trace.argmax())
+        below = np.flatnonzero(trace[:top] < base + 0.999 * (trace[top] - base))
+        align = int(below[-1]) + 1
+        window = trace[align - 400 : align + 400]
+        base = window[:200].mean()
+    window = window - base
+    return window * 0.80 / window[-5:].mean(), align
+
+
+class TestMeasured:
+    def test_follows_the_definition(self) -> None:
+        raw = measured(n=50)
+        prepared = prepared_of(raw)
+        assert len(prepared) == 50
+        for i, trace in enumerate(raw):
+            window, align = by_definition(trace)
+            assert prepared.align_sample[i] == align
+            np.testing.assert_allclose(prepared.pulses.waveforms[i], window, atol=1e-6)
+
+    def test_levels_and_undoing(self) -> None:
+        raw = measured(n=20)
+        prepared = prepared_of(raw)
+        windows = prepared.pulses.waveforms.astype(float)
+        np.testing.assert_allclose(windows[:, :200].mean(1), 0, atol=1e-7)
+        np.testing.assert_allclose(windows[:, -5:].mean(1), 0.80, rtol=1e-6)
+        for i in range(20):
+            start = prepared.align_sample[i] - 400
+            undone = windows[i] * prepared.scale[i] + prepared.baseline[i]
+            np.testing.assert_allclose(undone, raw[i, start : start + 800], atol=0.01)
+
+    def test_noise_tail_and_chi_square_are_those_put_in(self) -> None:
+        prepared = prepared_of(measured(n=400, noise=10.0, tau_us=54.6))
+        rms = prepared.baseline_rms * prepared.scale
+        assert np.mean(rms) == pytest.approx(10.0, rel=0.02)
+        assert np.mean(-1e3 / prepared.tail_slope) == pytest.approx(54.6, rel=0.002)
+        # Expectation n/(n-2) from the estimated noise; the error of the mean is 0.006.
+        assert np.mean(prepared.chi2) == pytest.approx(1.01, abs=0.03)
+        assert abs(np.mean(prepared.baseline_slope)) < 0.05
+
+    def test_tail_slope_equals_a_straight_line_fit(self) -> None:
+        prepared = prepared_of(measured(n=5))
+        t_ms = np.arange(300) * DT_NS * 1e-6
+        logs = np.log(prepared.pulses.waveforms[:, -300:].astype(float))
+        expected = np.polyfit(t_ms, logs.T, 1)[0]
+        np.testing.assert_allclose(prepared.tail_slope, expected, rtol=1e-6)
+
+    def test_baseline_slope_of_a_decaying_baseline(self) -> None:
+        raw = measured(n=3, noise=0.0) + np.arange(1200) * -0.5
+        prepared = prepared_of(raw)
+        per_ms = -0.5 / (DT_NS * 1e-6) / prepared.scale
+        np.testing.assert_allclose(prepared.baseline_slope, per_ms, rtol=1e-3)
+
+    @settings(max_examples=30, deadline=None)
+    @given(
+        gain=st.floats(0.01, 50),
+        offset=st.floats(-2e4, 2e4),
+        seed=st.integers(0, 2**32 - 1),
+    )
+    def test_gain_and_offset_do_not_matter(self, gain: float, offset: float, seed: int) -> None:
+        raw = measured(n=4, seed=seed)
+        plain = prepared_of(raw)
+        changed = prepared_of(gain * (raw + offset))
+        # float32 holds an offset trace to 2e-7 of full scale: a tie may move a sample.
+        same = plain.align_sample == changed.align_sample
+        assert np.all(abs(plain.align_sample - changed.align_sample) <= 2)
+        np.testing.assert_allclose(
+            plain.pulses.waveforms[same], changed.pulses.waveforms[same], atol=1e-5
+        )
+        np.testing.assert_allclose(plain.tail_slope[same], changed.tail_slope[same], atol=2e-2)
+
+    @settings(max_examples=30, deadline=None)
+    @given(
+        amplitude=st.floats(500, 50_000),
+        start=st.floats(410, 700),
+        rise=st.floats(5, 60),
+        seed=st.integers(0, 2**32 - 1),
+    )
+    def test_preparing_again_changes_nothing(
+        self, amplitude: float, start: float, rise: float, seed: int
+    ) -> None:
+        once = prepared_of(
+            measured(n=4, amplitude=amplitude, start=start, rise=rise, seed=seed)
+        )
+        twice = prepared_of(once.pulses.waveforms)
+        assert twice.rejections == {}
+        np.testing.assert_array_equal(twice.align_sample, 400)
+        np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
+        np.testing.assert_allclose(twice.tail_slope, once.tail_slope, atol=1e-3)
+
+    def test_preparing_again_survives_exact_ties_with_the_threshold(self) -> None:
+        # 999 of 1000 is the threshold itself: float32 rounding decides on which side.
+        steps = np.arange(1, 60)[:, None]
+        raw = np.zeros((59, 1200))
+        raw[:, 500:] = np.exp(-np.arange(700) * 0.016 / 60) * 1000
+        raw[:, 499] = 999
+        raw[:, 498] = 990
+        once = prepared_of(raw * steps)
+        assert set(once.align_sample) == {499}
+        twice = prepared_of(once.pulses.waveforms)
+        np.testing.assert_array_equal(twice.align_sample, 400)
+        np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
+
+    def test_early_pulse_is_padded_with_zero(self) -> None:
+        prepared = prepared_of(measured(start=260.0, length=800))
+        padding = 400 - int(prepared.align_sample[0])
+        assert 0 < padding < 200
+        window = prepared.pulses.waveforms[0]
+        assert np.all(window[:padding] == 0)
+        assert np.all(window[padding : padding + 5] != 0)
+        assert abs(window[padding:200].mean()) < 1e-6
+
+    def test_records_too_short_are_counted(self) -> None:
+        early, late = measured(start=100.0), measured(start=900.0)
+        prepared = prepared_of(np.concatenate([early, late, measured()]))
+        assert prepared.codes.tolist() == [Rejection.WINDOW_OUTSIDE_RECORD] * 2 + [0]
+        assert prepared.rejections == {"window_outside_record": 2}
+        assert prepared.index.tolist() == [2]
+        assert len(prepared_of(late, max_padding_after=200)) == 1
+
+    def test_pile_up_moves_the_window_out_of_the_record(self) -> None:
+        raw = measured() + measured(start=1000.0, offset=0.0)
+        assert prepared_of(raw).rejections == {"window_outside_record": 1}
+
+    def test_what_is_not_a_pulse_is_counted_by_reason(self) -> None:
+        good = measured()[0]
+        noise = np.random.default_rng(1).normal(14_000, 10, 1200).round()
+        broken = good.copy()
+        broken[30] = np.nan
+        endless = good.copy()
+        endless[700] = np.inf
+        undershoot = good.copy()
+        undershoot[650:] = 13_000
+        traces = [good, broken, endless, np.full(1200, 5.0), noise, 30_000 - good, undershoot]
+        prepared = prepared_of(np.array(traces))
+        labels = [Rejection(c).label for c in prepared.codes]
+        assert labels == ["accepted", "nan", "nan", "constant"] + 3 * ["no_amplitude"]
+        assert sum(prepared.rejections.values()) + len(prepared) == prepared.n_read == 7
+
+    def test_a_tail_without_logarithm_is_counted(self) -> None:
+        trace = measured()[0]
+        trace[900] = 10_000
+        assert prepared_of([trace]).rejections == {"tail_not_positive": 1}
+
+    def test_traces_without_samples_are_refused(self) -> None:
+        with pytest.raises(CpunetError, match="no samples"):
+            prepared_of(np.zeros((3, 0)))
+
+    def test_no_traces_are_no_error(self) -> None:
+        prepared = prepared_of(np.zeros((0, 1200)))
+        assert (len(prepared), prepared.n_read, prepared.rejections) == (0, 0, {})
+
+    @settings(max_examples=60, deadline=None)
+    @given(length=st.integers(1, 900), seed=st.integers(0, 2**32 - 1), kind=st.booleans())
+    def test_any_trace_is_accepted_or_counted(self, length: int, seed: int, kind: bool) -> None:
+        rng = np.random.default_rng(seed)
+        odds = {0.0: 0.4, 1.0: 0.2, -5.0: 0.2, 7.0: 0.199, np.nan: 0.001}
+        raw = rng.choice([*odds], p=[*odds.values()], size=(5, length))
+        raw[1] = np.sort(raw[1])
+        raw[2] = 1e30 * rng.normal(size=length)
+        prepared = prepared_of(raw, "simulated" if kind else "measured")
+        assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read == 5
+        assert np.isfinite(prepared.pulses.waveforms).all()
+        assert np.isfinite(prepared.scale).all()
+
+
+class TestSaturation:
+    @pytest.mark.parametrize("ceiling", [30_000.0, 65_520.0, 65_535.0])
+    @pytest.mark.parametrize("noise", [0.0, 0.3, 3.0, 30.0])
+    def test_clipped_traces_are_found(self, ceiling: float, noise: float) -> None:
+        raw = measured(n=20, amplitude=1.1 * (ceiling - 14_000), noise=noise)
+        prepared = prepared_of(np.minimum(raw, ceiling))
+        assert prepared.rejections == {"saturated": 20}
+
+    @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 3.0, 10.0])
+    @pytest.mark.parametrize("amplitude", [200.0, 1000.0, 5000.0, 40_000.0])
+    def test_coarse_steps_and_slow_decays_are_not(self, noise: float, amplitude: float) -> None:
+        raw = measured(n=200, amplitude=amplitude, noise=noise, tau_us=550.0, length=1000)
+        assert "saturated" not in prepared_of(raw).rejections
+
+    def test_flat_simulated_tops_are_legitimate(self) -> None:
+        assert prepared_of(simulated(n=5), "simulated").rejections == {}
+
+
+class TestSimulated:
+    def test_scaled_to_one_aligned_and_padded(self) -> None:
+        raw = 3 + 2 * simulated(n=20)
+        prepared = prepared_of(raw, "simulated")
+        assert len(prepared) == 20
+        windows = prepared.pulses.waveforms
+        assert np.all(windows.min(1) == 0)
+        np.testing.assert_allclose(windows.max(1), 1, rtol=1e-6)
+        assert np.all(windows[:, 400] >= np.float32(0.999))
+        assert np.all(windows[:, 399] < np.float32(0.999))
+        for window, align, trace in zip(windows, prepared.align_sample, raw, strict=True):
+            assert np.all(window[: 400 - align] == 0)
+            inside = (trace - trace.min()) / np.ptp(trace)
+            np.testing.assert_allclose(
+                window[400 - align : 625 - align][: 400 + align], inside, atol=1e-6
+            )
+            assert np.all(window[625 - align :] == window[-1])
+
+    def test_no_noise_has_no_chi_square_and_no_slope(self) -> None:
+        prepared = prepared_of(simulated(n=5), "simulated")
+        assert np.isnan(prepared.chi2).all()
+        np.testing.assert_allclose(prepared.tail_slope, 0, atol=1e-3)
+
+    @settings(max_examples=30, deadline=None)
+    @given(seed=st.integers(0, 2**32 - 1), length=st.integers(130, 2000))
+    def test_preparing_again_changes_nothing(self, seed: int, length: int) -> None:
+        once = prepared_of(simulated(n=5, seed=seed, length=length), "simulated")
+        twice = prepared_of(once.pulses.waveforms, "simulated")
+        assert len(once) == len(twice) == 5
+        np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
+
+
+class TestSets:
+    def test_joining_blocks_equals_one_block(self) -> None:
+        raw = measured(n=30)
+        raw[[3, 17, 18]] = np.nan
+        pulses = Pulses.of(raw, dt_ns=DT_NS, energy_kev=np.arange(30.0))
+        whole = prepare(pulses, CONFIG, "measured")
+        blocks = [prepare(pulses[s : s + 7], CONFIG, "measured", s) for s in range(0, 30, 7)]
+        joined = Prepared.concatenate(blocks)
+        assert joined.rejections == whole.rejections == {"nan": 3}
+        np.testing.assert_array_equal(joined.index, whole.index)
+        np.testing.assert_array_equal(joined.codes, whole.codes)
+        np.testing.assert_array_equal(joined.pulses.waveforms, whole.pulses.waveforms)
+        np.testing.assert_array_equal(joined.pulses.energy_kev, joined.index)
+
+    def test_joining_files_counts_rows_on(self) -> None:
+        first, second = prepared_of(measured(n=4)), prepared_of(measured(n=3, seed=1))
+        joined = Prepared.concatenate([first, second])
+        assert joined.index.tolist() == list(range(7))
+        assert joined.n_read == 7
+
+    def test_rejecting_counts_and_choosing_does_not(self) -> None:
+        prepared = prepared_of(np.concatenate([np.full((1, 1200), np.nan), measured(n=4)]))
+        reasons = np.array([0, Rejection.CHI2, 0, Rejection.CHI2], np.uint8)
+        cut = prepared.rejected(reasons)
+        assert cut.rejections == {"nan": 1, "chi2": 2}
+        assert cut.index.tolist() == [1, 3]
+        assert len(cut) + sum(cut.rejections.values()) == cut.n_read
+        assert prepared.rejections == {"nan": 1}
+        chosen = prepared[np.array([2, 0])]
+        assert chosen.index.tolist() == [3, 1]
+        assert chosen.rejections == {"nan": 1}
+
+
+def test_closure_data_prepare_twice_alike(reference_data) -> None:  # type: ignore[no-untyped-def]
+    with h5py.File(reference_data / "closure" / "data.lh5") as file:
+        raw = file["geds/raw/waveform/values"][:600]
+    once = prepared_of(raw)
+    assert len(once) > 590
+    twice = prepared_of(once.pulses.waveforms)
+    np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
+    assert np.median(once.chi2) == pytest.approx(1, abs=0.3)
+
+
+def test_real_traces(reference_data) -> None:  # type: ignore[no-untyped-def]
+    with h5py.File(reference_data / "real" / "hpge_real_waveforms.h5") as file:
+        for group in file.values():
+            prepared = prepared_of(group["waveform"][:])
+            empty = group["is_baseline_only"][:].astype(bool)
+            assert not empty[prepared.index].any()
+        bench = file["th228_fcio"]
+        codes = prepared_of(bench["waveform"][:]).codes
+        saturated = bench["saturated"][:].astype(bool)
+        np.testing.assert_array_equal(codes == Rejection.SATURATED, saturated)
+        good = bench["clean"][:].astype(bool) & (bench["energy_keV"][:] > 300)
+    assert (codes[good] == Rejection.ACCEPTED).mean() > 0.98

@@ -1,0 +1,136 @@
+"""Prepared sets from sources: selection, counting, streaming, and one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.pulses import sets
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.sets import load_prepared
+from cpunet.recipes.schema import PreparationConfig
+
+CONFIG = PreparationConfig(
+    samples_before=20,
+    samples_after=20,
+    align_fraction=0.999,
+    baseline_samples=10,
+    tail_samples=2,
+    tail_level=0.80,
+    decay_fit_samples=10,
+    max_padding_before=5,
+    max_padding_after=0,
+    saturation_run=4,
+)
+
+
+class MemorySource:
+    """Pulses in memory, given out in blocks; says how far it was read."""
+
+    path = Path("run7.lh5")
+    dt_ns = 16.0
+
+    def __init__(self, pulses: Pulses) -> None:
+        self.pulses = pulses
+        self.given = 0
+
+    def blocks(self, size: int, /) -> Iterator[Pulses]:
+        for start in range(0, len(self.pulses), size):
+            block = self.pulses[start : start + size]
+            self.given += len(block)
+            yield block
+
+
+def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> MemorySource:
+    energy_kev = np.asarray(energies, float)
+    t = np.maximum(np.arange(60) - 27, 0)
+    raw = (
+        np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1) * np.exp(-t / 300)
+    )
+    raw[broken or []] = np.nan
+    return MemorySource(Pulses.of(raw, dt_ns=16, energy_kev=energy_kev))
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sets, "BLOCK_SIZE", 4)
+
+
+def near_1000(energy_kev: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    return abs(energy_kev - 1000) < 100
+
+
+def test_every_pulse_is_kept_or_counted() -> None:
+    energies = [1000, 1001, 50, np.nan, 1002, 1003, 2000, 999, 998, np.nan]
+    prepared = load_prepared(source_of(energies, [4]), CONFIG, "measured", select=near_1000)
+    assert prepared.pulses.energy_kev.tolist() == [1000, 1001, 1003, 999, 998]
+    assert prepared.index.tolist() == [0, 1, 5, 7, 8]
+    assert prepared.rejections == {"nan": 1, "energy_unknown": 2, "energy_outside_selection": 2}
+    assert prepared.n_read == 10
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.sampled_from([1000.0, 50.0, np.nan]), min_size=1, max_size=20),
+    st.integers(1, 20),
+)
+def test_counts_add_up(energies: list[float], limit: int) -> None:
+    source = source_of([*energies, 1000.0])
+    prepared = load_prepared(source, CONFIG, "measured", select=near_1000, limit=limit)
+    assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
+    assert len(prepared) == min(limit, energies.count(1000.0) + 1)
+    assert (source.pulses.energy_kev[prepared.index] == 1000).all()
+
+
+def test_without_selection_energies_need_not_be_known() -> None:
+    prepared = load_prepared(source_of([np.nan] * 5), CONFIG, "simulated")
+    assert (len(prepared), prepared.rejections) == (5, {})
+
+
+def test_peaks_are_named() -> None:
+    prepared = load_prepared(
+        source_of([1592, 1000, 1593]),
+        CONFIG,
+        "measured",
+        peaks=lambda energy_kev: np.where(energy_kev > 1500, "DEP", ""),
+    )
+    assert prepared.pulses.peak.tolist() == ["DEP", "", "DEP"]
+
+
+def test_limit_stops_reading_and_progress_is_told() -> None:
+    source, told = source_of([1000.0] * 40), list[int]()
+    prepared = load_prepared(source, CONFIG, "measured", limit=6, progress=told.append)
+    assert (len(prepared), prepared.n_read, source.given) == (6, 6, 8)
+    assert told == [4, 4]
+
+
+def test_only_windows_are_kept() -> None:
+    prepared = load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
+    assert prepared.pulses.waveforms.shape == (9, 40)
+    assert prepared.pulses.waveforms.base is None
+
+
+@pytest.mark.parametrize(
+    ("energies", "broken", "words"),
+    [
+        ([], [], ["run7.lh5", "no pulses"]),
+        ([50.0] * 9, [], ["9 energy_outside_selection", "calibration"]),
+        ([1000.0] * 5 + [50.0], [0, 1, 2, 3, 4], ["5 nan, 1 energy_outside", "written"]),
+        ([np.nan] * 3, [], ["3 energy_unknown", "calibrated energies"]),
+    ],
+)
+def test_nothing_left_is_one_line_with_counts_and_remedy(
+    energies: list[float], broken: list[int], words: list[str]
+) -> None:
+    with pytest.raises(CpunetError) as error:
+        load_prepared(source_of(energies, broken), CONFIG, "measured", select=near_1000)
+    message = str(error.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message
