@@ -1,0 +1,1 @@
+"""Pulse-shape parameters, comparison of distributions, paired scores, figures, report."""

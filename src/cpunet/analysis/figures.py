@@ -1,0 +1,283 @@
+"""Figures of a training and of its validation; each function returns a `Figure`.
+
+Object-oriented matplotlib throughout: nothing is drawn on a global state, so figures
+can be made in worker processes and notebooks alike.  Saving is the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import hist
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.analysis.comparisons import Comparison, histogram
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.parameters import PARAMETERS
+from cpunet.analysis.style import COLOURS, DATA_FILL, colours, label, styled
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+
+# Panels of the loss figure: which losses, under which name, in which colour.
+LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "Cycle and identity": {
+        "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
+        "cycle_backward": ("cycle, data → sim → data", COLOURS["iren"]),
+        "identity_data": ("identity, data", COLOURS["data"]),
+        "identity_sim": ("identity, simulation", COLOURS["raw"]),
+    },
+    "Generators, adversarial": {
+        "adversarial_ren": ("REN", COLOURS["ren"]),
+        "adversarial_iren": ("IREN", COLOURS["iren"]),
+    },
+    "Discriminators": {
+        "discriminator_data": ("data", COLOURS["data"]),
+        "discriminator_sim": ("simulation", COLOURS["raw"]),
+    },
+}
+
+
+@styled
+def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figure:
+    """The losses over the training: each record faint, the moving average on top.
+
+    Parameters
+    ----------
+    records
+        The training log: ``{"iteration": i, "losses": {name: value, …}}``, in order.
+    window
+        Records in the moving average.
+
+    Raises
+    ------
+    CpunetError
+        If there are no records.
+    """
+    if not records:
+        raise CpunetError("the training log is empty: there are no losses to draw; train first")
+    iteration = np.array([record["iteration"] for record in records], dtype=float)
+    figure = Figure(figsize=(10.5, 3.4))
+    panels = figure.subplots(1, len(LOSS_PANELS))
+    for axes, (title, losses) in zip(panels, LOSS_PANELS.items(), strict=True):
+        for name, (text, colour) in losses.items():
+            series = np.array([record["losses"].get(name, np.nan) for record in records], float)
+            if np.isnan(series).all():
+                continue
+            axes.plot(iteration, series, color=colour, alpha=0.25, linewidth=0.7)
+            average = _moving_average(series, window)
+            axes.plot(iteration[len(iteration) - len(average) :], average, colour, label=text)
+        axes.set(title=title, xlabel="Iteration")
+        if axes.lines:
+            axes.legend()
+    panels[0].set(ylabel="Loss", yscale="log")
+    figure.supxlabel(f"Lines: mean of {window} records", fontsize=8, x=0.99, ha="right")
+    return figure
+
+
+@styled
+def cycle_figure(
+    start: FloatArray,
+    middle: FloatArray,
+    end: FloatArray,
+    titles: tuple[str, str, str],
+    dt_ns: float,
+    pulses: int = 10,
+) -> Figure:
+    """A few pulses through one cycle in three panels (paper, figure of the cycles).
+
+    Parameters
+    ----------
+    start, middle, end
+        Pulses of shape ``(n, length)`` before, half-way through and after the cycle,
+        row by row of the same event.
+    titles
+        Of the three panels.
+    dt_ns
+        Sampling period in ns.
+    pulses
+        How many of the pulses are drawn.
+    """
+    figure = Figure(figsize=(10.5, 3.2))
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    time_us = np.arange(start.shape[1]) * dt_ns * 1e-3
+    shades = _shades(min(pulses, len(start)))
+    for axes, waveforms, title in zip(panels, (start, middle, end), titles, strict=True):
+        for waveform, shade in zip(waveforms, shades, strict=False):
+            axes.plot(time_us, waveform, color=shade, linewidth=1.0)
+        axes.set(title=title, xlabel="Time [µs]")
+    panels[0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
+    return figure
+
+
+@styled
+def parameter_histograms(
+    values: Mapping[str, Values],
+    axis: hist.axis.Regular,
+    parameter: str,
+    peak: str,
+    comparison: Comparison,
+) -> Figure:
+    """Distributions of one parameter: the data filled, each method as a line.
+
+    All histograms sum to one.  The outermost bars hold what lies outside the axis, and
+    the legend gives each method's IoU and the ceiling.
+
+    Parameters
+    ----------
+    values
+        By method, with the measured ones under ``"data"``.
+    axis
+        Binning, see `comparisons.data_axis`.
+    parameter
+        Its name in `PARAMETERS`.
+    peak
+        Name of the gamma line, for the title.
+    comparison
+        The parameter's entry of `comparisons.compare`.
+    """
+    palette = colours(values)
+    edges = _edges_with_flow(axis)
+    fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
+    figure = Figure(figsize=(5.6, 4.2))
+    axes = figure.subplots()
+    for method, heights in fractions.items():
+        is_data = method == "data"
+        axes.stairs(
+            heights,
+            edges,
+            fill=is_data,
+            facecolor=DATA_FILL if is_data else None,
+            edgecolor=palette[method],
+            linewidth=0.8 if is_data else 1.5,
+            label=f"{label(method)}{_score(method, comparison)}, {_size(values[method])}",
+            zorder=1 if is_data else 2,
+        )
+    # the bars at the ends may be as high as 1 and would flatten all that is between
+    top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
+    axes.set(
+        xlabel=PARAMETERS[parameter].axis_label,
+        ylabel="Fraction of events per bin",
+        xlim=(edges[0], edges[-1]),
+        ylim=(0, top),
+    )
+    _mark_flow(axes, edges, fractions, palette)
+    title = f"{peak}: bars beyond the dotted lines hold all events outside"
+    figure.legend(loc="outside upper left", title=title, alignment="left")
+    return figure
+
+
+@styled
+def mean_pulses(
+    sets: Mapping[str, FloatArray],
+    dt_ns: float,
+    peak: str,
+    samples_before: int = 100,
+    samples_after: int = 150,
+) -> Figure:
+    """Mean pulses aligned at half maximum, and their differences from the data's.
+
+    Parameters
+    ----------
+    sets
+        Pulses of shape ``(n, length)`` by method, the measured ones under ``"data"``;
+        methods are drawn over each other in this order.
+    dt_ns
+        Sampling period in ns.
+    peak
+        Name of the gamma line, for the title.
+    samples_before, samples_after
+        Samples drawn before and after the crossing of half the maximum.
+    """
+    palette = colours(sets)
+    means = {m: _mean_aligned(w, samples_before, samples_after) for m, w in sets.items()}
+    time_ns = (np.arange(samples_before + samples_after) - samples_before) * dt_ns
+    figure = Figure(figsize=(5.6, 4.8))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for method, mean in means.items():
+        text = f"{label(method)}, n = {len(sets[method])}"
+        # a broad grey line, so that a method which agrees does not hide the data
+        look = (
+            {"color": "0.65", "linewidth": 4.0}
+            if method == "data"
+            else {"color": palette[method]}
+        )
+        above.plot(time_ns, mean, label=text, **look)
+        if method != "data":
+            below.plot(time_ns, 100 * (mean - means["data"]), color=palette[method])
+    below.axhline(0, color="black", linewidth=0.8)
+    above.set(title=f"{peak}, mean pulse aligned at half maximum", ylabel="Pulse height")
+    above.legend(loc="lower right")
+    below.set(
+        xlabel="Time from half maximum [ns]",
+        ylabel="Method − data\n[% of full charge]",
+        xlim=(time_ns[0], time_ns[-1]),
+    )
+    # so that small differences show beside those of an untranslated simulation
+    below.set_yscale("symlog", linthresh=1.0)
+    below.yaxis.set_major_formatter("{x:g}")
+    return figure
+
+
+def _moving_average(series: Values, window: int) -> Values:
+    """Mean of each `window` neighbours; of all values if there are fewer."""
+    width = min(window, len(series))
+    return np.convolve(series, np.full(width, 1 / width), mode="valid")
+
+
+def _shades(count: int) -> Sequence[tuple[float, float, float, float]]:
+    from matplotlib import colormaps
+
+    return [colormaps["viridis"](x) for x in np.linspace(0, 0.9, count)]
+
+
+def _edges_with_flow(axis: hist.axis.Regular) -> Values:
+    """Edges of the bins, and of a bar at either end for what lies outside."""
+    edges: Values = axis.edges
+    bar = max(edges[-1] - edges[0], np.spacing(edges[-1])) / 25
+    return np.concatenate([[edges[0] - bar], edges, [edges[-1] + bar]])
+
+
+def _score(method: str, comparison: Comparison) -> str:
+    name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
+    score = comparison["iou"].get(name)
+    return "" if score is None else f" ({kind} {score:.1f} %)"
+
+
+def _size(sample: Values) -> str:
+    missing = int(np.isnan(sample).sum())
+    return f"n = {len(sample)}" + (f", {missing} undefined" if missing else "")
+
+
+def _mark_flow(
+    axes: Axes, edges: Values, fractions: Mapping[str, Values], palette: Mapping[str, str]
+) -> None:
+    """Set the outer bars apart, and write the height of those that leave the figure."""
+    top = axes.get_ylim()[1]
+    for bar, edge, side in ((0, edges[1], "left"), (-1, edges[-2], "right")):
+        axes.axvline(edge, color="0.55", linewidth=0.8, linestyle=":")
+        high = [method for method, heights in fractions.items() if heights[bar] > top]
+        for line, method in enumerate(high):
+            axes.annotate(
+                f"{100 * fractions[method][bar]:.0f} %",
+                (edge, top),
+                xytext=(6 if side == "left" else -6, -4 - 12 * line),
+                textcoords="offset points",
+                ha=side,
+                va="top",
+                color=palette[method],
+                fontsize=8.5,
+            )
+
+
+def _mean_aligned(waveforms: FloatArray, before: int, after: int) -> Values:
+    aligned = align_half_maximum(waveforms, before, after)
+    known = np.isfinite(aligned)
+    count = known.sum(axis=0)
+    total = np.where(known, aligned, 0).sum(axis=0, dtype=float)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,0 +1,77 @@
+"""One look for all figures: fonts, and a fixed colour and label for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Colours of Okabe and Ito, which the colour-blind can tell apart.
+COLOURS = {
+    "data": "black",
+    "raw": "#D55E00",
+    "ren": "#0072B2",
+    "iren": "#CC79A7",
+    "truth": "#009E73",
+}
+SPARE_COLOURS = ("#E69F00", "#56B4E9", "#7F7F7F", "#8C6D1F", "#5B3A8C")
+DATA_FILL = "0.80"
+
+LABELS = {
+    "data": "Data",
+    "raw": "Simulation",
+    "ren": "REN translation",
+    "iren": "IREN translation",
+    "truth": "True response",
+}
+
+_STYLE = {
+    "font.size": 10.0,
+    "axes.labelsize": 10.0,
+    "axes.titlesize": 10.0,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "0.92",
+    "axes.axisbelow": True,
+    "figure.constrained_layout.use": True,
+}
+
+
+def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
+    """Run a function that makes a figure with the common look, and only it."""
+
+    @wraps(make_figure)
+    def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        from matplotlib import style
+
+        # from matplotlib's defaults, so that no user's settings change a report
+        with style.context(["default", _STYLE]):
+            return make_figure(*args, **kwargs)
+
+    return in_style
+
+
+def colours(methods: Iterable[str]) -> Mapping[str, str]:
+    """A colour for each method: its own, or else the next spare one.
+
+    Examples
+    --------
+    >>> colours(["data", "rival"])
+    {'data': 'black', 'rival': '#E69F00'}
+    """
+    methods = list(methods)
+    others = [method for method in methods if method not in COLOURS]
+    spare = {m: SPARE_COLOURS[i % len(SPARE_COLOURS)] for i, m in enumerate(others)}
+    return {method: COLOURS.get(method) or spare[method] for method in methods}
+
+
+def label(method: str) -> str:
+    """What a legend calls a method."""
+    return LABELS.get(method, method)

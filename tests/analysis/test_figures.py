@@ -1,0 +1,139 @@
+"""Figures show what they are given, and leave matplotlib's settings alone."""
+
+from __future__ import annotations
+
+import io
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.special import ndtr
+
+from cpunet.analysis import figures
+from cpunet.analysis.comparisons import compare, data_axis
+from cpunet.analysis.parameters import PARAMETERS
+from cpunet.analysis.style import SPARE_COLOURS, colours, label
+from cpunet.errors import CpunetError
+from cpunet.recipes.schema import ScoreConfig
+
+SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)
+LOSSES = [name for panel in figures.LOSS_PANELS.values() for name in panel]
+
+
+def render(figure: Figure) -> None:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=40)
+    assert stream.tell() > 1000
+
+
+def log(n: int, names: list[str] = LOSSES) -> list[dict]:
+    return [
+        {"iteration": 10 * i, "losses": dict.fromkeys(names, 1 / (i + 1))} for i in range(n)
+    ]
+
+
+def histogram_figure(values: dict[str, np.ndarray]) -> Figure:
+    data = {"drift_time": values["data"]}
+    methods = {m: {"drift_time": v} for m, v in values.items() if m != "data"}
+    comparison = compare(data, methods, SCORES, seed=1)["drift_time"]
+    axis = data_axis(values["data"], SCORES.max_bins)
+    return figures.parameter_histograms(values, axis, "drift_time", "SEP", comparison)
+
+
+def pulses(n: int, centre: float = 350.0) -> np.ndarray:
+    time = np.arange(800) - centre - np.linspace(0, 5, n)[:, np.newaxis]
+    return ndtr(time / 5).astype(np.float32)
+
+
+def test_all_eight_losses_are_drawn_with_their_moving_average():
+    figure = figures.loss_curves(log(50), window=10)
+    render(figure)
+    lines = [line for axes in figure.axes for line in axes.lines]
+    assert len(lines) == 2 * len(LOSSES) == 16
+    average = figure.axes[1].lines[1].get_xydata()
+    assert average.shape == (41, 2)
+    assert average[0].tolist() == pytest.approx([90, np.mean(1 / np.arange(1, 11))])
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_training_shorter_than_the_window_is_drawn(n):
+    render(figures.loss_curves(log(n)))
+
+
+def test_a_loss_that_was_not_recorded_is_left_out():
+    figure = figures.loss_curves(log(20, ["cycle_forward"]))
+    render(figure)
+    assert [len(axes.lines) for axes in figure.axes] == [2, 0, 0]
+
+
+def test_an_empty_log_is_refused():
+    with pytest.raises(CpunetError, match="log is empty"):
+        figures.loss_curves([])
+
+
+def test_cycle_figure_draws_ten_pulses_in_each_panel():
+    sets = pulses(15)
+    figure = figures.cycle_figure(sets, sets, sets, ("A", "B", "C"), 16.0)
+    render(figure)
+    assert [len(axes.lines) for axes in figure.axes] == [10, 10, 10]
+    assert [axes.get_title() for axes in figure.axes] == ["A", "B", "C"]
+    assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(799 * 0.016)
+
+
+def test_histogram_legend_tells_scores_and_counts():
+    rng = np.random.default_rng(0)
+    values = {
+        "data": rng.normal(1400, 100, 500),
+        "raw": np.r_[rng.normal(900, 50, 400), np.nan],
+        "ren": rng.normal(1410, 100, 400),
+    }
+    figure = histogram_figure(values)
+    render(figure)
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[0].startswith("Data (ceiling ")
+    assert texts[1].startswith("Simulation (IoU ")
+    assert texts[1].endswith("n = 401, 1 undefined")
+    assert figure.axes[0].get_xlabel() == PARAMETERS["drift_time"].axis_label
+    assert figure.legends[0].get_title().get_text().startswith("SEP")
+
+
+def test_a_bar_too_high_for_the_figure_is_labelled():
+    rng = np.random.default_rng(0)
+    figure = histogram_figure({"data": rng.normal(0, 1, 500), "raw": np.full(400, 99.0)})
+    render(figure)
+    assert [text.get_text() for text in figure.axes[0].texts] == ["100 %"]
+    assert figure.axes[0].get_ylim()[1] < 0.5
+
+
+def test_histograms_of_one_event_and_of_none_are_drawn():
+    render(histogram_figure({"data": np.array([1.0]), "ren": np.array([])}))
+
+
+def test_mean_pulse_differences_are_in_percent_of_the_charge():
+    data = pulses(40)
+    figure = figures.mean_pulses({"data": data, "ren": 1.01 * data}, 16.0, "DEP")
+    render(figure)
+    difference = figure.axes[1].lines[0].get_ydata()
+    assert difference[-1] == pytest.approx(1.0, rel=1e-3)
+    assert difference[100] == pytest.approx(0.5, rel=1e-2)
+
+
+def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
+    render(figures.mean_pulses({"data": pulses(5), "raw": pulses(5, 700.0)}, 16.0, "DEP"))
+
+
+def test_global_settings_neither_change_nor_matter():
+    before = dict(mpl.rcParams)
+    with mpl.rc_context({"font.size": 30.0, "axes.grid": False}):
+        figure = figures.loss_curves(log(5))
+        assert mpl.rcParams["font.size"] == 30.0
+    assert dict(mpl.rcParams) == before
+    assert figure.axes[0].xaxis.label.get_size() == 10.0
+
+
+def test_each_method_has_a_colour_of_its_own():
+    methods = ["data", "raw", "ren", "iren", "truth", *"abcde"]
+    assert len(set(colours(methods).values())) == len(methods)
+    assert colours(["x"])["x"] == SPARE_COLOURS[0]
+    assert (label("ren"), label("x")) == ("REN translation", "x")
