@@ -98,7 +98,9 @@ class Pulses:
         """Samples per pulse."""
         return int(self.waveforms.shape[1])
 
-    def __getitem__(self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Pulses:
+    def __getitem__(
+        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
+    ) -> Pulses:
         """The pulses of a slice, a mask or a list of rows."""
         return Pulses(
             waveforms=self.waveforms[which],

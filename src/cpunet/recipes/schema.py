@@ -106,7 +106,13 @@ class GruConfig(Config):
 
 
 class LossConfig(Config):
-    """Weights of the eight losses and of the three windows of the L1 terms."""
+    """Weights of the eight losses and of the three windows of the L1 terms.
+
+    ``gradient_penalty`` weighs the mean squared gradient of the discriminators on
+    real and translated pulses (Mescheder et al. 2018, arXiv:1801.04406; 0 in the
+    paper): it keeps a discriminator from growing so steep that it throws the
+    generators off.
+    """
 
     baseline_len: Count
     rising_edge_len: Count
@@ -117,6 +123,7 @@ class LossConfig(Config):
     cycle_weight: NonNegative
     identity_weight: NonNegative
     adversarial_weight: NonNegative
+    gradient_penalty: NonNegative
 
 
 class TrainingConfig(Config):

@@ -1,0 +1,66 @@
+"""``cpunet info``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import out
+
+Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
+TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
+Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
+
+
+def info(
+    source: Source,
+    table: TableName = None,
+    energy: Energy = None,
+    kev_per_adc: options.KevPerAdc = None,
+    dt: options.Dt = None,
+) -> None:
+    """Say what is in a file or run: events, sampling, energies, peaks, provenance.
+
+    Example: cpunet info raw.lh5
+    """
+    from cpunet.jobs.info import describe
+    from cpunet.recipes import load_recipe
+
+    told = describe(
+        source,
+        table=table,
+        energy=energy,
+        kev_per_adc=kev_per_adc,
+        dt_ns=dt,
+        peaks=load_recipe("small").peaks,
+    )
+    width = max(len(name) for name, _ in _lines(told))
+    for name, value in _lines(told):
+        out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _lines(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested mappings as ``outer.inner`` lines, in order."""
+    lines: list[tuple[str, str]] = []
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            lines += _lines(value, f"{prefix}{name}.")
+        else:
+            lines.append((f"{prefix}{name}", _text(value)))
+    return lines
+
+
+def _text(value: Any) -> str:
+    if value is None or value == {}:
+        return "–"
+    if isinstance(value, (list, tuple)):
+        return (
+            " … ".join(_text(v) for v in value)
+            if len(value) == 2
+            else ", ".join(map(_text, value))
+        )
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,35 @@
+"""The command ``cpunet``: its subcommands, and errors as one line."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from cpunet.cli.info import info
+from cpunet.cli.messages import fail
+from cpunet.cli.train import train
+from cpunet.cli.translate import translate
+from cpunet.cli.validate import validate
+from cpunet.errors import CpunetError
+
+app = typer.Typer(
+    help="Make simulated germanium-detector pulses look measured.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+for command in (train, translate, validate, info):
+    app.command()(command)
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one line and status 2."""
+    try:
+        app()
+    except CpunetError as error:
+        fail(str(error))
+        sys.exit(2)
+    except KeyboardInterrupt:
+        fail("interrupted; nothing half-written was left")
+        sys.exit(130)

@@ -1,0 +1,37 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
+Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
+Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="RUN")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
+Device = Annotated[str, typer.Option(help="cpu, cuda, or auto: the GPU if there is one.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
+SimTable = Annotated[
+    str | None, typer.Option(help="Table of the simulated pulses, if the file has several.")
+]
+DataTable = Annotated[
+    str | None, typer.Option(help="Table of the measured pulses, if the file has several.")
+]
+SimEnergy = Annotated[
+    str | None, typer.Option(help="Energy column of the simulation, or FILE:path/to/column.")
+]
+DataEnergy = Annotated[
+    str | None,
+    typer.Option(help="Energy column of the data, or FILE:path/to/column, as of a hit tier."),
+]
+KevPerAdc = Annotated[
+    float | None,
+    typer.Option(
+        help="Calibration of measured pulses without energies in keV: keV per ADC count."
+    ),
+]
+Dt = Annotated[
+    float | None, typer.Option("--dt", help="Sampling period in ns, if the files do not tell.")
+]

@@ -1,0 +1,121 @@
+"""Files named on a command line become prepared sets."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.monitor import Monitor
+from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
+from cpunet.pulses.peaks import EnergySelection, label_peaks
+from cpunet.pulses.preparation import Prepared
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.sets import load_prepared
+from cpunet.recipes.schema import Recipe
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`."""
+
+    path: Path
+    table: str | None = None
+    energy: str | None = None
+    kev_per_adc: float | None = None
+    dt_ns: float | None = None
+
+    def open(self) -> PulseSource:
+        """Open the file."""
+        return open_pulses(
+            self.path,
+            table=self.table,
+            energy=self.energy,
+            kev_per_adc=self.kev_per_adc,
+            dt_ns=self.dt_ns,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class InputSet:
+    """What was made of a file: prepared pulses, and the cuts if it was measured."""
+
+    prepared: Prepared
+    dt_ns: float
+    path: Path
+    cuts: CutWindows | None = None
+
+    def provenance(self) -> dict[str, Any]:
+        """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
+        waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
+        return {
+            "file": str(self.path),
+            "dt_ns": self.dt_ns,
+            "read": self.prepared.n_read,
+            "used": len(self.prepared),
+            "rejections": self.prepared.rejections,
+            "cuts": None if self.cuts is None else self.cuts.model_dump(mode="json"),
+            "sha256": hashlib.sha256(waveforms.data).hexdigest(),
+        }
+
+
+def load_simulated(
+    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+) -> InputSet:
+    """Read and prepare the selected simulated pulses of a file."""
+    return _load(file, recipe, selection, monitor, measured=False)
+
+
+def load_measured(
+    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+) -> InputSet:
+    """Read, prepare and cut the selected measured pulses of a file."""
+    return _load(file, recipe, selection, monitor, measured=True)
+
+
+def require_same_sampling(sim: InputSet, data: InputSet) -> None:
+    """Raise a `CpunetError` if the two sides differ in their sampling period."""
+    if not np.isclose(sim.dt_ns, data.dt_ns):
+        raise CpunetError(
+            f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
+            f"{data.dt_ns:g} ns; resample one of them"
+        )
+
+
+def _load(
+    file: InputFile,
+    recipe: Recipe,
+    selection: EnergySelection,
+    monitor: Monitor,
+    *,
+    measured: bool,
+) -> InputSet:
+    source = file.open()
+    with monitor.stage(f"Preparing {file.path.name}", source.n_pulses) as advance:
+        prepared = load_prepared(
+            source,
+            recipe.preparation,
+            "measured" if measured else "simulated",
+            select=selection.select,
+            peaks=lambda energies: label_peaks(energies, recipe.peaks),
+            progress=advance,
+        )
+    cuts = None
+    if measured:
+        cuts = fit_cuts(prepared, recipe.cuts)
+        prepared = apply_cuts(prepared, cuts)
+        if not len(prepared):
+            raise CpunetError(
+                f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
+            )
+    rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+    monitor.note(
+        f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
+        + (f" (left out: {rejected})" if rejected else "")
+    )
+    return InputSet(prepared, source.dt_ns, file.path, cuts)

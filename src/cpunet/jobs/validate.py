@@ -1,0 +1,206 @@
+"""How well a run translates: scores per peak, figures and a page to read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpunet.analysis.comparisons import compare
+from cpunet.analysis.paired import paired_scores
+from cpunet.analysis.parameters import Values, pulse_parameters
+from cpunet.analysis.report import write_report
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.jobs.figures import validation_figures
+from cpunet.jobs.inputs import (
+    InputFile,
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_same_sampling,
+)
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.train import resolve_device
+from cpunet.jobs.truth import load_truth
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import Recipe
+from cpunet.training.run_folder import read_info, read_losses
+from cpunet.translation.translator import IREN, REN
+
+QUIET = Monitor()
+
+
+@dataclass(frozen=True, eq=False)
+class PeakSets:
+    """The pulses of one peak: raw simulation, its translation, measured."""
+
+    name: str
+    raw: Pulses
+    ren: Pulses
+    data: Pulses
+    clean: FloatArray
+    truth: FloatArray | None
+
+    def missing(self) -> str | None:
+        """Say what keeps the peak from being scored, if anything does."""
+        sides = (("simulated", self.raw), ("measured", self.data))
+        empty = [side for side, pulses in sides if not len(pulses)]
+        return f"no {' and no '.join(empty)} pulses" if empty else None
+
+
+def validate_run(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    out: Path,
+    *,
+    truth: Path | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Score a run on simulated and measured pulses and write the report folder.
+
+    Every peak of the recipe is scored, and the energies of the training if they are
+    none of them. SEP and DEP are no part of the training: they are the test.
+
+    Parameters
+    ----------
+    run
+        Folder of the training run.
+    sim, data
+        Simulated and measured pulses.
+    out
+        Report folder: ``metrics.json``, figures, ``report.html``.
+    truth
+        ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
+    seed
+        Of latent noise and bootstraps.
+    device, force, monitor
+        As for `cpunet.jobs.train.train_run`.
+
+    Returns
+    -------
+    dict
+        The content of ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, or no peak can be scored.
+    """
+    info = read_info(run)
+    ren = REN.load(run, resolve_device(device))
+    iren = IREN.load(run, resolve_device(device))
+    recipe = ren.recipe
+    names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
+    selection = parse_selection(",".join(names), recipe.peaks)
+    with folder_written_aside(out, force=force) as folder:
+        sim_set = load_simulated(sim, recipe, selection, monitor)
+        data_set = load_measured(data, recipe, selection, monitor)
+        require_same_sampling(sim_set, data_set)
+        true_windows = None if truth is None else load_truth(truth, sim_set, recipe.preparation)
+        windows = sim_set.prepared.pulses.waveforms
+        with monitor.stage("Translating", 2 * len(windows)) as advance:
+            noisy = ren.apply(windows, generator=ren.seeded(seed), progress=advance)
+            clean = ren.apply(windows, noise=False, progress=advance)
+        sets = [
+            _peak_sets(name, recipe, sim_set, data_set, noisy, clean, true_windows)
+            for name in names
+        ]
+        values: dict[str, dict[str, dict[str, Values]]] = {}
+        peaks: dict[str, Any] = {}
+        with monitor.stage("Scoring", len(sets)) as advance:
+            for peak in sets:
+                values[peak.name], peaks[peak.name] = _score(peak, recipe, seed)
+                advance(1)
+        if all("missing" in scores for scores in peaks.values()):
+            raise CpunetError(
+                f"{data_set.path}: no peak has pulses on both sides; "
+                "check the calibration (--kev-per-adc, --data-energy)"
+            )
+        metrics = {
+            "peaks": peaks,
+            "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
+            | {"peak": info["peak"]},
+            "rejections": {
+                "sim": sim_set.prepared.rejections,
+                "data": data_set.prepared.rejections,
+            },
+        }
+        with monitor.stage("Drawing") as advance:
+            figures = validation_figures(sets, values, peaks, read_losses(run), ren, iren)
+            write_report(folder, metrics, figures, _notes(info, sets, truth))
+    return metrics
+
+
+def _peak_sets(
+    name: str,
+    recipe: Recipe,
+    sim_set: InputSet,
+    data_set: InputSet,
+    noisy: FloatArray,
+    clean: FloatArray,
+    truth: FloatArray | None,
+) -> PeakSets:
+    selection = parse_selection(name, recipe.peaks)
+    sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
+    chosen = selection.select(sim.energy_kev)
+    raw = sim[chosen]
+    return PeakSets(
+        name=name,
+        raw=raw,
+        ren=raw.with_waveforms(noisy[chosen]),
+        data=data[selection.select(data.energy_kev)],
+        clean=clean[chosen],
+        truth=None if truth is None else truth[chosen],
+    )
+
+
+def _score(
+    peak: PeakSets, recipe: Recipe, seed: int
+) -> tuple[dict[str, dict[str, Values]], dict[str, Any]]:
+    """Return parameter values by method and the scores of one peak."""
+    scores: dict[str, Any] = {"n_sim": len(peak.raw), "n_data": len(peak.data)}
+    missing = peak.missing()
+    if missing is not None:
+        return {}, scores | {"parameters": {}, "missing": missing}
+    values = {
+        method: pulse_parameters(pulses, recipe.preparation, recipe.scores)
+        for method, pulses in (("data", peak.data), ("raw", peak.raw), ("ren", peak.ren))
+    }
+    methods: Mapping[str, Mapping[str, Values]] = {m: values[m] for m in ("raw", "ren")}
+    scores["parameters"] = compare(values["data"], methods, recipe.scores, seed)
+    if peak.truth is not None:
+        scores["paired"] = _paired(peak, recipe.scores.edge_samples)
+    return values, scores
+
+
+def _paired(peak: PeakSets, edge_samples: int) -> dict[str, Any]:
+    assert peak.truth is not None
+    known = np.isfinite(peak.truth).all(axis=1)
+    return {
+        method: paired_scores(waveforms[known], peak.truth[known], edge_samples)
+        for method, waveforms in (("raw", peak.raw.waveforms), ("ren", peak.clean))
+    }
+
+
+def _notes(info: Mapping[str, Any], sets: list[PeakSets], truth: Path | None) -> list[str]:
+    notes = [
+        f"Trained with recipe “{info['recipe']}” on {info['sim']['used']} simulated and "
+        f"{info['data']['used']} measured pulses of {info['peak']}, unpaired; peaks other "
+        "than that took no part in the training.",
+        "IoU is the overlap of two distributions in percent. Two samples of the same "
+        "distribution do not reach 100 at finite size: the ceiling is what data score "
+        "against data at these sizes.",
+    ]
+    if truth is None:
+        notes.append("No truth was given, so single pulses are not scored.")
+    notes += [f"{s.name}: {s.missing()}, so it is not scored." for s in sets if s.missing()]
+    return notes

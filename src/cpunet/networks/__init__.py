@@ -1,0 +1,1 @@
+"""The networks of CPU-Net: generators (REN, IREN) and discriminators."""

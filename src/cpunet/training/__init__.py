@@ -1,0 +1,1 @@
+"""From two prepared sets to trained networks in a run folder."""

@@ -1,0 +1,161 @@
+"""The four networks of CPU-Net and one step of their training (paper, section 3.4)."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import LambdaLR
+
+from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
+
+LOSS_NAMES = (
+    "identity_data",
+    "identity_sim",
+    "cycle_forward",
+    "cycle_backward",
+    "adversarial_ren",
+    "adversarial_iren",
+    "discriminator_data",
+    "discriminator_sim",
+)
+
+
+class CycleGan(nn.Module):
+    """REN (sim → data), IREN (data → sim) and a discriminator for each side."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        super().__init__()
+        length = recipe.preparation.length
+        self.ren = PositionalUNet(recipe.generator, length)
+        self.iren = PositionalUNet(recipe.generator, length)
+        self.discriminator_data = GruDiscriminator(recipe.discriminator)
+        self.discriminator_sim = GruDiscriminator(recipe.discriminator)
+
+    def generator_parameters(self) -> list[nn.Parameter]:
+        """Parameters of REN and IREN."""
+        return list(chain(self.ren.parameters(), self.iren.parameters()))
+
+
+class Step:
+    """One training iteration: generators always, discriminators at their interval.
+
+    The learning rates of all three optimisers follow the iteration, also between
+    the discriminators' updates.
+    """
+
+    def __init__(self, model: CycleGan, config: TrainingConfig) -> None:
+        self.model = model
+        self.config = config
+        device = next(model.parameters()).device
+        self.weights = window_weights(config.losses).to(device)
+
+        def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
+            return AdamW(
+                parameters, lr=rate, betas=config.betas, weight_decay=config.weight_decay
+            )
+
+        self.generators = optimiser(model.generator_parameters(), config.rate_generators)
+        self.discriminators = [
+            optimiser(list(network.parameters()), config.rate_discriminators)
+            for network in (model.discriminator_data, model.discriminator_sim)
+        ]
+        self.schedules = [
+            LambdaLR(o, self._rate_factor) for o in (self.generators, *self.discriminators)
+        ]
+
+    def _rate_factor(self, iteration: int) -> float:
+        """Constant, then linear to zero at the end (paper, section 3.4.2)."""
+        decay = max(1, self.config.iterations - self.config.decay_start)
+        return min(1.0, max(0.0, (self.config.iterations - iteration) / decay))
+
+    def __call__(self, iteration: int, sim: Tensor, data: Tensor) -> dict[str, Tensor]:
+        """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
+
+        Discriminator losses are there only in iterations that update them.
+        """
+        losses, fake_data, fake_sim = self._update_generators(sim, data)
+        if iteration % self.config.discriminator_interval == 0:
+            losses |= self._update_discriminators(
+                (("discriminator_data", data, fake_data), ("discriminator_sim", sim, fake_sim))
+            )
+        for schedule in self.schedules:
+            schedule.step()
+        return {name: loss.detach() for name, loss in losses.items()}
+
+    def generator_losses(
+        self, sim: Tensor, data: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Return the six losses of the generators and the two translated batches."""
+        model, weights = self.model, self.weights
+        fake_data, fake_sim = model.ren(sim), model.iren(data)
+        losses = {
+            "identity_data": weighted_l1(model.ren(data), data, weights),
+            "identity_sim": weighted_l1(model.iren(sim), sim, weights),
+            "cycle_forward": weighted_l1(model.iren(fake_data), sim, weights),
+            "cycle_backward": weighted_l1(model.ren(fake_sim), data, weights),
+            "adversarial_ren": real_loss(model.discriminator_data(fake_data)),
+            "adversarial_iren": real_loss(model.discriminator_sim(fake_sim)),
+        }
+        return losses, fake_data, fake_sim
+
+    def total(self, losses: dict[str, Tensor]) -> Tensor:
+        """Weighted sum of the generators' six losses."""
+        c = self.config.losses
+        return (
+            c.identity_weight * (losses["identity_data"] + losses["identity_sim"])
+            + c.cycle_weight * (losses["cycle_forward"] + losses["cycle_backward"])
+            + c.adversarial_weight * (losses["adversarial_ren"] + losses["adversarial_iren"])
+        )
+
+    def _update_generators(
+        self, sim: Tensor, data: Tensor
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        model = self.model
+        discriminators = (model.discriminator_data, model.discriminator_sim)
+        for network in discriminators:  # judged by fixed judges
+            network.requires_grad_(False).eval()
+        losses, fake_data, fake_sim = self.generator_losses(sim, data)
+        self.generators.zero_grad(set_to_none=True)
+        self.total(losses).backward()  # type: ignore[no-untyped-call]
+        clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
+        self.generators.step()
+        for network in discriminators:
+            network.requires_grad_(True).train()
+        return losses, fake_data.detach(), fake_sim.detach()
+
+    def _discriminator_loss(
+        self, network: nn.Module, real: Tensor, fake: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the adversarial loss and the gradient penalty."""
+        weight = self.config.losses.gradient_penalty
+        # one batch: the norm inside must see both kinds at once
+        pulses = torch.cat([real, fake]).requires_grad_(weight > 0)
+        # cuDNN's GRU has no second derivative
+        with torch.backends.cudnn.flags(enabled=weight == 0):
+            logits = network(pulses)
+        loss = real_loss(logits[: len(real)]) + fake_loss(logits[len(real) :])
+        if not weight:
+            return loss, torch.zeros_like(loss)
+        (slope,) = torch.autograd.grad(logits.sum(), pulses, create_graph=True)
+        return loss, weight * slope.square().sum(dim=(1, 2)).mean()
+
+    def _update_discriminators(
+        self, sides: tuple[tuple[str, Tensor, Tensor], ...]
+    ) -> dict[str, Tensor]:
+        losses = {}
+        for (name, real, fake), optimiser in zip(sides, self.discriminators, strict=True):
+            network = getattr(self.model, name)
+            loss, penalty = self._discriminator_loss(network, real, fake)
+            optimiser.zero_grad(set_to_none=True)
+            (loss + penalty).backward()  # type: ignore[no-untyped-call]
+            clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
+            optimiser.step()
+            losses[name] = loss
+        return losses

@@ -1,0 +1,126 @@
+"""What a training leaves behind, in one folder that says where it came from.
+
+``run.json``
+    Versions, seed, device, time taken, fingerprints of the files, counts.
+``recipe.yaml``
+    Every setting, resolved.
+``losses.jsonl``
+    One line per iteration.
+``weights.safetensors``
+    The four networks, names prefixed ``ren.``, ``iren.``, ``discriminator_*.``.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from cpunet.errors import CpunetError
+from cpunet.recipes import recipe_from
+from cpunet.recipes.schema import Recipe
+from cpunet.training.loop import Record
+
+INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what shapes the result."""
+    packages = ("cpunet", "torch", "numpy", "numba")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def append_losses(folder: Path, records: Iterable[Record]) -> None:
+    """Add training records to the folder's log."""
+    with (folder / LOSSES).open("a") as stream:
+        stream.writelines(json.dumps(record) + "\n" for record in records)
+
+
+def write_run(folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, Any]) -> None:
+    """Write weights, recipe and provenance into an existing folder."""
+    weights = {
+        name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()
+    }
+    save_file(weights, folder / WEIGHTS)
+    (folder / RECIPE).write_text(
+        yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False)
+    )
+    (folder / INFO).write_text(json.dumps(info, indent=2) + "\n")
+
+
+def read_info(run: Path) -> dict[str, Any]:
+    """Provenance of a run.
+
+    Raises
+    ------
+    CpunetError
+        If the folder is no finished run.
+    """
+    path = Path(run) / INFO
+    try:
+        info = json.loads(path.read_text())
+    except OSError as error:
+        raise CpunetError(
+            f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
+        ) from error
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); train again") from error
+    if not isinstance(info, dict):
+        raise CpunetError(f"{path}: damaged (no mapping); train again")
+    return info
+
+
+def read_recipe(run: Path) -> Recipe:
+    """Return the resolved recipe of a run."""
+    path = Path(run) / RECIPE
+    try:
+        return recipe_from(yaml.safe_load(path.read_text()), source=str(path))
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    except yaml.YAMLError as error:
+        raise CpunetError(f"{path}: damaged; train again") from error
+
+
+def read_losses(run: Path) -> list[Record]:
+    """Return the training records; empty if the log is missing."""
+    path = Path(run) / LOSSES
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") -> nn.Module:
+    """Fill `network` with the weights saved under `name` (``"ren"``, ``"iren"``, …).
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, damaged or of another architecture.
+    """
+    path = Path(run) / WEIGHTS
+    try:
+        weights: dict[str, Tensor] = load_file(path, device=device)
+    except (OSError, SafetensorError) as error:
+        raise CpunetError(f"{path}: no readable weights; train again") from error
+    prefix = f"{name}."
+    own = {key.removeprefix(prefix): v for key, v in weights.items() if key.startswith(prefix)}
+    expected = network.state_dict()
+    wrong = sorted(
+        (own.keys() ^ expected.keys())
+        | {k for k in own.keys() & expected.keys() if own[k].shape != expected[k].shape}
+    )
+    if wrong:
+        raise CpunetError(
+            f"{path}: weights of another network: {len(wrong)} tensors differ, first {wrong[0]}"
+        )
+    network.load_state_dict(own)
+    return network.to(torch.device(device)).eval()

@@ -1,0 +1,42 @@
+"""Truly unpaired batches: each side is drawn on its own, and every pulse is used."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class Deck:
+    """Deal batches from a set of pulses like cards, reshuffled when too few are left.
+
+    Two decks with their own generators never meet in the same order twice, so no
+    simulated pulse is tied to one measured pulse, and the surplus of the larger
+    set is not thrown away.
+
+    Parameters
+    ----------
+    pulses
+        Shape (n, 1, samples), on the device of the training.
+    batch_size
+        Pulses per batch; sets smaller than that are dealt with replacement.
+    seed
+        Of the order of the cards.
+    """
+
+    def __init__(self, pulses: Tensor, batch_size: int, seed: int) -> None:
+        self.pulses = pulses
+        self.batch_size = batch_size
+        self._random = torch.Generator().manual_seed(seed)
+        self._order = torch.empty(0, dtype=torch.long)
+
+    def deal(self) -> Tensor:
+        """Return the next batch, shape (batch, 1, samples)."""
+        n = len(self.pulses)
+        if n < self.batch_size:
+            chosen = torch.randint(n, (self.batch_size,), generator=self._random)
+        else:
+            if len(self._order) < self.batch_size:
+                self._order = torch.randperm(n, generator=self._random)
+            chosen = self._order[: self.batch_size]
+            self._order = self._order[self.batch_size :]
+        return self.pulses[chosen.to(self.pulses.device)]
