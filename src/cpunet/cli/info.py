@@ -58,9 +58,6 @@ def _text(value: Any) -> str:
     if value is None or value == {}:
         return "–"
     if isinstance(value, (list, tuple)):
-        return (
-            " … ".join(_text(v) for v in value)
-            if len(value) == 2
-            else ", ".join(map(_text, value))
-        )
+        bounds = len(value) == 2 and all(isinstance(v, (int, float)) for v in value)
+        return (" … " if bounds else ", ").join(map(_text, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)

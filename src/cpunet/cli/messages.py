@@ -1,7 +1,8 @@
-"""Messages and progress bars on stderr; results go to stdout."""
+"""Messages and progress on stderr; results go to stdout."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,15 +21,17 @@ from cpunet.jobs.monitor import Advance, Monitor
 out = Console()
 err = Console(stderr=True)
 
+LOG_EVERY_S = 30.0  # between lines of progress in a log file
+
 
 def fail(message: str) -> None:
     """Print an error as one line."""
     err.print(f"[bold red]error:[/] {_plain(message)}", soft_wrap=True, highlight=False)
 
 
-def _plain(text: str) -> str:
-    # file names may hold brackets, which rich would read as markup
-    return " ".join(text.split()).replace("[", r"\[")
+def monitor() -> Monitor:
+    """Progress bars on a terminal, now and then a line in a batch job's log."""
+    return BarMonitor() if err.is_terminal else LogMonitor()
 
 
 class BarMonitor(Monitor):
@@ -47,14 +50,52 @@ class BarMonitor(Monitor):
         )
         with Progress(*columns, console=err) as progress:
             task = progress.add_task(_plain(title), total=total, rate="")
+            start, done = time.monotonic(), 0
 
             def advance(steps: int) -> None:
-                progress.advance(task, steps)
-                speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
-                progress.update(task, rate=f"{speed:.3g}/s" if speed else "")
+                nonlocal done
+                done += steps
+                rate = f"{done / (time.monotonic() - start):.3g}/s"
+                progress.update(task, advance=steps, rate=rate)
 
             yield advance
 
     def note(self, message: str) -> None:
         """Print a line."""
-        err.print(_plain(message), soft_wrap=True, highlight=False)
+        _print(message)
+
+
+class LogMonitor(Monitor):
+    """A line at the end of each stage, and every `LOG_EVERY_S` seconds in a long one."""
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        """Print lines while the stage lasts."""
+        start = last = time.monotonic()
+        done = 0
+
+        def advance(steps: int) -> None:
+            nonlocal done, last
+            done += steps
+            now = time.monotonic()
+            if now - last >= LOG_EVERY_S:
+                last = now
+                rate = done / (now - start)
+                left = f", {(total - done) / rate:.0f} s left" if total and done else ""
+                _print(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}")
+
+        yield advance
+        _print(f"{title}: done in {time.monotonic() - start:.1f} s")
+
+    def note(self, message: str) -> None:
+        """Print a line."""
+        _print(message)
+
+
+def _print(message: str) -> None:
+    err.print(_plain(message), soft_wrap=True, highlight=False)
+
+
+def _plain(text: str) -> str:
+    # file names may hold brackets, which rich would read as markup
+    return " ".join(text.split()).replace("[", r"\[")

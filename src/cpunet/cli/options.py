@@ -10,7 +10,7 @@ import typer
 Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
 Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="RUN")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random.")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, or auto: the GPU if there is one.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
 SimTable = Annotated[

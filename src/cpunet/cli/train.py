@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import BarMonitor, out
+from cpunet.cli.messages import monitor, out
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
@@ -21,7 +21,7 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a value: --set training.batch_size=64 (repeatable)."),
 ]
-Threads = Annotated[int | None, typer.Option(help="CPU threads; all cores by default.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores by default.")]
 Board = Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs too.")]
 
 
@@ -66,6 +66,6 @@ def train(
         device=device,
         force=force,
         tensorboard=tensorboard,
-        monitor=BarMonitor(),
+        monitor=monitor(),
     )
     out.print(f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import BarMonitor, out
+from cpunet.cli.messages import monitor, out
 
 Source = Annotated[Path, typer.Argument(help="File of pulses to translate.", metavar="FILE")]
 Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
@@ -53,7 +53,7 @@ def translate(
         table=out_table,
         device=device,
         force=force,
-        monitor=BarMonitor(),
+        monitor=monitor(),
     )
     rejected = ", ".join(f"{n} {reason}" for reason, n in counts["rejections"].items())
     out.print(

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import BarMonitor, out
+from cpunet.cli.messages import monitor, out
 
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 Truth = Annotated[
@@ -49,7 +49,7 @@ def validate(
         seed=seed,
         device=device,
         force=force,
-        monitor=BarMonitor(),
+        monitor=monitor(),
     )
     out.print(_score_table(metrics))
     out.print(f"{out_folder / 'report.html'}", soft_wrap=True)

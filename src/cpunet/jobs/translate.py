@@ -85,9 +85,10 @@ def translate_file(
             counts += np.bincount(done.codes, minlength=len(counts))
             advance(len(block))
         if not counts[Rejection.ACCEPTED]:
+            reasons = ", ".join(f"{n} {reason}" for reason, n in _by_reason(counts).items())
             raise CpunetError(
                 f"{source.path}: none of {counts.sum()} pulses can be translated "
-                f"({_by_reason(counts)}); are these {translator.takes} pulses?"
+                f"({reasons}); are these {translator.takes} pulses?"
             )
     return {
         "read": int(counts.sum()),

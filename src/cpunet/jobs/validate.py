@@ -105,6 +105,11 @@ def validate_run(
         sim_set = load_simulated(sim, recipe, selection, monitor)
         data_set = load_measured(data, recipe, selection, monitor)
         require_same_sampling(sim_set, data_set)
+        if not np.isclose(sim_set.dt_ns, ren.dt_ns):
+            raise CpunetError(
+                f"{sim_set.path}: sampled every {sim_set.dt_ns:g} ns, the run was trained on "
+                f"{ren.dt_ns:g} ns; resample the pulses"
+            )
         true_windows = None if truth is None else load_truth(truth, sim_set, recipe.preparation)
         windows = sim_set.prepared.pulses.waveforms
         with monitor.stage("Translating", 2 * len(windows)) as advance:

@@ -45,7 +45,8 @@ class InterpolatedEmbedding(nn.Module):
         code = fraction.clamp(0, 1) * last
         lower = code.detach().floor().clamp(max=last - 1)
         part = (code - lower)[..., None]
-        index = lower.long()
+        # NaN is no row: it passes through `part`, for the training to notice
+        index = lower.nan_to_num().long()
         below = nn.functional.embedding(index, self.weight)
         above = nn.functional.embedding(index + 1, self.weight)
         return torch.lerp(below, above, part)

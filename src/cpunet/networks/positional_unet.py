@@ -60,31 +60,47 @@ class PositionalMap(nn.Module):
         return self.dropout(x + self.values)  # type: ignore[no-any-return]
 
 
-class Skip(nn.Module):
-    """What a residual generator adds its correction to: its input, moved and weighted.
+SKIP_KERNEL = 65  # samples; about 1 µs at 16 ns
 
-    ``gain[t] * pulse[t + advance]``, the edge values repeated beyond the ends. It
-    starts as the identity; `set` gives it a better start.
+
+class Skip(nn.Module):
+    """What a residual generator adds its correction to: its input, smoothed, moved, weighted.
+
+    ``gain[t] * (kernel * pulse)[t + advance]``, the edge values repeated beyond the
+    ends. It starts as the identity; `set` gives it a better start.
     """
 
     gain: Tensor
     advance: Tensor
+    kernel: Tensor
     index: Tensor
 
     def __init__(self, length: int) -> None:
         super().__init__()
+        kernel = torch.zeros(SKIP_KERNEL)
+        kernel[SKIP_KERNEL // 2] = 1.0
         self.register_buffer("gain", torch.ones(length))
         self.register_buffer("advance", torch.zeros((), dtype=torch.long))
+        self.register_buffer("kernel", kernel)
         self.register_buffer("index", torch.arange(length), persistent=False)
 
-    def set(self, gain: Tensor, advance: int) -> None:
-        """Set the gain of each output sample and the advance in whole samples."""
+    def set(self, gain: Tensor, advance: int, kernel: Tensor | None = None) -> None:
+        """Set the gain of each output sample, the advance in samples and the smoothing."""
         self.gain.copy_(gain)
         self.advance.fill_(advance)
+        if kernel is not None:
+            self.kernel.copy_(kernel)
 
     def forward(self, pulses: Tensor) -> Tensor:
         source = (self.index + self.advance).clamp(0, len(self.index) - 1)
-        return self.gain * pulses[..., source]
+        return self.gain * smoothed(pulses, self.kernel)[..., source]
+
+
+def smoothed(pulses: Tensor, kernel: Tensor) -> Tensor:
+    """Convolve pulses (batch, 1, samples) with a kernel of odd length, edges repeated."""
+    half = len(kernel) // 2
+    padded = nn.functional.pad(pulses, (half, half), mode="replicate")
+    return nn.functional.conv1d(padded, kernel[None, None])
 
 
 class PositionalUNet(nn.Module):

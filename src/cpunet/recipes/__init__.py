@@ -46,7 +46,10 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     if name in recipe_names():
         text = (files("cpunet.recipes") / f"{name}.yaml").read_text()
     elif Path(name).is_file():
-        text = Path(name).read_text()
+        try:
+            text = Path(name).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise CpunetError(f"recipe {name}: cannot be read as text ({error})") from error
     else:
         raise CpunetError(
             f"recipe {name!r}: neither a file nor one of {', '.join(recipe_names())}"

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 class Config(BaseModel):
@@ -84,7 +85,7 @@ class PunetConfig(Config):
 
     name: Literal["punet"]
     width: Annotated[int, Field(ge=2, multiple_of=2)]
-    dropout: Annotated[float, Field(ge=0, lt=1)]
+    dropout: Fraction
     residual: bool
 
 
@@ -103,6 +104,12 @@ class GruConfig(Config):
     hidden: Count
     samples_per_step: Count
     value_range: tuple[float, float] | None
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> GruConfig:
+        if self.value_range is not None and not self.value_range[0] < self.value_range[1]:
+            raise ValueError("value_range must go from a lower to a higher value")
+        return self
 
 
 class LossConfig(Config):
@@ -132,6 +139,10 @@ class TrainingConfig(Config):
     The generators that are kept are running averages of the trained ones, with
     ``average_decay`` per iteration (0: the last weights, as in the paper); their
     batch-norm statistics are taken anew over ``statistics_batches``.
+    ``instance_noise`` is the RMS of white noise added to all that the discriminators
+    see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
+    paper): translations carry no electronic noise, and a discriminator that can tell
+    them by that alone teaches nothing about the shape.
     """
 
     iterations: Count
@@ -139,11 +150,12 @@ class TrainingConfig(Config):
     batch_size: Annotated[int, Field(ge=2)]
     rate_generators: Positive
     rate_discriminators: Positive
-    betas: tuple[float, float]
+    betas: tuple[Fraction, Fraction]
     weight_decay: NonNegative
     max_grad_norm: Positive
     discriminator_interval: Count
-    average_decay: Annotated[float, Field(ge=0, lt=1)]
+    instance_noise: NonNegative
+    average_decay: Fraction
     statistics_batches: Count
     log_interval: Count
     losses: LossConfig
@@ -179,5 +191,15 @@ class Recipe(Config):
             raise ValueError(
                 f"the loss windows cover {covered} samples, "
                 f"a prepared pulse has {self.preparation.length}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _networks_fit(self) -> Recipe:
+        length, step = self.preparation.length, self.discriminator.samples_per_step
+        if length % 16 or length % step:
+            raise ValueError(
+                f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
+                f"halve it four times) and of samples_per_step ({step})"
             )
         return self

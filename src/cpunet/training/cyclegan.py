@@ -55,6 +55,7 @@ class Step:
         self.config = config
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
+        self.noise = config.instance_noise
 
         def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
             return AdamW(
@@ -80,6 +81,7 @@ class Step:
 
         Discriminator losses are there only in iterations that update them.
         """
+        self.noise = self.config.instance_noise * self._rate_factor(iteration)
         losses, fake_data, fake_sim = self._update_generators(sim, data)
         if iteration % self.config.discriminator_interval == 0:
             losses |= self._update_discriminators(
@@ -100,8 +102,8 @@ class Step:
             "identity_sim": weighted_l1(model.iren(sim), sim, weights),
             "cycle_forward": weighted_l1(model.iren(fake_data), sim, weights),
             "cycle_backward": weighted_l1(model.ren(fake_sim), data, weights),
-            "adversarial_ren": real_loss(model.discriminator_data(fake_data)),
-            "adversarial_iren": real_loss(model.discriminator_sim(fake_sim)),
+            "adversarial_ren": real_loss(model.discriminator_data(self._noisy(fake_data))),
+            "adversarial_iren": real_loss(model.discriminator_sim(self._noisy(fake_sim))),
         }
         return losses, fake_data, fake_sim
 
@@ -120,7 +122,8 @@ class Step:
         model = self.model
         discriminators = (model.discriminator_data, model.discriminator_sim)
         for network in discriminators:  # judged by fixed judges
-            network.requires_grad_(False).eval()
+            network.requires_grad_(False)
+            network.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
         losses, fake_data, fake_sim = self.generator_losses(sim, data)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
@@ -130,13 +133,19 @@ class Step:
             network.requires_grad_(True).train()
         return losses, fake_data.detach(), fake_sim.detach()
 
+    def _noisy(self, pulses: Tensor) -> Tensor:
+        """Add the instance noise of this iteration, if any."""
+        if not self.noise:
+            return pulses
+        return pulses + self.noise * torch.randn_like(pulses)
+
     def _discriminator_loss(
         self, network: nn.Module, real: Tensor, fake: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the adversarial loss and the gradient penalty."""
         weight = self.config.losses.gradient_penalty
         # one batch: the norm inside must see both kinds at once
-        pulses = torch.cat([real, fake]).requires_grad_(weight > 0)
+        pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
         # cuDNN's GRU has no second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
             logits = network(pulses)

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import yaml
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
@@ -50,7 +50,7 @@ def write_run(folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, An
     weights = {
         name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()
     }
-    save_file(weights, folder / WEIGHTS)
+    (folder / WEIGHTS).write_bytes(save(weights))
     (folder / RECIPE).write_text(
         yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False)
     )
@@ -76,6 +76,8 @@ def read_info(run: Path) -> dict[str, Any]:
         raise CpunetError(f"{path}: damaged ({error}); train again") from error
     if not isinstance(info, dict):
         raise CpunetError(f"{path}: damaged (no mapping); train again")
+    if missing := {"dt_ns", "peak", "recipe", "seconds", "device", "seed"} - info.keys():
+        raise CpunetError(f"{path}: damaged (no {min(missing)}); train again")
     return info
 
 
@@ -86,7 +88,7 @@ def read_recipe(run: Path) -> Recipe:
         return recipe_from(yaml.safe_load(path.read_text()), source=str(path))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CpunetError(f"{path}: damaged; train again") from error
 
 
@@ -95,7 +97,10 @@ def read_losses(run: Path) -> list[Record]:
     path = Path(run) / LOSSES
     if not path.is_file():
         return []
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
 
 
 def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") -> nn.Module:

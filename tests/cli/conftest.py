@@ -1,0 +1,214 @@
+"""A small stand with a known answer, written independently of the package, and a run on it."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import lh5
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
+
+from cpunet.cli.main import main
+
+DT_NS = 16.0
+PEAKS_KEV = {"DEP": 1592.511, "SEP": 2103.511, "FEP": 2614.511}
+PER_PEAK = 24
+
+# The narrowest networks and the shortest training there are.
+TINY = [
+    "generator.width=2",
+    "discriminator.embedding_rows=20",
+    "discriminator.embedding_dim=2",
+    "discriminator.hidden=2",
+    "discriminator.samples_per_step=16",
+    "training.iterations=4",
+    "training.decay_start=2",
+    "training.batch_size=4",
+    "training.statistics_batches=2",
+    "training.log_interval=3",
+    "scores.bootstraps=20",
+]
+TINY_OPTIONS = [word for value in TINY for word in ("--set", value)]
+
+Waveforms = npt.NDArray[Any]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Tiny networks: threads that wait for each other cost more than they gain."""
+    torch.set_num_threads(1)
+
+
+def charge(n: int, rng: np.random.Generator, length: int = 225) -> npt.NDArray[np.float64]:
+    """Charge signals of one to three deposits: slow rise, logistic edge, then exactly 1."""
+    time = np.arange(length)
+    total = np.zeros((n, length))
+    for _ in range(3):
+        fraction = rng.uniform(0, 1, (n, 1))
+        arrival = rng.uniform(30, 70, (n, 1))
+        width = rng.uniform(1.0, 2.5, (n, 1))
+        total += fraction / (1 + np.exp(-(time - arrival) / width))
+    total -= total[:, :1]
+    return total / total[:, -1:]
+
+
+def respond(pulses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """A record of 1200 samples with the charge from sample 500 on, behind electronics.
+
+    Bandwidth of 60 ns and a decay of 55 µs: two discrete one-pole filters, sample by sample.
+    """
+    record = np.zeros((len(pulses), 1200))
+    record[:, 500:725] = pulses
+    record[:, 725:] = 1
+    smooth, decayed = np.zeros(len(pulses)), np.zeros(len(pulses))
+    rise, fall = np.exp(-DT_NS / 60), np.exp(-DT_NS / 55_000)
+    out, before = np.zeros_like(record), np.zeros(len(pulses))
+    for sample in range(record.shape[1]):
+        smooth = rise * smooth + (1 - rise) * record[:, sample]
+        decayed = fall * decayed + smooth - before
+        before = smooth
+        out[:, sample] = decayed
+    return out
+
+
+def digitised(response: npt.NDArray[np.float64], kev: Waveforms, seed: int) -> Waveforms:
+    """ADC counts: gain, baseline and noise of a flash ADC."""
+    rng = np.random.default_rng(seed)
+    adc = 8000 + 15 * kev[:, None] * response + rng.normal(0, 15, response.shape)
+    return np.round(adc).astype(np.uint16)
+
+
+def energies(rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Every peak in turn, and each fifth event on the continuum."""
+    peaks = np.tile(list(PEAKS_KEV.values()), PER_PEAK) + rng.normal(0, 0.7, 3 * PER_PEAK)
+    return np.insert(peaks, np.arange(0, len(peaks), 4), 1000.0)
+
+
+def write(
+    path: Path,
+    table: str,
+    waveforms: Waveforms,
+    kev: npt.ArrayLike,
+    *,
+    units: str = "ADC",
+    dt_ns: float = DT_NS,
+) -> Path:
+    """An LH5 table as LEGEND's software writes it, not by this package's writer."""
+    n = len(waveforms)
+    content = Table(
+        col_dict={
+            "waveform": WaveformTable(
+                t0=np.zeros(n),
+                t0_units="ns",
+                dt=np.full(n, dt_ns),
+                dt_units="ns",
+                values=ArrayOfEqualSizedArrays(nda=waveforms, attrs={"units": units}),
+            ),
+            "energy": Array(np.asarray(kev, float), attrs={"units": "keV"}),
+            "event_number": Array(1000 + 3 * np.arange(n)),
+        }
+    )
+    group, name = table.split("/")
+    lh5.write(content, name, str(path), group=group, wo_mode="overwrite_file")
+    return path
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Files of the stand, and what is in them."""
+
+    folder: Path
+    sim: Path
+    data: Path
+    truth: Path
+    sim_waveforms: npt.NDArray[np.float32]
+    sim_kev: npt.NDArray[np.float64]
+    data_waveforms: npt.NDArray[np.uint16]
+    data_kev: npt.NDArray[np.float64]
+
+    write = staticmethod(write)
+
+    @property
+    def inputs(self) -> list[str]:
+        """Options that name the two files."""
+        return ["--sim", str(self.sim), "--data", str(self.data)]
+
+
+@pytest.fixture(scope="session")
+def tiny() -> list[str]:
+    """Options that make a training take a second."""
+    return TINY_OPTIONS
+
+
+@pytest.fixture(scope="session")
+def stand(tmp_path_factory: pytest.TempPathFactory) -> Stand:
+    folder = tmp_path_factory.mktemp("stand")
+    rng = np.random.default_rng(20)
+    sim_kev, data_kev = energies(rng), energies(rng)
+    sim, other = charge(len(sim_kev), rng), charge(len(data_kev), rng)
+    data = digitised(respond(other), data_kev, seed=21)
+    sim32 = sim.astype(np.float32)
+    truth = folder / "truth.npz"
+    np.savez(truth, response=respond(sim).astype(np.float32))
+    return Stand(
+        folder=folder,
+        sim=write(folder / "sim.lh5", "geds/sim", sim32, sim_kev, units=""),
+        data=write(folder / "data.lh5", "geds/raw", data, data_kev),
+        truth=truth,
+        sim_waveforms=sim32,
+        sim_kev=sim_kev,
+        data_waveforms=data,
+        data_kev=data_kev,
+    )
+
+
+Outcome = SimpleNamespace
+Command = Callable[..., Outcome]
+
+
+def call(capsys: pytest.CaptureFixture[str], *words: object) -> Outcome:
+    """Run the command line in this process; its status and what it printed."""
+    capsys.readouterr()
+    arguments, sys.argv = sys.argv, ["cpunet", *map(str, words)]
+    try:
+        with pytest.raises(SystemExit) as stop:
+            main()
+    finally:
+        sys.argv = arguments
+    printed = capsys.readouterr()
+    return SimpleNamespace(code=stop.value.code, out=printed.out, err=printed.err)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    return lambda *words: call(capsys, *words)
+
+
+@pytest.fixture(scope="session")
+def trained(stand: Stand, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder made by the command line; do not change it."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    words = ["cpunet", "train", *stand.inputs, "--out", str(out), "--seed", "3"]
+    arguments, sys.argv = sys.argv, [*words, *TINY_OPTIONS]
+    try:
+        with pytest.raises(SystemExit) as stop:
+            main()
+    finally:
+        sys.argv = arguments
+    assert stop.value.code == 0
+    return out
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the run folder that may be changed."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))

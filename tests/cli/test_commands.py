@@ -1,0 +1,288 @@
+"""Train, translate, validate and info on a stand with a known answer."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import lh5
+import numpy as np
+import pytest
+import yaml
+
+PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
+
+
+def listing(folder: Path) -> list[str]:
+    """Every name in a folder, hidden ones too."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_run_folder(trained, stand):
+    assert listing(trained.parent) == ["run"]
+    assert listing(trained) == [
+        "losses.jsonl",
+        "recipe.yaml",
+        "run.json",
+        "weights.safetensors",
+    ]
+    info = json.loads((trained / "run.json").read_text())
+    assert (info["recipe"], info["peak"], info["seed"]) == ("small", "FEP", 3)
+    assert info["dt_ns"] == 16
+    assert 0 < info["seconds"] < 60
+    for side, kev in (("sim", stand.sim_kev), ("data", stand.data_kev)):
+        told = info[side]
+        assert told["file"] == str(getattr(stand, side))
+        assert told["read"] == len(kev)
+        # every pulse is used or has a reason
+        assert told["used"] + sum(told["rejections"].values()) == len(kev)
+        on_peak = int((abs(kev - 2614.511) <= 5).sum())
+        assert told["rejections"]["energy_outside_selection"] == len(kev) - on_peak
+        assert told["used"] >= 0.8 * on_peak
+    recipe = yaml.safe_load((trained / "recipe.yaml").read_text())
+    assert recipe["training"]["iterations"] == 4
+    lines = (trained / "losses.jsonl").read_text().splitlines()
+    records = [json.loads(line) for line in lines]
+    assert [record["iteration"] for record in records] == [0, 1, 2, 3]
+
+
+def test_the_same_seed_gives_the_same_weights(command, trained, stand, tiny, tmp_path):
+    outcomes = [
+        command("train", *stand.inputs, "--out", tmp_path / seed, "--seed", seed, *tiny)
+        for seed in ("3", "4")
+    ]
+    assert [outcome.code for outcome in outcomes] == [0, 0]
+    weights = [(f / "weights.safetensors").read_bytes() for f in (tmp_path / "3", trained)]
+    assert weights[0] == weights[1]
+    assert weights[0] != (tmp_path / "4" / "weights.safetensors").read_bytes()
+
+
+def translated(path: Path, table: str) -> dict[str, np.ndarray]:
+    columns = lh5.read(table, str(path))
+    assert set(columns) == {"waveform", "energy", "event_number", "rejection"}
+    waveform = columns["waveform"]
+    return {
+        "values": waveform["values"].nda,
+        "dt": waveform["dt"].nda,
+        "t0": waveform["t0"].nda,
+        "dt_units": waveform["dt"].attrs["units"],
+        "kev": columns["energy"].nda,
+        "kev_units": columns["energy"].attrs["units"],
+        "event_number": columns["event_number"].nda,
+        "rejection": columns["rejection"].nda,
+    }
+
+
+def test_translate_keeps_the_rows(command, trained, stand, tmp_path):
+    n = len(stand.sim_kev)
+    outcome = command("translate", trained, stand.sim, "--out", tmp_path / "out.lh5")
+    assert outcome.code == 0
+    assert f"{n} of {n} pulses translated" in " ".join(outcome.out.split())
+    assert listing(tmp_path) == ["out.lh5"]
+    done = translated(tmp_path / "out.lh5", "geds/ren")
+    assert done["values"].shape == (n, 800)
+    assert done["values"].dtype == np.float32
+    assert np.isfinite(done["values"]).all()
+    assert (done["rejection"] == 0).all()
+    assert done["event_number"].tolist() == [1000 + 3 * i for i in range(n)]
+    np.testing.assert_allclose(done["kev"], stand.sim_kev)
+    assert (done["dt_units"], done["kev_units"]) == ("ns", "keV")
+    assert (done["dt"] == 16).all()
+    assert (done["t0"] == -400 * 16).all()  # sample 400 is where the pulse is aligned
+
+
+def test_seed_and_noise_of_translate(command, trained, stand, tmp_path):
+    def values(name: str, *options: object) -> np.ndarray:
+        path = tmp_path / name
+        assert command("translate", trained, stand.sim, "--out", path, *options).code == 0
+        return translated(path, "geds/ren")["values"]
+
+    first = values("a.lh5", "--seed", 1)
+    assert np.array_equal(first, values("b.lh5", "--seed", 1))
+    assert not np.array_equal(first, values("c.lh5", "--seed", 2))
+    mean = values("d.lh5", "--no-noise", "--seed", 1)
+    assert np.array_equal(mean, values("e.lh5", "--no-noise", "--seed", 2))
+
+
+def test_translate_is_the_python_api(command, trained, stand, tmp_path):
+    import cpunet
+
+    assert command("translate", trained, stand.sim, "--out", tmp_path / "o.lh5").code == 0
+    from_file = translated(tmp_path / "o.lh5", "geds/ren")["values"]
+    from_python = cpunet.REN.load(trained).translate(stand.sim_waveforms, seed=0)
+    np.testing.assert_allclose(from_file, from_python, atol=1e-6)
+
+
+def test_inverse(command, trained, stand, tmp_path):
+    path = tmp_path / "inverse.lh5"
+    outcome = command("translate", trained, stand.data, "--out", path, "--inverse")
+    assert outcome.code == 0
+    done = translated(path, "geds/iren")
+    assert done["values"].shape == (len(stand.data_kev), 800)
+    assert done["event_number"].tolist() == [1000 + 3 * i for i in range(len(stand.data_kev))]
+
+
+def test_another_table_for_the_output(command, trained, stand, tmp_path):
+    path = tmp_path / "out.lh5"
+    words = ("translate", trained, stand.sim, "--out", path, "--out-table", "ch1/like_data")
+    assert command(*words).code == 0
+    assert len(translated(path, "ch1/like_data")["values"]) == len(stand.sim_kev)
+
+
+def test_pulses_that_cannot_be_translated_stay_as_nan(command, trained, stand, tmp_path):
+    waveforms = stand.sim_waveforms.copy()
+    waveforms[3, 100] = np.nan
+    waveforms[8] = 0.5
+    source = stand.write(tmp_path / "in.lh5", "geds/sim", waveforms, stand.sim_kev, units="")
+    outcome = command("translate", trained, source, "--out", tmp_path / "out.lh5")
+    assert outcome.code == 0
+    assert "rows of NaN for 1 nan, 1 constant" in " ".join(outcome.out.split())
+    done = translated(tmp_path / "out.lh5", "geds/ren")
+    missing = np.isnan(done["values"]).all(axis=1)
+    assert np.flatnonzero(missing).tolist() == [3, 8]
+    assert np.array_equal(done["rejection"] != 0, missing)
+    assert done["event_number"][[3, 8]].tolist() == [1009, 1024]
+
+
+@pytest.fixture(scope="module")
+def report(trained, stand, tmp_path_factory):
+    """A validation with truth, and what it printed."""
+    out = tmp_path_factory.mktemp("report") / "report"
+    words = ["validate", trained, *stand.inputs, "--out", out, "--truth", stand.truth]
+    program = "from cpunet.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    return out, done
+
+
+def test_metrics_have_their_schema(report, trained):
+    metrics = json.loads((report[0] / "metrics.json").read_text())
+    assert set(metrics["peaks"]) == {"SEP", "DEP", "FEP"}
+    for scores in metrics["peaks"].values():
+        assert {"n_sim", "n_data", "parameters", "paired"} == set(scores)
+        assert scores["n_sim"] == 24
+        assert 18 <= scores["n_data"] <= 24
+        assert set(scores["parameters"]) == PARAMETERS
+        for comparison in scores["parameters"].values():
+            assert set(comparison["iou"]) == {"raw", "ren", "ceiling"}
+            assert set(comparison["wasserstein"]) == set(comparison["ks"]) == {"raw", "ren"}
+            for value in comparison["iou"].values():
+                assert 0 <= value <= 100
+            for value in comparison["ks"].values():
+                assert 0 <= value <= 1
+            for value in comparison["wasserstein"].values():
+                assert value >= 0
+        assert set(scores["paired"]) == {"raw", "ren"}
+        for paired in scores["paired"].values():
+            assert {"rmse", "edge_rmse"} <= set(paired)
+            assert 0 < paired["rmse"] < 1
+            assert 0 < paired["edge_rmse"] < 1
+    info = json.loads((trained / "run.json").read_text())
+    assert metrics["training"]["recipe"] == "small"
+    assert metrics["training"]["device"] == info["device"]
+    assert metrics["training"]["seconds"] == info["seconds"]
+
+
+def test_raw_simulations_score_what_is_known_of_them(report):
+    """A raw pulse does not decay; the stand's measured ones do, with 55 µs."""
+    metrics = json.loads((report[0] / "metrics.json").read_text())
+    for scores in metrics["peaks"].values():
+        tail = scores["parameters"]["tail_slope"]
+        assert tail["iou"]["raw"] == 0
+        assert tail["ks"]["raw"] == 1
+        assert tail["wasserstein"]["raw"] == pytest.approx(1e3 / 55, rel=0.03)
+        assert scores["paired"]["raw"]["edge_rmse"] > 0.01
+
+
+def test_the_report_is_complete(report):
+    folder, done = report
+    assert listing(folder.parent) == ["report"]
+    names = listing(folder)
+    pictures = {name for name in names if name.endswith(".png")}
+    assert set(names) - pictures == {"metrics.json", "report.html"}
+    expected = {f"{peak}_{p}.png" for peak in ("SEP", "DEP", "FEP") for p in PARAMETERS}
+    assert expected <= pictures
+    assert "losses.png" in pictures
+    for cycle in ("forward_cycle", "backward_cycle"):
+        assert [name for name in pictures if name.endswith(f"{cycle}.png")]
+    for name in pictures:
+        content = (folder / name).read_bytes()
+        assert content.startswith(b"\x89PNG\r\n")
+        assert len(content) > 5000
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.count("<img") == len(pictures)
+    assert "SEP" in done.stdout
+    assert str(folder / "report.html") in done.stdout
+
+
+def test_a_peak_without_pulses_is_told_and_the_others_are_scored(
+    command, trained, stand, tmp_path
+):
+    below = stand.data_kev < 2200
+    data = stand.write(
+        tmp_path / "data.lh5", "geds/raw", stand.data_waveforms[below], stand.data_kev[below]
+    )
+    words = ("--sim", stand.sim, "--data", data, "--out", tmp_path / "report")
+    outcome = command("validate", trained, *words)
+    assert outcome.code == 0
+    metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
+    assert metrics["peaks"]["FEP"]["missing"] == "no measured pulses"
+    assert metrics["peaks"]["FEP"]["parameters"] == {}
+    assert set(metrics["peaks"]["SEP"]["parameters"]) == PARAMETERS
+    assert "paired" not in metrics["peaks"]["SEP"]
+    assert "no measured pulses" in outcome.out
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert "FEP: no measured pulses, so it is not scored." in page
+
+
+def test_info_of_files_and_runs(command, stand, trained):
+    told = command("info", stand.data)
+    assert told.code == 0
+    lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
+    assert lines["n_pulses"] == str(len(stand.data_kev))
+    assert (lines["length"], lines["dt_ns"]) == ("1200", "16")
+    assert [lines[f"peaks.{peak}"] for peak in ("FEP", "SEP", "DEP")] == ["24"] * 3
+    told = command("info", trained)
+    lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
+    assert (lines["kind"], lines["seed"], lines["recipe"]) == ("run", "3", "small")
+
+
+@pytest.mark.parametrize("what", ["train", "translate", "validate"])
+def test_existing_output_is_refused_and_with_force_replaced(
+    command, trained, stand, tiny, tmp_path, what
+):
+    out = tmp_path / ("out.lh5" if what == "translate" else "out")
+    words = {
+        "train": ["train", *stand.inputs, "--out", out, *tiny],
+        "translate": ["translate", trained, stand.sim, "--out", out],
+        "validate": ["validate", trained, *stand.inputs, "--out", out],
+    }[what]
+    if what == "translate":
+        out.write_text("old")
+    else:
+        out.mkdir()
+        (out / "old").touch()
+    refused = command(*words)
+    assert refused.code == 2
+    expected = f"error: {out}: exists already; choose another name or give --force"
+    assert refused.err.splitlines() == [expected]
+    if what == "translate":
+        assert out.read_text() == "old"
+    else:
+        assert listing(out) == ["old"]
+    assert command(*words, "--force").code == 0
+    assert listing(tmp_path) == [out.name]
+    if what == "translate":
+        assert len(translated(out, "geds/ren")["values"]) == len(stand.sim_kev)
+    else:
+        assert "old" not in listing(out)
+        assert {"train": "run.json", "validate": "metrics.json"}[what] in listing(out)

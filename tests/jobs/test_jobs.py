@@ -1,0 +1,210 @@
+"""The jobs behind the commands: truth, provenance, progress, devices."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.jobs import translate as translate_job
+from cpunet.jobs.inputs import (
+    InputFile,
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_same_sampling,
+)
+from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.jobs.train import resolve_device, train_run
+from cpunet.jobs.translate import translate_file
+from cpunet.jobs.truth import load_truth
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.training.cyclegan import CycleGan
+from cpunet.training.run_folder import write_run
+
+RECIPE = load_recipe(
+    "paper",
+    [
+        "generator.width=2",
+        "discriminator.embedding_dim=2",
+        "discriminator.hidden=2",
+        "discriminator.samples_per_step=16",
+        "training.iterations=2",
+        "training.batch_size=2",
+        "training.statistics_batches=1",
+    ],
+)
+N = 30
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Tiny networks: threads that wait for each other cost more than they gain."""
+    torch.set_num_threads(1)
+
+
+class Listening(Monitor):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, list[int | None]] = {}
+        self.notes: list[str] = []
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        done: list[int | None] = [total]
+        self.stages[title] = done
+        yield done.append
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[InputFile, InputFile]:
+    """Simulated and measured pulses, every third on the full-energy peak."""
+    folder = tmp_path_factory.mktemp("files")
+    rng = np.random.default_rng(5)
+    time = np.arange(225)
+    width = rng.uniform(1.5, 4, (N, 1))
+    sim = 1 / (1 + np.exp(-(time - 60) / width))
+    data = np.ones((N, 1200))
+    data[:, :500] = 0
+    data[:, 500:725] = sim[::-1]
+    data *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * 16 / 55_000)
+    kev = np.resize([2614.511, 2103.511, 1592.511], N)
+    adc = 8000 + 20_000 * data + rng.normal(0, 10, data.shape)
+    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
+    write_pulses(folder / "data.lh5", Pulses.of(adc, dt_ns=16, energy_kev=kev))
+    return InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with untrained weights."""
+    folder = tmp_path_factory.mktemp("run")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+        write_run(folder, CycleGan(RECIPE), RECIPE, info | {"seconds": 1, "device": "cpu"})
+    return folder
+
+
+@pytest.fixture
+def sim_set(files) -> InputSet:
+    selection = parse_selection("SEP,DEP", RECIPE.peaks)
+    return load_simulated(files[0], RECIPE, selection, Monitor())
+
+
+def test_provenance_counts_and_fingerprints(files, sim_set):
+    told = sim_set.provenance()
+    assert (told["file"], told["dt_ns"]) == (str(files[0].path), 16)
+    assert (told["read"], told["used"]) == (N, 2 * N // 3)
+    assert told["rejections"] == {"energy_outside_selection": N // 3}
+    assert told["cuts"] is None
+    content = sim_set.prepared.pulses.waveforms.tobytes()
+    assert told["sha256"] == hashlib.sha256(content).hexdigest()
+    json.dumps(told)
+
+
+def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
+    selection = parse_selection("FEP", RECIPE.peaks)
+    told = load_measured(files[1], RECIPE, selection, Monitor()).provenance()
+    assert {window["name"] for window in told["cuts"]["windows"]} >= {"tail_slope", "baseline"}
+    json.dumps(told)
+
+
+def test_sets_of_different_sampling(sim_set, files):
+    other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"))
+    require_same_sampling(sim_set, sim_set)
+    with pytest.raises(CpunetError) as error:
+        require_same_sampling(sim_set, other)
+    assert str(error.value) == (
+        f"{files[0].path}: sampled every 16 ns, but other.lh5 every 10 ns; resample one of them"
+    )
+
+
+def test_devices():
+    assert resolve_device("cpu") == "cpu"
+    assert resolve_device("auto") in ("cpu", "cuda")
+    for name in ("gpu", "", "CPU", "mps"):
+        with pytest.raises(CpunetError, match="is not known; use cpu, cuda or auto"):
+            resolve_device(name)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("name", ["cuda", "cuda:1"])
+def test_a_gpu_that_is_not_there(name):
+    with pytest.raises(CpunetError, match="no GPU was found; use --device cpu"):
+        resolve_device(name)
+
+
+def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
+    response = np.zeros((N, 1200), np.float16)
+    response[:, 600:] = 1
+    response[4, 300:] = 0.5  # an earlier start, so that one row differs
+    response[5] = np.nan
+    np.savez(tmp_path / "truth.npz", response=response)
+    truth = load_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
+    used = np.flatnonzero(np.arange(N) % 3)
+    assert truth.shape == (len(used), 800)
+    assert np.isnan(truth[used == 5]).all()
+    assert np.isfinite(truth[used != 5]).all()
+    # prepared like data: aligned at sample 400, the tail at 0.8
+    np.testing.assert_allclose(truth[used == 8][0], 0.8 * (np.arange(800) >= 400), atol=1e-6)
+
+
+def test_a_training_tells_what_it_does(files, tmp_path):
+    monitor = Listening()
+    info = train_run(*files, tmp_path / "run", RECIPE, seed=7, device="cpu", monitor=monitor)
+    assert monitor.stages == {
+        "Preparing sim.lh5": [N, N],
+        "Preparing data.lh5": [N, N],
+        "Training": [2, 2],
+    }
+    assert monitor.notes[0].startswith("sim.lh5: 10 of 30 pulses used (left out: 20 energy_")
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == info
+    assert (info["seed"], info["device"]) == (7, "cpu")
+
+
+def test_a_range_of_energies(files, tmp_path):
+    info = train_run(*files, tmp_path / "run", RECIPE, peak="1500-2200", device="cpu")
+    assert info["peak"] == "1500-2200"
+    assert info["sim"]["used"] == 20
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, inverse):
+    source = files[1] if inverse else files[0]
+    options = {"inverse": inverse, "noise": False, "device": "cpu"}
+    whole = translate_file(run, source, tmp_path / "whole.lh5", **options)
+    monkeypatch.setattr(translate_job, "BLOCK_SIZE", 7)
+    monitor = Listening()
+    parts = translate_file(run, source, tmp_path / "parts.lh5", monitor=monitor, **options)
+    assert whole == parts == {"read": N, "translated": N, "rejections": {}}
+    assert monitor.stages == {"Translating": [N, 7, 7, 7, 7, 2]}
+    found = [open_pulses(tmp_path / name).read() for name in ("whole.lh5", "parts.lh5")]
+    np.testing.assert_allclose(found[0].waveforms, found[1].waveforms, atol=1e-5)
+    assert found[0].event_number.tolist() == found[1].event_number.tolist() == list(range(N))
+
+
+def test_a_failed_translation_leaves_the_old_file(files, run, tmp_path):
+    out = tmp_path / "out.lh5"
+    out.write_bytes(b"old")
+    constant = tmp_path / "constant.lh5"
+    write_pulses(constant, Pulses.of(np.ones((3, 225)), dt_ns=16))
+    with pytest.raises(CpunetError, match=r"none of 3 pulses can be translated \(3 constant\)"):
+        translate_file(run, InputFile(constant), out, force=True, device="cpu")
+    assert out.read_bytes() == b"old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["constant.lh5", "out.lh5"]

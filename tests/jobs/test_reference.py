@@ -1,0 +1,60 @@
+"""From files to a report on the optional reference data; minutes each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.train import train_run
+from cpunet.jobs.validate import validate_run
+from cpunet.recipes import load_recipe
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.timeout(1800)
+def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_path: Path):
+    """Trained on FEP, judged on SEP and DEP, which it has not seen."""
+    folder = reference_data / "closure"
+    sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
+    info = train_run(sim, data, tmp_path / "run", load_recipe("small"), device="cpu")
+    assert info["seconds"] <= 600
+    metrics = validate_run(
+        tmp_path / "run", sim, data, tmp_path / "report", truth=folder / "truth.npz"
+    )
+    worse = []
+    for peak in ("SEP", "DEP"):
+        scores = metrics["peaks"][peak]
+        for name, comparison in scores["parameters"].items():
+            if not comparison["iou"]["ren"] > comparison["iou"]["raw"]:
+                worse.append(f"{peak} {name} iou {comparison['iou']}")
+            worse += [
+                f"{peak} {name} {kind} {comparison[kind]}"
+                for kind in ("wasserstein", "ks")
+                if not comparison[kind]["ren"] < comparison[kind]["raw"]
+            ]
+        worse += [
+            f"{peak} {kind} {scores['paired']}"
+            for kind in ("rmse", "edge_rmse")
+            if not scores["paired"]["ren"][kind] < scores["paired"]["raw"][kind]
+        ]
+    assert worse == []
+    iou = metrics["peaks"]["SEP"]["parameters"]["current_amplitude"]["iou"]
+    assert iou["ren"] >= iou["ceiling"] / 3
+
+
+def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_path: Path):
+    """Traces of a real detector, whose few events are taken from 300 keV on."""
+    sim = InputFile(reference_data / "closure" / "sim.lh5")
+    data = InputFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
+    recipe = load_recipe("small", ["training.iterations=20", "training.decay_start=10"])
+    info = train_run(sim, data, tmp_path / "run", recipe, peak="300-", device="cpu")
+    assert 200 < info["data"]["used"] < 1000
+    metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")
+    scores = metrics["peaks"]["300-"]
+    assert scores["n_data"] == info["data"]["used"]
+    assert set(scores["parameters"]) == {"current_amplitude", "drift_time", "tail_slope"}
+    for name in ("metrics.json", "report.html", "losses.png"):
+        assert (tmp_path / "report" / name).is_file()

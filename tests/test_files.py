@@ -1,0 +1,167 @@
+"""Outputs appear whole or not at all, and nothing else is left in the folder."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside, refuse_existing, written_aside
+
+
+def listing(folder: Path) -> list[str]:
+    """Every name in a folder, hidden ones too."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_appears_at_the_end(tmp_path):
+    target = tmp_path / "new" / "folder" / "out.lh5"
+    with written_aside(target) as aside:
+        aside.write_bytes(b"content")
+        assert aside.parent == target.parent
+        assert aside.suffix == ".lh5"
+        assert not target.exists()
+    assert target.read_bytes() == b"content"
+    assert listing(target.parent) == ["out.lh5"]
+
+
+@pytest.mark.parametrize("error", [ValueError, CpunetError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_a_file_that_failed_leaves_no_trace(tmp_path, error, old):
+    target = tmp_path / "out.lh5"
+    if old is not None:
+        target.write_bytes(old)
+
+    def fail():
+        with written_aside(target) as aside:
+            aside.write_bytes(b"half")
+            raise error("stop")
+
+    with pytest.raises(error, match="stop"):
+        fail()
+    assert listing(tmp_path) == ([] if old is None else ["out.lh5"])
+    if old is not None:
+        assert target.read_bytes() == old
+
+
+def test_an_existing_file_is_replaced(tmp_path):
+    target = tmp_path / "out.lh5"
+    target.write_bytes(b"old")
+    with written_aside(target) as aside:
+        aside.write_bytes(b"new")
+        assert target.read_bytes() == b"old"
+    assert target.read_bytes() == b"new"
+
+
+def test_a_file_has_the_permissions_of_any_other(tmp_path):
+    with written_aside(tmp_path / "file") as aside:
+        aside.touch()
+    with folder_written_aside(tmp_path / "folder"):
+        pass
+    (tmp_path / "other").touch()
+    (tmp_path / "others").mkdir()
+    modes = [
+        stat.S_IMODE((tmp_path / name).stat().st_mode)
+        for name in ("file", "other", "folder", "others")
+    ]
+    assert modes[0] == modes[1]
+    assert modes[2] == modes[3]
+
+
+@pytest.mark.parametrize("writer", [written_aside, folder_written_aside])
+def test_a_place_that_cannot_be_written_to(tmp_path, writer):
+    (tmp_path / "file").touch()
+    target = tmp_path / "file" / "out"
+    with pytest.raises(CpunetError) as error, writer(target):
+        pass
+    assert str(error.value).startswith(f"{target}: cannot be written (")
+    assert "\n" not in str(error.value)
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    target = tmp_path / "out.lh5"
+    with pytest.raises(CpunetError) as error, written_aside(target):
+        raise OSError(28, "No space left on device")
+    assert str(error.value) == f"{target}: cannot be written (No space left on device)"
+    assert listing(tmp_path) == []
+
+
+def test_a_folder_appears_at_the_end(tmp_path):
+    target = tmp_path / "new" / "run"
+    with folder_written_aside(target) as aside:
+        (aside / "run.json").write_text("{}")
+        assert not target.exists()
+    assert listing(target) == ["run.json"]
+    assert listing(target.parent) == ["run"]
+
+
+@pytest.mark.parametrize("error", [ValueError, CpunetError, KeyboardInterrupt])
+@pytest.mark.parametrize("old", [False, True])
+def test_a_folder_that_failed_leaves_no_trace(tmp_path, error, old):
+    target = tmp_path / "run"
+    if old:
+        target.mkdir()
+        (target / "old").touch()
+
+    def fail():
+        with folder_written_aside(target, force=True) as aside:
+            (aside / "half").touch()
+            raise error("stop")
+
+    with pytest.raises(error, match="stop"):
+        fail()
+    assert listing(tmp_path) == (["run"] if old else [])
+    if old:
+        assert listing(target) == ["old"]
+
+
+def test_an_existing_folder_is_refused_and_with_force_replaced(tmp_path):
+    target = tmp_path / "run"
+    target.mkdir()
+    (target / "old").touch()
+    with pytest.raises(CpunetError, match="exists already") as error:  # noqa: SIM117
+        with folder_written_aside(target):
+            pytest.fail("entered")
+    assert str(error.value) == (
+        f"{target}: exists already; choose another name or give --force"
+    )
+    assert listing(target) == ["old"]
+    with folder_written_aside(target, force=True) as aside:
+        (aside / "new").touch()
+        assert listing(target) == ["old"]
+    assert listing(target) == ["new"]
+    assert listing(tmp_path) == ["run"]
+
+
+def test_a_file_in_the_place_of_a_folder_is_no_traceback(tmp_path):
+    target = tmp_path / "run"
+    target.touch()
+    with pytest.raises(CpunetError, match="cannot be written"):  # noqa: SIM117
+        with folder_written_aside(target, force=True):
+            pass
+    assert listing(tmp_path) == ["run"]
+
+
+def test_refuse_existing(tmp_path):
+    refuse_existing(tmp_path / "none")
+    refuse_existing(tmp_path, force=True)
+    with pytest.raises(CpunetError, match="--force"):
+        refuse_existing(tmp_path)
+
+
+NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)
+
+
+@settings(deadline=None)
+@given(name=NAME.filter(lambda n: n not in (".", "..") and len(n.encode()) < 200))
+def test_any_name_that_a_file_may_have(name):
+    with TemporaryDirectory() as folder:
+        with written_aside(Path(folder) / name) as aside:
+            aside.write_bytes(name.encode())
+        assert (Path(folder) / name).read_bytes() == name.encode()
+        assert listing(Path(folder)) == [name]

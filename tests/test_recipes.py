@@ -1,0 +1,160 @@
+"""Recipes: the paper's numbers, and one line for whatever is wrong with a setting."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.recipes import load_recipe, recipe_from, recipe_names
+
+
+def test_the_recipes_that_come_with_the_package():
+    assert {"paper", "small"} <= set(recipe_names())
+    for name in recipe_names():
+        recipe = load_recipe(name)
+        assert recipe.name == name
+        assert recipe.preparation.length == 800
+        assert recipe.training.losses.adversarial_weight > 0
+
+
+def test_the_papers_numbers():
+    recipe = load_recipe("paper")
+    training, losses = recipe.training, recipe.training.losses
+    assert (training.iterations, training.decay_start, training.batch_size) == (7000, 1000, 32)
+    assert (training.rate_generators, training.rate_discriminators) == (1e-3, 1e-3)
+    assert (training.discriminator_interval, training.max_grad_norm) == (30, 100)
+    assert (losses.baseline_len, losses.rising_edge_len, losses.tail_len) == (200, 250, 350)
+    assert (losses.baseline_weight, losses.rising_edge_weight, losses.tail_weight) == (3, 10, 7)
+    weights = (losses.cycle_weight, losses.identity_weight, losses.adversarial_weight)
+    assert weights == (20, 5, 9)
+    assert (recipe.generator.width, recipe.discriminator.embedding_rows) == (40, 1000)
+    assert recipe.discriminator.samples_per_step == 1
+    energies = {name: peak.energy_kev for name, peak in recipe.peaks.items()}
+    # one and two annihilation photons of 511 keV (rounded) below the Tl-208 line
+    assert energies["FEP"] == 2614.511
+    assert energies["FEP"] - energies["SEP"] == pytest.approx(511, abs=0.01)
+    assert energies["FEP"] - energies["DEP"] == pytest.approx(1022, abs=0.01)
+
+
+def test_what_is_written_is_read_back():
+    for name in recipe_names():
+        recipe = load_recipe(name)
+        text = yaml.safe_dump(recipe.model_dump(mode="json"))
+        assert recipe_from(yaml.safe_load(text), "copy") == recipe
+
+
+def test_values_are_overridden_in_turn():
+    recipe = load_recipe(
+        "paper",
+        [
+            "training.batch_size=16",
+            "discriminator.value_range=[-0.1, 1.2]",
+            "training.batch_size=8",
+            "generator.residual=true",
+        ],
+    )
+    assert recipe.training.batch_size == 8
+    assert recipe.discriminator.value_range == (-0.1, 1.2)
+    assert recipe.generator.residual is True
+    assert load_recipe("paper").training.batch_size == 32
+
+
+def test_a_recipe_of_ones_own(tmp_path):
+    path = tmp_path / "own.yaml"
+    settings = load_recipe("small").model_dump(mode="json") | {"name": "own"}
+    path.write_text(yaml.safe_dump(settings))
+    recipe = load_recipe(str(path), ["training.iterations=3"])
+    assert (recipe.name, recipe.training.iterations) == ("own", 3)
+
+
+def message(name: str, *overrides: str) -> str:
+    with pytest.raises(CpunetError) as error:
+        load_recipe(name, overrides)
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+def test_a_recipe_that_is_not_there():
+    text = message("papre")
+    assert "'papre'" in text
+    assert "paper, small" in text
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"- 1\n- 2\n", b"a: [1\n", b"\xff\xfe\x00binary", b"just words", b"a: 1\n\tb: 2\n"],
+)
+def test_files_that_are_no_recipes(tmp_path, content):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    assert "bad.yaml" in message(str(path))
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("training.batch_siez=16", "no training.batch_siez"),
+        ("trianing.batch_size=16", "no trianing.batch_size"),
+        ("training.batch_size.more=16", "no training.batch_size.more"),
+        ("training.batch_size", "expected KEY=VALUE"),
+        ("=16", "the recipe has no "),
+        ("training.batch_size=[", "not YAML"),
+        ("training.batch_size=many", "training.batch_size: "),
+        ("training.batch_size=1", "training.batch_size: "),
+        ("training.batch_size=1.5", "training.batch_size: "),
+        ("training.rate_generators=-1", "training.rate_generators: "),
+        ("training.rate_generators=.nan", "training.rate_generators: "),
+        ("training.betas=[0.5, 1.5]", "training.betas"),
+        ("training.average_decay=1", "training.average_decay: "),
+        ("training=5", "training: "),
+        ("generator.width=3", "generator.width: "),
+        ("generator.name=unet", "generator.name: "),
+        ("generator.dropout=1", "generator.dropout: "),
+        ("discriminator.value_range=[1, 0]", "discriminator: "),
+        ("discriminator.value_range=[1]", "discriminator.value_range"),
+        ("discriminator.samples_per_step=7", "samples_per_step (7)"),
+        ("preparation.samples_before=300", "the loss windows cover 800 samples"),
+        ("preparation.baseline_samples=400", "baseline_samples must be fewer"),
+        ("preparation.tail_samples=401", "must fit in samples_after"),
+        ("training.losses.tail_len=351", "the loss windows cover 801 samples"),
+    ],
+)
+def test_wrong_settings_are_named(override, part):
+    assert part in message("paper", override)
+
+
+def test_a_length_that_the_networks_cannot_halve():
+    text = message("paper", "preparation.samples_after=408", "training.losses.tail_len=358")
+    assert "808 samples, no multiple of 16" in text
+
+
+def test_unknown_keys_of_a_file_are_refused():
+    settings = load_recipe("paper").model_dump(mode="json")
+    settings["training"]["epochs"] = 3
+    with pytest.raises(CpunetError, match=r"mine: training\.epochs: .*not permitted"):
+        recipe_from(settings, "mine")
+
+
+def test_every_setting_is_required():
+    settings = load_recipe("paper").model_dump(mode="json")
+    for room, values in settings.items():
+        if isinstance(values, dict):
+            for key in values:
+                less = {k: v for k, v in values.items() if k != key}
+                if room != "peaks":
+                    with pytest.raises(CpunetError, match=rf"mine: {room}"):
+                        recipe_from(settings | {room: less}, "mine")
+
+
+LINE = st.text(st.characters(exclude_categories=["Cc", "Cs"]), max_size=30)
+
+
+@settings(deadline=None)
+@given(LINE, LINE)
+def test_no_override_gives_a_traceback(key, value):
+    with pytest.raises(CpunetError, match=r"^[^\n]*$"):
+        load_recipe("paper", [f"{key}={value}", f"training.none.{key}={value}"])

@@ -1,0 +1,67 @@
+"""A training small enough to be repeated in every test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.pulses.container import FloatArray
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
+
+# 64-sample pulses and the narrowest networks: an iteration takes milliseconds.
+TINY = (
+    "preparation.samples_before=32",
+    "preparation.samples_after=32",
+    "preparation.baseline_samples=16",
+    "preparation.tail_samples=2",
+    "preparation.decay_fit_samples=16",
+    "generator.width=2",
+    "discriminator.embedding_rows=20",
+    "discriminator.embedding_dim=4",
+    "discriminator.hidden=4",
+    "discriminator.samples_per_step=4",
+    "training.iterations=4",
+    "training.decay_start=2",
+    "training.batch_size=4",
+    "training.statistics_batches=2",
+    "training.log_interval=3",
+    "training.losses.baseline_len=16",
+    "training.losses.rising_edge_len=24",
+    "training.losses.tail_len=24",
+)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Tiny networks: threads that wait for each other cost more than they gain."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def tiny() -> Callable[..., Recipe]:
+    """Make the paper's recipe tiny; arguments override more of it."""
+
+    def make(*overrides: str) -> Recipe:
+        return load_recipe("paper", [*TINY, *overrides])
+
+    return make
+
+
+@pytest.fixture
+def sets() -> tuple[FloatArray, FloatArray]:
+    """Eleven simulated and nine measured pulses of 64 samples."""
+    rng = np.random.default_rng(1)
+    time = np.arange(64)
+
+    def edges(n: int) -> FloatArray:
+        width = rng.uniform(1, 4, (n, 1))
+        return 1 / (1 + np.exp(-(time - 32 + 3 * width) / width))
+
+    sim, data = edges(11), edges(9)
+    data = data * np.exp(-np.clip(time - 32, 0, None) / 150)
+    data += rng.normal(0, 0.003, data.shape)
+    return sim.astype(np.float32), data.astype(np.float32)

@@ -1,0 +1,185 @@
+"""The run folder: read back what was written, and one line for every damage."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+
+from cpunet.errors import CpunetError
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.training.cyclegan import CycleGan
+from cpunet.training.run_folder import (
+    append_losses,
+    load_network,
+    read_info,
+    read_losses,
+    read_recipe,
+    versions,
+    write_run,
+)
+
+INFO = {"recipe": "paper", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
+INFO |= {"seconds": 1.5, "device": "cpu"}
+
+
+@pytest.fixture
+def recipe(tiny):
+    return tiny("generator.residual=true", "discriminator.value_range=[-0.1, 1.1]")
+
+
+@pytest.fixture
+def model(recipe) -> CycleGan:
+    model = CycleGan(recipe)
+    model.ren.skip.set(torch.linspace(1, 0.8, 64), 7)
+    return model
+
+
+@pytest.fixture
+def run(tmp_path: Path, model, recipe) -> Path:
+    write_run(tmp_path, model, recipe, INFO)
+    return tmp_path
+
+
+def blank(recipe) -> PositionalUNet:
+    return PositionalUNet(recipe.generator, recipe.preparation.length)
+
+
+def test_everything_comes_back(run, model, recipe):
+    assert read_info(run) == INFO
+    assert read_recipe(run) == recipe
+    for name in ("ren", "iren", "discriminator_data", "discriminator_sim"):
+        fresh = getattr(CycleGan(recipe), name)
+        loaded = load_network(run, name, fresh.train())
+        assert not loaded.training
+        saved = getattr(model, name).state_dict()
+        assert all(torch.equal(saved[k], v) for k, v in loaded.state_dict().items())
+
+
+def test_ren_and_iren_are_not_confused(run, recipe):
+    ren, iren = (load_network(run, name, blank(recipe)) for name in ("ren", "iren"))
+    assert int(ren.skip.advance) == 7
+    assert int(iren.skip.advance) == 0
+
+
+def test_the_weights_are_safetensors_and_no_pickle(run, model):
+    with safe_open(run / "weights.safetensors", "pt") as file:
+        assert set(file.keys()) == set(model.state_dict())
+    head = (run / "weights.safetensors").read_bytes()
+    length = int.from_bytes(head[:8], "little")
+    assert isinstance(json.loads(head[8 : 8 + length]), dict)
+
+
+def test_losses_are_appended(tmp_path):
+    assert read_losses(tmp_path) == []
+    records = [
+        {"iteration": i, "rate": 1e-3 / 3**i, "losses": {"cycle_forward": 0.1 * i}}
+        for i in range(5)
+    ]
+    append_losses(tmp_path, records[:2])
+    append_losses(tmp_path, records[2:])
+    assert read_losses(tmp_path) == records
+    assert len((tmp_path / "losses.jsonl").read_text().splitlines()) == 5
+
+
+def test_versions_name_what_shapes_the_result():
+    found = versions()
+    assert {"python", "cpunet", "torch", "numpy"} <= found.keys()
+    assert found["torch"] == torch.__version__.split("+")[0] or found["torch"] == (
+        torch.__version__
+    )
+
+
+def one_line(error: pytest.ExceptionInfo[CpunetError], *parts: str) -> None:
+    text = str(error.value)
+    assert "\n" not in text
+    for part in parts:
+        assert part in text
+
+
+def test_weights_of_another_architecture(run, tiny):
+    for other in (tiny("generator.width=4", "generator.residual=true"), tiny()):
+        with pytest.raises(CpunetError) as error:
+            load_network(run, "ren", blank(other))
+        one_line(error, "weights.safetensors: weights of another network", "tensors differ")
+
+
+def test_weights_without_the_part_wanted(run, recipe):
+    with pytest.raises(CpunetError) as error:
+        load_network(run, "other", blank(recipe))
+    one_line(error, "weights.safetensors: weights of another network")
+
+
+def test_missing_weights(run, recipe):
+    (run / "weights.safetensors").unlink()
+    with pytest.raises(CpunetError) as error:
+        load_network(run, "ren", blank(recipe))
+    one_line(error, "weights.safetensors: no readable weights; train again")
+
+
+@settings(deadline=None)
+@given(part=st.floats(0, 1, exclude_max=True))
+def test_truncated_weights(tmp_path_factory, part):
+    # made once, cut anew each time: hypothesis keeps function-scoped fixtures
+    from cpunet.recipes import load_recipe
+
+    folder = tmp_path_factory.mktemp("run")
+    network = torch.nn.Linear(3, 2)
+    write_run(folder, torch.nn.ModuleDict({"ren": network}), load_recipe("paper"), INFO)
+    path = folder / "weights.safetensors"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(part * len(content))])
+    with pytest.raises(CpunetError) as error:
+        load_network(folder, "ren", network)
+    one_line(error, str(path), "train again")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04" + bytes(500), b"\xff" * 500, b"{}"])
+def test_foreign_weights(run, recipe, content):
+    (run / "weights.safetensors").write_bytes(content)
+    with pytest.raises(CpunetError) as error:
+        load_network(run, "ren", blank(recipe))
+    one_line(error, "weights.safetensors: no readable weights; train again")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no finished run"),
+        ("", "run.json: damaged"),
+        ('{"dt_ns": 16', "run.json: damaged"),
+        ("[1]", "run.json: damaged (no mapping)"),
+        ("{}", "run.json: damaged"),
+        ('{"dt_ns": 16}', "run.json: damaged"),
+    ],
+)
+def test_damaged_info(run, text, message):
+    (run / "run.json").unlink()
+    if text is not None:
+        (run / "run.json").write_text(text)
+    with pytest.raises(CpunetError) as error:
+        read_info(run)
+    one_line(error, str(run), message)
+
+
+@pytest.mark.parametrize("text", [None, "", "{", "name: x", "- 1", "a: [\n"])
+def test_damaged_recipe(run, text):
+    (run / "recipe.yaml").unlink()
+    if text is not None:
+        (run / "recipe.yaml").write_text(text)
+    with pytest.raises(CpunetError) as error:
+        read_recipe(run)
+    one_line(error, str(run / "recipe.yaml"))
+
+
+@pytest.mark.parametrize("text", ['{"iteration": 0', "x\n", "\n\n[1"])
+def test_a_damaged_log(run, text):
+    (run / "losses.jsonl").write_text(text)
+    with pytest.raises(CpunetError) as error:
+        read_losses(run)
+    one_line(error, "losses.jsonl: damaged")

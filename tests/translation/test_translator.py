@@ -1,0 +1,195 @@
+"""REN and IREN: any array in, the same rows out, reproducible, and no silent failure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.translation import translator
+from cpunet.translation.translator import IREN, REN
+
+
+@pytest.fixture(scope="session")
+def ren(run: Path) -> REN:
+    return REN.load(run)
+
+
+@pytest.fixture(scope="session")
+def iren(run: Path) -> IREN:
+    return IREN.load(str(run))
+
+
+def test_they_are_the_packages_front_door():
+    assert cpunet.REN is REN
+    assert cpunet.IREN is IREN
+
+
+def test_arrays_and_tensors_give_the_same(ren, sim):
+    from_array = ren.translate(sim, seed=3)
+    from_tensor = ren.translate(torch.from_numpy(sim), seed=3)
+    assert isinstance(from_array, np.ndarray)
+    assert isinstance(from_tensor, torch.Tensor)
+    assert (from_array.dtype, from_tensor.dtype) == (np.float32, torch.float32)
+    assert from_array.shape == (5, 800)
+    assert np.array_equal(from_array, from_tensor.numpy())
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_any_precision_gives_float32(ren, sim, dtype):
+    out = ren.translate(sim.astype(dtype), noise=False)
+    assert out.dtype == np.float32
+    assert np.array_equal(out, ren.translate(sim, noise=False))
+
+
+def test_tensors_with_a_gradient_are_taken(ren, sim):
+    out = ren.translate(torch.from_numpy(sim).requires_grad_(), noise=False)
+    assert np.array_equal(out.numpy(), ren.translate(sim, noise=False))
+
+
+def test_a_single_pulse_is_a_batch_of_one(ren, sim):
+    single = ren.translate(sim[2], seed=4)
+    assert single.shape == (800,)
+    assert np.array_equal(single, ren.translate(sim[2:3], seed=4)[0])
+    tensor = ren.translate(torch.from_numpy(sim[2]), seed=4)
+    assert np.array_equal(single, tensor.numpy())
+
+
+def test_the_batch_does_not_matter_without_noise(ren, sim, monkeypatch):
+    together = ren.translate(sim, noise=False)
+    alone = np.stack([ren.translate(pulse, noise=False) for pulse in sim])
+    np.testing.assert_allclose(together, alone, atol=1e-5)
+    monkeypatch.setattr(translator, "BATCH", 2)
+    np.testing.assert_allclose(ren.translate(sim, noise=False), together, atol=1e-5)
+
+
+def test_seeds(ren, sim):
+    first, again, other = (ren.translate(sim, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(ren.translate(sim), ren.translate(sim))
+
+
+def test_without_noise_nothing_is_random(ren, sim):
+    before = torch.get_rng_state()
+    first, again = (ren.translate(sim, noise=False, seed=seed) for seed in (1, 2))
+    assert np.array_equal(first, again)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_loading_twice_gives_the_same_translator(run, ren, sim):
+    assert np.array_equal(REN.load(run).translate(sim, seed=1), ren.translate(sim, seed=1))
+
+
+def test_iren_takes_measured_pulses(iren, data):
+    out = iren.translate(data, noise=False)
+    assert out.shape == (5, 800)
+    # gain and offset of the digitiser are no part of the pulse
+    np.testing.assert_allclose(iren.translate(3 * data + 500, noise=False), out, atol=1e-4)
+
+
+def test_there_and_back(ren, iren, sim):
+    there = ren.translate(sim, noise=False)
+    assert iren.apply(there, noise=False).shape == (len(sim), 800)
+
+
+@pytest.mark.parametrize(("side", "kind"), [("ren", "simulated"), ("iren", "measured")])
+def test_prepared_pulses_are_not_prepared_again(request, recipe, sim, data, side, kind):
+    one = request.getfixturevalue(side)
+    raw = Pulses.of(sim if side == "ren" else data, dt_ns=16)
+    windows = prepare(raw, recipe.preparation, kind).pulses.waveforms
+    assert len(windows) == 5
+    np.testing.assert_allclose(
+        one.translate(windows, noise=False),
+        one.translate(raw.waveforms, noise=False),
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(
+        one.translate(windows, noise=False), one.apply(windows, noise=False), atol=1e-5
+    )
+
+
+def test_the_input_is_left_alone(ren, sim):
+    before = sim.copy()
+    ren.translate(sim)
+    assert np.array_equal(sim, before)
+
+
+def test_sets_keep_their_rows(ren, sim):
+    pulses = Pulses.of(
+        sim, dt_ns=16, energy_kev=[1, 2, 3, 4, 5], event_number=[10, 20, 30, 40, 50]
+    )
+    steps: list[int] = []
+    done = ren.translate_pulses(pulses, generator=ren.seeded(6), progress=steps.append)
+    assert np.array_equal(done.pulses.waveforms, ren.translate(sim, seed=6))
+    assert done.pulses.event_number.tolist() == [10, 20, 30, 40, 50]
+    assert done.pulses.energy_kev.tolist() == [1, 2, 3, 4, 5]
+    assert done.valid.all()
+    assert sum(steps) == 5
+
+
+def broken(sim: np.ndarray) -> np.ndarray:
+    sim = sim.copy()
+    sim[1, 7] = np.nan
+    sim[3] = 0.25
+    return sim
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [(slice(None), "pulse 1: nan; "), (slice(2, None), "pulse 1: constant; ")],
+)
+def test_a_pulse_that_cannot_be_translated_is_named(ren, sim, rows, message):
+    for waveforms in (broken(sim)[rows], torch.from_numpy(broken(sim)[rows])):
+        with pytest.raises(CpunetError, match=message) as error:
+            ren.translate(waveforms)
+        assert "\n" not in str(error.value)
+
+
+def test_in_a_set_it_becomes_nan_with_a_code(ren, sim):
+    done = ren.translate_pulses(Pulses.of(broken(sim), dt_ns=16), noise=False)
+    codes = [Rejection.ACCEPTED] * 5
+    codes[1], codes[3] = Rejection.NAN, Rejection.CONSTANT
+    assert done.codes.tolist() == codes
+    assert done.valid.tolist() == [True, False, True, False, True]
+    assert np.isnan(done.pulses.waveforms[[1, 3]]).all()
+    good = ren.translate(sim[[0, 2, 4]], noise=False)
+    np.testing.assert_allclose(done.pulses.waveforms[[0, 2, 4]], good, atol=1e-5)
+
+
+def test_a_set_without_a_good_pulse_is_all_nan(ren):
+    done = ren.translate_pulses(Pulses.of(np.zeros((3, 225)), dt_ns=16))
+    assert np.isnan(done.pulses.waveforms).all()
+    assert not done.valid.any()
+
+
+def test_no_pulses_at_all(ren):
+    assert ren.translate(np.zeros((0, 225), np.float32)).shape == (0, 800)
+
+
+def test_another_sampling_period_is_refused(ren, sim):
+    with pytest.raises(CpunetError) as error:
+        ren.translate_pulses(Pulses.of(sim, dt_ns=10))
+    assert str(error.value) == (
+        "pulses sampled every 10 ns, the run was trained on 16 ns; resample them"
+    )
+
+
+@pytest.mark.parametrize("shape", [(), (2, 3, 225), (3, 0)])
+def test_shapes_that_are_no_pulses(ren, shape):
+    with pytest.raises(CpunetError) as error:
+        ren.translate(np.zeros(shape, np.float32))
+    assert "\n" not in str(error.value)
+
+
+def test_folders_that_are_no_runs(tmp_path):
+    for path in (tmp_path, tmp_path / "none"):
+        with pytest.raises(CpunetError, match=r"no finished run .* `cpunet train`") as error:
+            REN.load(path)
+        assert str(error.value).startswith(str(path))
