@@ -6,6 +6,12 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
+from hypothesis import settings
+
+# compilation and a shared machine make single examples slow now and then
+settings.register_profile("cpunet", deadline=None)
+settings.load_profile("cpunet")
 
 
 @pytest.fixture(scope="session")
@@ -16,3 +22,9 @@ def reference_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no reference data: set CPUNET_REFERENCE_DATA to their folder")
     return folder
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Tiny networks: threads that wait for each other cost more than they gain."""
+    torch.set_num_threads(1)

@@ -7,11 +7,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside, refuse_existing, written_aside
+from cpunet.files import folder_written_aside as aside_with_marker
+from cpunet.files import refuse_existing, written_aside
+
+
+def folder_written_aside(target, *, force=False):
+    return aside_with_marker(target, marker="old", force=force)
 
 
 def listing(folder: Path) -> list[str]:
@@ -141,7 +146,7 @@ def test_an_existing_folder_is_refused_and_with_force_replaced(tmp_path):
 def test_a_file_in_the_place_of_a_folder_is_no_traceback(tmp_path):
     target = tmp_path / "run"
     target.touch()
-    with pytest.raises(CpunetError, match="cannot be written"):  # noqa: SIM117
+    with pytest.raises(CpunetError, match="is no folder"):  # noqa: SIM117
         with folder_written_aside(target, force=True):
             pass
     assert listing(tmp_path) == ["run"]
@@ -154,10 +159,24 @@ def test_refuse_existing(tmp_path):
         refuse_existing(tmp_path)
 
 
+def test_force_replaces_nothing_but_folders_of_its_kind(tmp_path):
+    target = tmp_path / "home"
+    target.mkdir()
+    (target / "thesis.tex").touch()
+    with pytest.raises(CpunetError, match=r"is no folder with a run\.json"):  # noqa: SIM117
+        with aside_with_marker(target, marker="run.json", force=True):
+            pytest.fail("entered")
+    assert listing(target) == ["thesis.tex"]
+    (target / "thesis.tex").unlink()
+    with folder_written_aside(target, force=True) as aside:  # an empty one is fair game
+        (aside / "run.json").touch()
+    assert listing(target) == ["run.json"]
+    assert listing(tmp_path) == ["home"]
+
+
 NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)
 
 
-@settings(deadline=None)
 @given(name=NAME.filter(lambda n: n not in (".", "..") and len(n.encode()) < 200))
 def test_any_name_that_a_file_may_have(name):
     with TemporaryDirectory() as folder:

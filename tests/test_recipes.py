@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
@@ -153,7 +153,6 @@ def test_every_setting_is_required():
 LINE = st.text(st.characters(exclude_categories=["Cc", "Cs"]), max_size=30)
 
 
-@settings(deadline=None)
 @given(LINE, LINE)
 def test_no_override_gives_a_traceback(key, value):
     with pytest.raises(CpunetError, match=r"^[^\n]*$"):

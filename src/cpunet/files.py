@@ -44,16 +44,32 @@ def written_aside(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def folder_written_aside(target: Path, *, force: bool = False) -> Iterator[Path]:
+def folder_written_aside(target: Path, *, marker: str, force: bool = False) -> Iterator[Path]:
     """Give a temporary folder beside `target`; move it there if all went well.
+
+    Parameters
+    ----------
+    target
+        The folder to make.
+    marker
+        A file that all folders of this kind hold.  With `force`, only an empty
+        folder or one with that file is replaced, so that a slip of the keyboard
+        cannot delete anything else.
+    force
+        Replace an existing folder.
 
     Raises
     ------
     CpunetError
-        If `target` exists and `force` is off, or its parent cannot be written to.
+        If `target` exists and may not be replaced, or its parent cannot be written to.
     """
     target = Path(target)
     refuse_existing(target, force=force)
+    if target.exists() and not _replaceable(target, marker):
+        raise CpunetError(
+            f"{target}: is no folder with a {marker}, so --force does not replace it; "
+            "choose another name"
+        )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -62,13 +78,30 @@ def folder_written_aside(target: Path, *, force: bool = False) -> Iterator[Path]
     try:
         yield aside
         aside.chmod(0o777 & ~_umask())
-        if target.is_dir():
-            shutil.rmtree(target)
-        aside.replace(target)
+        _take_the_place(aside, target)
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def _replaceable(folder: Path, marker: str) -> bool:
+    return folder.is_dir() and ((folder / marker).is_file() or not any(folder.iterdir()))
+
+
+def _take_the_place(aside: Path, target: Path) -> None:
+    """Rename `aside` to `target`; an old folder is removed only once that is done."""
+    if not target.exists():
+        aside.replace(target)
+        return
+    old = aside.with_name(f"{aside.name}-old")
+    target.replace(old)
+    try:
+        aside.replace(target)
+    except OSError:
+        old.replace(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def refuse_existing(target: Path, *, force: bool = False) -> None:

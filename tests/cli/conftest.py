@@ -14,7 +14,6 @@ import lh5
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
 
 from cpunet.cli.main import main
@@ -40,12 +39,6 @@ TINY = [
 TINY_OPTIONS = [word for value in TINY for word in ("--set", value)]
 
 Waveforms = npt.NDArray[Any]
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    """Tiny networks: threads that wait for each other cost more than they gain."""
-    torch.set_num_threads(1)
 
 
 def charge(n: int, rng: np.random.Generator, length: int = 225) -> npt.NDArray[np.float64]:

@@ -48,12 +48,6 @@ RECIPE = load_recipe(
 N = 30
 
 
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    """Tiny networks: threads that wait for each other cost more than they gain."""
-    torch.set_num_threads(1)
-
-
 class Listening(Monitor):
     """Keeps what it is told."""
 

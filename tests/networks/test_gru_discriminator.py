@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -39,7 +39,6 @@ def test_the_paper_network_has_the_published_number_of_parameters():
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == 130_817
 
 
-@settings(deadline=None)
 @given(rows=st.integers(2, 1200))
 def test_whole_codes_give_the_rows_themselves(rows):
     table = InterpolatedEmbedding(rows, 3).double()
@@ -49,7 +48,6 @@ def test_whole_codes_give_the_rows_themselves(rows):
     assert torch.allclose(found, table.weight, atol=1e-9)
 
 
-@settings(deadline=None)
 @given(rows=st.integers(2, 1200), code=st.floats(0, 1))
 def test_between_rows_it_is_their_weighted_mean(rows, code):
     table = InterpolatedEmbedding(rows, 3).double()

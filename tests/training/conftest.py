@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import torch
 
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes import load_recipe
@@ -33,12 +32,6 @@ TINY = (
     "training.losses.rising_edge_len=24",
     "training.losses.tail_len=24",
 )
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    """Tiny networks: threads that wait for each other cost more than they gain."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture

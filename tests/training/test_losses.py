@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.recipes import load_recipe
@@ -31,7 +31,6 @@ def test_the_papers_windows():
     assert weights.tolist() == pytest.approx(expected)
 
 
-@settings(deadline=None)
 @given(
     lengths=st.tuples(*[st.integers(1, 7)] * 3),
     weights=st.tuples(*[st.floats(0, 20)] * 3),
@@ -54,7 +53,6 @@ def test_weighted_l1_sample_by_sample(lengths, weights, n, seed):
     assert float(found) == pytest.approx(total / n, rel=1e-5, abs=1e-12)
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-30, 30), min_size=1, max_size=5))
 def test_cross_entropies(logits):
     # log(1 + exp(-x)) = -log(sigmoid(x))

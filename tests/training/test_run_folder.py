@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
 
@@ -122,7 +122,6 @@ def test_missing_weights(run, recipe):
     one_line(error, "weights.safetensors: no readable weights; train again")
 
 
-@settings(deadline=None)
 @given(part=st.floats(0, 1, exclude_max=True))
 def test_truncated_weights(tmp_path_factory, part):
     # made once, cut anew each time: hypothesis keeps function-scoped fixtures

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.training import loop
@@ -24,7 +24,6 @@ def numbers(batch: torch.Tensor) -> list[int]:
     return [int(x) for x in batch[:, 0, 0]]
 
 
-@settings(deadline=None)
 @given(n=st.integers(1, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_every_batch_is_full_and_holds_pulses_of_the_set(n, batch_size, seed):
     deck = Deck(numbered(n), batch_size, seed)
@@ -34,7 +33,6 @@ def test_every_batch_is_full_and_holds_pulses_of_the_set(n, batch_size, seed):
         assert set(numbers(batch)) <= set(range(n))
 
 
-@settings(deadline=None)
 @given(n=st.integers(2, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_between_two_shuffles_no_pulse_comes_twice(n, batch_size, seed):
     deck = Deck(numbered(n), batch_size, seed)
@@ -43,7 +41,6 @@ def test_between_two_shuffles_no_pulse_comes_twice(n, batch_size, seed):
         assert len(set(dealt)) == len(dealt)
 
 
-@settings(deadline=None)
 @given(n=st.integers(1, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_every_pulse_is_used(n, batch_size, seed):
     # chance to miss one in a shuffle is below 1/2, with replacement below exp(-1) a batch
@@ -52,7 +49,6 @@ def test_every_pulse_is_used(n, batch_size, seed):
     assert used == set(range(n))
 
 
-@settings(deadline=None)
 @given(n=st.integers(2, 40), seed=st.integers(0, 2**32))
 def test_the_same_seed_deals_the_same(n, seed):
     decks = [Deck(numbered(n), 4, s) for s in (seed, seed)]

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -17,12 +16,6 @@ from cpunet.training.loop import train
 from cpunet.training.run_folder import write_run
 
 DT_NS = 16.0
-
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    """Tiny networks: threads that wait for each other cost more than they gain."""
-    torch.set_num_threads(1)
 
 
 def simulated(n: int, seed: int = 1, length: int = 225) -> npt.NDArray[np.float32]:

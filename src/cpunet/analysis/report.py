@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from cpunet.analysis.parameters import PARAMETERS
 from cpunet.analysis.style import label
 
+METRICS = "metrics.json"
 DPI = 150
 WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
 NO_VALUE = "–"
@@ -53,7 +54,7 @@ def write_report(
     """
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    (folder / METRICS).write_text(text + "\n", encoding="utf-8")
     drawn = []
     for name, figure in figures.items():
         png = _png(figure)

@@ -33,5 +33,6 @@ KevPerAdc = Annotated[
     ),
 ]
 Dt = Annotated[
-    float | None, typer.Option("--dt", help="Sampling period in ns, if the files do not tell.")
+    float | None,
+    typer.Option("--dt-ns", "--dt", help="Sampling period in ns, if the files do not tell."),
 ]

@@ -16,7 +16,7 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record, train
-from cpunet.training.run_folder import append_losses, versions, write_run
+from cpunet.training.run_folder import INFO, append_losses, versions, write_run
 from cpunet.training.tensorboard import LossBoard
 
 QUIET = Monitor()
@@ -70,7 +70,7 @@ def train_run(
     """
     device = resolve_device(device)
     selection = parse_selection(peak, recipe.peaks)
-    with folder_written_aside(out, force=force) as folder:
+    with folder_written_aside(out, marker=INFO, force=force) as folder:
         sim_set = load_simulated(sim, recipe, selection, monitor)
         data_set = load_measured(data, recipe, selection, monitor)
         require_same_sampling(sim_set, data_set)

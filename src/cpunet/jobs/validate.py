@@ -12,7 +12,7 @@ import numpy as np
 from cpunet.analysis.comparisons import compare
 from cpunet.analysis.paired import paired_scores
 from cpunet.analysis.parameters import Values, pulse_parameters
-from cpunet.analysis.report import write_report
+from cpunet.analysis.report import METRICS, write_report
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.figures import validation_figures
@@ -101,7 +101,7 @@ def validate_run(
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
     selection = parse_selection(",".join(names), recipe.peaks)
-    with folder_written_aside(out, force=force) as folder:
+    with folder_written_aside(out, marker=METRICS, force=force) as folder:
         sim_set = load_simulated(sim, recipe, selection, monitor)
         data_set = load_measured(data, recipe, selection, monitor)
         require_same_sampling(sim_set, data_set)
