@@ -44,9 +44,9 @@ def write_report(
     metrics
         ``peaks``: by peak, ``n_sim``, ``n_data``, ``parameters`` (the result of
         `comparisons.compare`) and, if the truth is known, ``paired`` (by method, the
-        result of `paired.paired_scores`); ``training``: how the network was trained;
-        ``rejections``: counts by reason, possibly nested.  Numbers that are not
-        finite are written as ``null``.
+        result of `paired.paired_scores`), or ``missing``: why it is not scored;
+        ``training``: how the network was trained; ``rejections``: counts by reason,
+        possibly nested.  Numbers that are not finite are written as ``null``.
     figures
         Figures by name; the names become file names and captions.
     notes
@@ -76,7 +76,9 @@ def _peak_html(peak: str, scores: Mapping[str, Any]) -> str:
     parts = [
         f"<h3>{escape(peak)}: {_number(scores.get('n_sim'))} simulated, "
         f"{_number(scores.get('n_data'))} measured pulses</h3>",
-        _parameter_table(scores.get("parameters", {})),
+        f"<p>Not scored: {escape(scores['missing'])}.</p>"
+        if "missing" in scores
+        else _parameter_table(scores.get("parameters", {})),
     ]
     if scores.get("paired"):
         parts.append(_paired_table(scores["paired"]))

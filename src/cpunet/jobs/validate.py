@@ -33,6 +33,7 @@ from cpunet.training.run_folder import read_info, read_losses
 from cpunet.translation.translator import IREN, REN
 
 QUIET = Monitor()
+FEWEST = 10  # pulses, below which a distribution says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,10 @@ class PeakSets:
     def missing(self) -> str | None:
         """Say what keeps the peak from being scored, if anything does."""
         sides = (("simulated", self.raw), ("measured", self.data))
-        empty = [side for side, pulses in sides if not len(pulses)]
-        return f"no {' and no '.join(empty)} pulses" if empty else None
+        few = [
+            f"{len(pulses) or 'no'} {side}" for side, pulses in sides if len(pulses) < FEWEST
+        ]
+        return f"{' and '.join(few)} pulses (at least {FEWEST} are needed)" if few else None
 
 
 def validate_run(
@@ -141,7 +144,7 @@ def validate_run(
         }
         with monitor.stage("Drawing") as advance:
             figures = validation_figures(sets, values, peaks, read_losses(run), ren, iren)
-            write_report(folder, metrics, figures, _notes(info, sets, truth))
+            write_report(folder, metrics, figures, _notes(info, truth))
     return metrics
 
 
@@ -196,7 +199,7 @@ def _paired(peak: PeakSets, edge_samples: int) -> dict[str, Any]:
     }
 
 
-def _notes(info: Mapping[str, Any], sets: list[PeakSets], truth: Path | None) -> list[str]:
+def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:
     notes = [
         f"Trained with recipe “{info['recipe']}” on {info['sim']['used']} simulated and "
         f"{info['data']['used']} measured pulses of {info['peak']}, unpaired; peaks other "
@@ -207,5 +210,4 @@ def _notes(info: Mapping[str, Any], sets: list[PeakSets], truth: Path | None) ->
     ]
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
-    notes += [f"{s.name}: {s.missing()}, so it is not scored." for s in sets if s.missing()]
     return notes
