@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from types import FrameType
 
 import typer
 
@@ -27,14 +29,19 @@ for command in (train, translate, validate, info):
 def main() -> None:
     """Run the command line; bad input ends in one line and status 2."""
     _share_the_machine()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _stop)
     try:
         app()
     except CpunetError as error:
         fail(str(error))
         sys.exit(2)
-    except KeyboardInterrupt:
-        fail("interrupted; nothing half-written was left")
-        sys.exit(130)
+
+
+def _stop(number: int, _frame: FrameType | None) -> None:
+    """Leave as on an error, so that Ctrl-C and batch systems leave nothing half-written."""
+    fail("interrupted; nothing half-written was left")
+    sys.exit(128 + number)
 
 
 def _share_the_machine() -> None:

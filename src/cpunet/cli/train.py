@@ -68,4 +68,6 @@ def train(
         tensorboard=tensorboard,
         monitor=monitor(),
     )
-    out.print(f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}")
+    out.print(
+        f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
+    )

@@ -58,5 +58,6 @@ def translate(
     rejected = ", ".join(f"{n} {reason}" for reason, n in counts["rejections"].items())
     out.print(
         f"{out_file}: {counts['translated']} of {counts['read']} pulses translated"
-        + (f"; rows of NaN for {rejected}" if rejected else "")
+        + (f"; rows of NaN for {rejected}" if rejected else ""),
+        soft_wrap=True,
     )

@@ -34,7 +34,9 @@ _REMEDIES = {
     ),
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
-    Rejection.ENERGY_UNKNOWN: "give calibrated energies or select no peaks",
+    Rejection.ENERGY_UNKNOWN: (
+        "name the column of their calibrated energies, or give --kev-per-adc"
+    ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }
 
