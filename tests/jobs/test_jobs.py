@@ -119,6 +119,16 @@ def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
     json.dumps(told)
 
 
+def test_measured_pulses_given_as_simulated_ones_are_doubted(files):
+    selection, monitor = parse_selection("FEP", RECIPE.peaks), Listening()
+    load_simulated(files[1], RECIPE, selection, monitor)
+    assert monitor.notes[0].startswith("warning: data.lh5: these pulses decay")
+    monitor.notes.clear()
+    load_simulated(files[0], RECIPE, selection, monitor)
+    load_measured(files[1], RECIPE, selection, monitor)
+    assert not any(note.startswith("warning") for note in monitor.notes)
+
+
 def test_sets_of_different_sampling(sim_set, files):
     other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"))
     require_same_sampling(sim_set, sim_set)

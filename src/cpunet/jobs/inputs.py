@@ -19,6 +19,8 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
 from cpunet.recipes.schema import Recipe
 
+LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+
 
 @dataclass(frozen=True)
 class InputFile:
@@ -113,9 +115,20 @@ def _load(
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
             )
+    if not measured and _decays(prepared, recipe):
+        monitor.note(
+            f"warning: {file.path.name}: these pulses decay; "
+            "are they simulated ones, without electronics?"
+        )
     rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
     monitor.note(
         f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
         + (f" (left out: {rejected})" if rejected else "")
     )
     return InputSet(prepared, source.dt_ns, file.path, cuts)
+
+
+def _decays(prepared: Prepared, recipe: Recipe) -> bool:
+    """Tell whether simulated pulses end below their maximum, as measured ones do."""
+    end = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
+    return bool(np.median(end) < LEAST_SIMULATED_END)
