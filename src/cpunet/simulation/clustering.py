@@ -1,0 +1,102 @@
+"""Hits that lie close together merged into one, so that fewer pulses need a drift."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.hits import Hits
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+
+def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
+    """Merge the hits of each event that are nearer than a distance to each other.
+
+    Single linkage: hits joined by a chain of neighbours at most `distance_mm` apart
+    become one, at their energy-weighted mean position and with the sum of their energies.
+    Clusters keep the order of their first hits.
+
+    Parameters
+    ----------
+    hits
+        Events as read or simulated.
+    distance_mm
+        In mm; 0 merges only hits at the same place.
+
+    Raises
+    ------
+    CpunetError
+        If the distance is negative or not a number.
+
+    Examples
+    --------
+    >>> hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 9]], [100, 300, 50], [0, 3])
+    >>> sites = cluster_hits(hits, distance_mm=1.5)
+    >>> sites.z_mm, sites.edep_kev
+    (array([1.75, 9.  ]), array([400.,  50.]))
+    """
+    if not (math.isfinite(distance_mm) and distance_mm >= 0):
+        raise CpunetError(f"hits cannot be merged within {distance_mm} mm; give 0 or more")
+    merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, distance_mm**2)
+    x, y, z, energy = merged.T.copy()
+    return Hits(x, y, z, energy, offsets, hits.event_number)
+
+
+@numba.njit(cache=True, nogil=True)
+def _merge(
+    position: Array, energy: Array, offsets: Integers, distance2: float
+) -> tuple[Array, Integers]:
+    """Clusters as rows (x, y, z, energy), and the offsets of the events."""
+    merged = np.zeros((len(energy), 4))
+    new_offsets = np.zeros_like(offsets)
+    label = np.empty(len(energy), np.int64)
+    queue = np.empty(len(energy), np.int64)
+    n = 0
+    for event in range(len(offsets) - 1):
+        start, end = offsets[event], offsets[event + 1]
+        label[start:end] = -1
+        for first in range(start, end):
+            if label[first] >= 0:
+                continue
+            label[first] = n
+            queue[0] = first
+            done, waiting = 0, 1
+            while done < waiting:
+                mine = queue[done]
+                done += 1
+                for other in range(first + 1, end):
+                    if label[other] < 0 and _near(position, mine, other, distance2):
+                        label[other] = n
+                        queue[waiting] = other
+                        waiting += 1
+            _average(position, energy, queue[:waiting], merged[n])
+            n += 1
+        new_offsets[event + 1] = n
+    return merged[:n], new_offsets
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(position: Array, a: int, b: int, distance2: float) -> bool:
+    square = 0.0
+    for axis in range(3):
+        square += (position[a, axis] - position[b, axis]) ** 2
+    return square <= distance2
+
+
+@numba.njit(cache=True, nogil=True)
+def _average(position: Array, energy: Array, members: Integers, row: Array) -> None:
+    for member in members:
+        row[3] += energy[member]
+    for axis in range(3):
+        # relative to the first, so that equal positions stay exactly what they are
+        origin = position[members[0], axis]
+        shift = 0.0
+        for member in members:
+            shift += energy[member] * (position[member, axis] - origin)
+        row[axis] = origin + (shift / row[3] if row[3] > 0.0 else 0.0)

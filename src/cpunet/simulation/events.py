@@ -1,0 +1,185 @@
+"""Pulses of whole events: the sum of their hits' pulses, weighted by energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from cpunet.pulses.container import Pulses
+from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
+from cpunet.simulation.drift import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.library import Library, build_library, covers, interpolate
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.signals import cloud_numbers, hit_table, point_signal, time_numbers
+from cpunet.simulation.velocity import FloatArray
+
+Progress = Callable[[int, int], None]
+
+# Events between two calls of `progress`.
+_BLOCK = 2000
+# Outcomes of a hit.
+_COLLECTED, _NO_SIGNAL, _NOT_COLLECTED = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class EventPulses:
+    """Pulses of events, in units of the charge that gives a signal.
+
+    Parameters
+    ----------
+    waveforms
+        Float32 array (n_events, samples); zero for events without any signal.
+    dt_ns
+        Sampling period in ns.
+    energy_kev
+        Energy deposited in each event.
+    lost_kev
+        Part of it in hits without a signal: in a contact or its dead layer, outside the
+        crystal, or in germanium without a field.
+    event_number
+        The source's own number of each event.
+    counts
+        Hits and events by what became of them.
+    """
+
+    waveforms: npt.NDArray[np.float32]
+    dt_ns: float
+    energy_kev: FloatArray
+    lost_kev: FloatArray
+    event_number: npt.NDArray[np.int64]
+    counts: dict[str, int]
+
+    @property
+    def collected_kev(self) -> FloatArray:
+        """Energy that gives a signal: what a detector measures."""
+        return self.energy_kev - self.lost_kev
+
+    def pulses(self) -> Pulses:
+        """The events with a signal as `Pulses`, with the energy that is collected."""
+        kept = self.collected_kev > 0
+        return Pulses.of(
+            self.waveforms[kept],
+            dt_ns=self.dt_ns,
+            energy_kev=self.collected_kev[kept],
+            event_number=self.event_number[kept],
+        )
+
+
+def simulate_events(
+    fields: Maps,
+    hits: Hits,
+    settings: SimulationSettings,
+    mode: Literal["exact", "library"] = "exact",
+    progress: Progress | None = None,
+    library: Library | None = None,
+) -> EventPulses:
+    """Simulate the pulse of each event, in parallel over the events.
+
+    Parameters
+    ----------
+    mode
+        ``"exact"`` drifts every hit; ``"library"`` interpolates between pre-computed
+        pulses, and drifts only hits at the edge of the detector and near its contact.
+    progress
+        Called now and then with the numbers of events done and in all.
+    library
+        Pre-computed pulses of the same fields and settings; built if not given.
+
+    Raises
+    ------
+    CpunetError
+        If a hit's place or energy is no finite number.
+    """
+    table = hit_table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
+    use_library = mode == "library"
+    if library is None:
+        grid = {} if use_library else {"library_grid_mm": 1e4}
+        library = build_library(fields, settings.model_copy(update=grid))
+    maps = drift_maps(fields)
+    n = hits.n_events
+    waveforms = np.zeros((n, settings.n_samples), np.float32)
+    lost_kev = np.zeros(n)
+    outcome = np.zeros(len(table), np.int8)
+    cloud, times = cloud_numbers(fields, settings), time_numbers(settings)
+    for begin in range(0, n, _BLOCK):
+        end = min(begin + _BLOCK, n)
+        part = slice(begin, end)
+        offsets = hits.offsets[begin : end + 1]
+        _sum_hits(
+            maps,
+            library,
+            use_library,
+            table,
+            offsets,
+            cloud,
+            times,
+            waveforms[part],
+            lost_kev[part],
+            outcome,
+        )
+        if progress:
+            progress(end, n)
+    energy = hits.energy_kev
+    return EventPulses(
+        waveforms=waveforms,
+        dt_ns=settings.dt_ns,
+        energy_kev=energy,
+        lost_kev=lost_kev,
+        event_number=hits.event_number,
+        counts={
+            "hits": len(table),
+            "hits without signal": int((outcome == _NO_SIGNAL).sum()),
+            "hits not collected within the record": int((outcome == _NOT_COLLECTED).sum()),
+            "events": n,
+            "events without signal": int((energy - lost_kev <= 0).sum()),
+        },
+    )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sum_hits(
+    maps: DriftMaps,
+    library: Library,
+    use_library: bool,
+    hits: FloatArray,
+    offsets: npt.NDArray[np.int64],
+    cloud: tuple[float, float, float, bool],
+    times: tuple[float, int],
+    waveforms: npt.NDArray[np.float32],
+    lost_kev: FloatArray,
+    outcome: npt.NDArray[np.int8],
+) -> None:
+    step_ns, per_sample = times
+    n_samples = waveforms.shape[1]
+    coarse = max(1, round(per_sample * step_ns / library.step_ns))
+    for event in prange(len(offsets) - 1):
+        out = np.zeros(n_samples)
+        signal = np.empty(n_samples * per_sample)
+        short = np.empty(n_samples * coarse, np.float32)
+        lost = collected = 0.0
+        for i in range(offsets[event], offsets[event + 1]):
+            hit = hits[i]
+            if not in_active_volume(maps, hit[0], hit[1], hit[2]):
+                outcome[i] = _NO_SIGNAL
+                lost += hit[3]
+                continue
+            collected += hit[3]
+            if use_library and covers(library, hit[0], hit[1], hit[2]):
+                last, fwhm_ns = interpolate(library, hit, short)
+                sigma = fwhm_ns / library.step_ns / FWHM_PER_SIGMA
+                smear_and_sample(short, coarse, sigma, last, hit[3], out)
+                continue
+            last, arrived, fwhm = point_signal(maps, hit, cloud, step_ns, signal)
+            if not arrived:
+                outcome[i] = _NOT_COLLECTED
+            smear_and_sample(signal, per_sample, fwhm / FWHM_PER_SIGMA, last, hit[3], out)
+        lost_kev[event] = lost
+        if collected > 0.0:
+            for j in range(n_samples):
+                waveforms[event, j] = out[j] / collected

@@ -1,0 +1,11 @@
+"""Built-in Monte Carlo of Tl-208 gammas, for those without Geant4 hits of their own."""
+
+from cpunet.simulation.gammas.sample import (
+    TL208_KEV,
+    GammaStatistics,
+    WantedLine,
+    simulate_gammas,
+    with_resolution,
+)
+
+__all__ = ["TL208_KEV", "GammaStatistics", "WantedLine", "simulate_gammas", "with_resolution"]

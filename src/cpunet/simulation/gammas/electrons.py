@@ -1,0 +1,142 @@
+"""Electrons and positrons slowing down: steps of the electron table, with hard photons."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, ElectronTable
+from cpunet.simulation.gammas.processes import (
+    Direction,
+    annihilation_energy,
+    forward,
+    isotropic,
+    remainder,
+    turned,
+)
+from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
+
+Array = npt.NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> int:
+    """Append a deposit (mm, MeV) to the hits; the new number of hits."""
+    if energy > 0.0 and n < len(hits):
+        hits[n, 0], hits[n, 1], hits[n, 2], hits[n, 3] = x, y, z, energy
+        return n + 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def put_photon(
+    stack: Array, n: int, x: float, y: float, z: float, direction: Direction, energy: float
+) -> int:
+    """Put a photon on the stack of those still to be followed; the new height."""
+    row = stack[n]
+    row[0], row[1], row[2] = x, y, z
+    row[3], row[4], row[5] = direction.x, direction.y, direction.z
+    row[6] = energy
+    return n + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float) -> bool:
+    """Whether everything within `reach` (mm) surely is germanium (bore and ditch aside)."""
+    r = math.sqrt(x * x + y * y)
+    narrowing = max(z + reach - shape.outer_taper_start, 0.0) * shape.taper_slope
+    if z - reach < shape.ditch_depth or z + reach > shape.length:
+        return False
+    if r + reach > shape.radius - narrowing:
+        return False
+    widest = shape.bore_radius + (shape.length - shape.inner_taper_start) * shape.taper_slope
+    return z + reach < shape.bore_end or r - reach > widest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def row_of(table: ElectronTable, kinetic: float) -> int:
+    """The step an energy (MeV) lies in, at its upper end or below."""
+    if kinetic <= ELECTRON_CUT:
+        return 0
+    row = int((math.log(kinetic) - table.log_top) / table.log_ratio)
+    return min(max(row, 0), len(table.energy) - 2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def slow_down(
+    shape: CrystalShape,
+    table: ElectronTable,
+    position: tuple[float, float, float],
+    direction: Direction,
+    kinetic: float,
+    positron: bool,
+    hits: Array,
+    n_hits: int,
+    stack: Array,
+    n_stack: int,
+    rng: np.random.Generator,
+) -> tuple[int, int]:
+    """Follow an electron until it stops or leaves; new numbers of hits and of photons.
+
+    Each step goes straight to a random hinge, deposits its energy there, turns and goes
+    straight to its end (Baró et al., NIM B 100 (1995) 31), so that the mean and the
+    spread of the displacement are right although the step is long.
+    """
+    x, y, z = position
+    row = row_of(table, kinetic)
+    # looked at once per track: most start deep inside, few get there later
+    safe = kinetic > ELECTRON_CUT and deep_inside(shape, x, y, z, table.range[row])
+    part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
+    while kinetic > ELECTRON_CUT:
+        lower = table.energy[row + 1]
+        length = part * table.step[row]
+        hinge = length * rng.random()
+        x += hinge * direction.x
+        y += hinge * direction.y
+        z += hinge * direction.z
+        if not safe and not in_germanium(shape, x, y, z):
+            return n_hits, n_stack
+        n_hits = record(hits, n_hits, x, y, z, kinetic - lower)
+        kinetic = lower
+        scale = table.scattering[row] * part
+        cosine = 1.0 + scale * math.log(1.0 - rng.random() * table.scattering_cut[row])
+        direction = turned(direction, cosine, 2.0 * math.pi * rng.random())
+        rest = length - hinge
+        x += rest * direction.x
+        y += rest * direction.y
+        z += rest * direction.z
+        if not safe and not in_germanium(shape, x, y, z):
+            return n_hits, n_stack
+        chance = rng.random()
+        if chance < part * table.brems[row]:
+            shares = table.photon_share[row]
+            at = rng.random() * (len(shares) - 1)
+            node = int(at)
+            share = shares[node] + (at - node) * (shares[node + 1] - shares[node])
+            photon = min(share, 1.0) * kinetic
+            away = forward(direction, kinetic, rng)
+            n_stack = put_photon(stack, n_stack, x, y, z, away, photon)
+            kinetic -= photon
+            row = row_of(table, kinetic)
+            above = table.energy[row + 1]
+            part = (kinetic - above) / (table.energy[row] - above)
+            continue
+        if positron and 1.0 - chance < part * table.annihilation[row]:
+            energy, cosine = annihilation_energy(kinetic, rng)
+            momentum = math.sqrt(kinetic * (kinetic + 2.0 * ELECTRON_MASS))
+            first = turned(direction, cosine, 2.0 * math.pi * rng.random())
+            second = remainder(momentum, direction, energy, first)
+            n_stack = put_photon(stack, n_stack, x, y, z, first, energy)
+            other = kinetic + 2.0 * ELECTRON_MASS - energy
+            return n_hits, put_photon(stack, n_stack, x, y, z, second, other)
+        row, part = row + 1, 1.0
+    n_hits = record(hits, n_hits, x, y, z, kinetic)
+    if positron:
+        first = isotropic(rng)
+        second = Direction(-first.x, -first.y, -first.z)
+        n_stack = put_photon(stack, n_stack, x, y, z, first, ELECTRON_MASS)
+        n_stack = put_photon(stack, n_stack, x, y, z, second, ELECTRON_MASS)
+    return n_hits, n_stack

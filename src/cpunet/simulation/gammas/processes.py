@@ -1,0 +1,116 @@
+"""Samplers of single interactions; energies in MeV, directions as unit vectors.
+
+Compton: Klein and Nishina, sampled as in Nelson et al., SLAC-265 (1985), § 2.9.
+Annihilation in flight: Heitler's two-photon cross section.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from cpunet.simulation.gammas.germanium import ELECTRON_MASS
+
+
+class Direction(NamedTuple):
+    """A unit vector."""
+
+    x: float
+    y: float
+    z: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def isotropic(rng: np.random.Generator) -> Direction:
+    """A direction, all equally probable."""
+    cosine = 2.0 * rng.random() - 1.0
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    azimuth = 2.0 * math.pi * rng.random()
+    return Direction(sine * math.cos(azimuth), sine * math.sin(azimuth), cosine)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
+    """The direction at a polar angle and an azimuth (rad) around an axis."""
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
+    across = math.sqrt(axis.x * axis.x + axis.y * axis.y)
+    if across < 1e-9:
+        return Direction(a, b, cosine if axis.z > 0 else -cosine)
+    return Direction(
+        (a * axis.x * axis.z - b * axis.y) / across + axis.x * cosine,
+        (a * axis.y * axis.z + b * axis.x) / across + axis.y * cosine,
+        -a * across + axis.z * cosine,
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direction:
+    """A direction isotropic in the rest frame of an electron of this energy along the axis.
+
+    The usual stand-in for the angles of photoelectrons, pairs and bremsstrahlung,
+    which multiple scattering forgets within a fraction of the range.
+    """
+    gamma = 1.0 + kinetic / ELECTRON_MASS
+    beta = math.sqrt(max(1.0 - 1.0 / (gamma * gamma), 0.0))
+    at_rest = 2.0 * rng.random() - 1.0
+    cosine = (at_rest + beta) / (at_rest * beta + 1.0)
+    return turned(axis, cosine, 2.0 * math.pi * rng.random())
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def remainder(total: float, axis: Direction, part: float, direction: Direction) -> Direction:
+    """Direction of what is left of a momentum along `axis` without a part of it."""
+    x = total * axis.x - part * direction.x
+    y = total * axis.y - part * direction.y
+    z = total * axis.z - part * direction.z
+    size = math.sqrt(x * x + y * y + z * z)
+    if size == 0.0:
+        return axis
+    return Direction(x / size, y / size, z / size)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def compton_energy(energy: float, rng: np.random.Generator) -> float:
+    """Energy of a photon after Compton scattering on a free electron at rest."""
+    k = energy / ELECTRON_MASS
+    least = 1.0 / (1.0 + 2.0 * k)
+    inverse_part = -math.log(least)
+    linear_part = 0.5 * (1.0 - least * least)
+    while True:
+        if rng.random() * (inverse_part + linear_part) < inverse_part:
+            share = math.exp(math.log(least) * rng.random())
+        else:
+            share = math.sqrt(least * least + (1.0 - least * least) * rng.random())
+        t = (1.0 - share) / (k * share)
+        sine2 = t * (2.0 - t)
+        if rng.random() < 1.0 - share * sine2 / (1.0 + share * share):
+            return energy * share
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def pair_share(rng: np.random.Generator) -> float:
+    """Electron's share of a pair's kinetic energy: p+ p-, the phase space near threshold."""
+    while True:
+        share = rng.random()
+        if rng.random() < 2.0 * math.sqrt(share * (1.0 - share)):
+            return share
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Energy of one of the two photons and the cosine of its angle to the positron."""
+    gamma = 1.0 + kinetic / ELECTRON_MASS
+    half_width = 0.5 * math.sqrt((gamma - 1.0) / (gamma + 1.0))
+    least, most = 0.5 - half_width, 0.5 + half_width
+    while True:
+        share = least * (most / least) ** rng.random()
+        weight = 1.0 - share + (2.0 * gamma * share - 1.0) / (share * (gamma + 1.0) ** 2)
+        if rng.random() < weight:
+            break
+    cosine = (share * (gamma + 1.0) - 1.0) / (share * math.sqrt(gamma * gamma - 1.0))
+    energy = share * (kinetic + 2.0 * ELECTRON_MASS)
+    return energy, min(max(cosine, -1.0), 1.0)

@@ -1,0 +1,179 @@
+"""Hits of the 2614.5 keV gamma line of Tl-208 in a germanium detector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.gammas.germanium import electron_table, photon_table
+from cpunet.simulation.gammas.shape import CrystalDimensions, CrystalShape
+from cpunet.simulation.gammas.transport import MOST_HITS, Source, simulate_block
+from cpunet.simulation.hits import Hits
+
+TL208_KEV = 2614.511
+"""Energy of the gamma line of Tl-208."""
+
+_BLOCK_HITS = 1_000_000
+_BLOCK_EVENTS = 20_000
+
+
+class WantedLine(NamedTuple):
+    """How many events are wanted with an energy (keV) from `low_kev` to `high_kev`."""
+
+    low_kev: float
+    high_kev: float
+    events: int
+
+
+@dataclass(frozen=True, eq=False)
+class GammaStatistics:
+    """What became of all primaries, kept or not.
+
+    ``spectrum`` counts the events with a deposit in bins of 1 keV from 0.
+    """
+
+    n_primaries: int
+    spectrum: npt.NDArray[np.int64]
+
+    @property
+    def hit_fraction(self) -> float:
+        """Share of the primaries that left energy in the crystal."""
+        return float(self.spectrum.sum() / self.n_primaries)
+
+    def fraction(self, low_kev: int, high_kev: int) -> float:
+        """Share of the primaries with an energy of `low_kev` up to `high_kev` (whole keV)."""
+        return float(self.spectrum[low_kev:high_kev].sum() / self.n_primaries)
+
+
+def simulate_gammas(
+    detector: CrystalDimensions,
+    *,
+    source_height_mm: float,
+    source_radius_mm: float,
+    n_primaries: int,
+    seed: int,
+    wanted: Mapping[str, WantedLine] | None = None,
+    energy_kev: float = TL208_KEV,
+) -> tuple[Hits, GammaStatistics]:
+    """Simulate gammas from a disc above the crystal, in vacuum.
+
+    They are emitted isotropically into the cone around the axis that is as wide as
+    crystal and disc together, ``cos > h / hypot(h, R + r)``: the share of the full
+    solid angle that is simulated is ``(1 - cos) / 2``.  Photons undergo Compton
+    scattering (Klein-Nishina with the cross section of bound electrons), photoelectric
+    absorption and pair production; electrons and positrons slow down continuously,
+    scatter, and radiate; positrons annihilate at rest or in flight.
+
+    Parameters
+    ----------
+    detector
+        Dimensions of the crystal in mm.
+    source_height_mm, source_radius_mm
+        Height of the disc above the crystal's top (z = crystal length), and its radius.
+    n_primaries
+        Gammas in the cone; with `wanted`, the most that are tried.
+    seed
+        The same seed gives the same events.
+    wanted
+        Windows by name.  Only events in a window are kept, until each has its count.
+    energy_kev
+        Energy of the gammas, from 50 to 2700 keV.
+
+    Returns
+    -------
+    Hits
+        The events with a deposit; ``event_number`` is the number of the primary.
+    GammaStatistics
+        Counts over all primaries, also of the events not kept.
+
+    Raises
+    ------
+    CpunetError
+        If the source is not above the crystal, a window is empty or beyond the line, or
+        `n_primaries` do not give the wanted events.
+    """
+    _check(source_height_mm, source_radius_mm, n_primaries, energy_kev, wanted)
+    shape = CrystalShape.of(detector)
+    reach = shape.radius + source_radius_mm
+    cosine = source_height_mm / math.hypot(source_height_mm, reach)
+    source = Source(energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine)
+    lines = list((wanted or {}).values())
+    # deposits add up to the line only within rounding
+    low = np.array([line.low_kev / 1e3 - 1e-9 for line in lines])
+    high = np.array([line.high_kev / 1e3 + 1e-9 for line in lines])
+    missing = np.array([line.events for line in lines], np.int64)
+    spectrum = np.zeros(math.ceil(energy_kev) + 1, np.int64)
+    rng = np.random.default_rng(seed)
+    hits = np.empty((min(_BLOCK_HITS, MOST_HITS + 300 * n_primaries), 4))
+    offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
+    primaries = np.empty(_BLOCK_EVENTS, np.int64)
+    blocks: list[Hits] = [Hits.of([], [], [0])]
+    done = 0
+    while done < n_primaries and not (lines and missing.sum() == 0):
+        tried, kept = simulate_block(
+            shape, source, photon_table(), electron_table(), n_primaries - done,
+            low, high, missing, spectrum, rng, hits, offsets, primaries,
+        )  # fmt: skip
+        ends = offsets[: kept + 1].copy()
+        deposits = hits[: ends[-1]]
+        blocks.append(
+            Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:kept] + done)
+        )
+        done += tried
+    if missing.any():
+        names = list(wanted or {})
+        short = ", ".join(f"{n} of {name}" for name, n in zip(names, missing, strict=True) if n)
+        raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
+    return Hits.concatenate(blocks), GammaStatistics(done, spectrum)
+
+
+def _check(
+    height: float,
+    radius: float,
+    n_primaries: int,
+    energy_kev: float,
+    wanted: Mapping[str, WantedLine] | None,
+) -> None:
+    if not (height > 0 and radius >= 0 and math.isfinite(height + radius)):
+        raise CpunetError(
+            f"a source of radius {radius} mm at {height} mm is not above the crystal; "
+            "give a height above 0 and a radius of at least 0"
+        )
+    if n_primaries < 1:
+        raise CpunetError(f"{n_primaries} gammas asked for; give at least 1")
+    if not 50 <= energy_kev <= 2700:
+        raise CpunetError(f"gammas of {energy_kev} keV; the tables hold 50 to 2700 keV")
+    for name, line in (wanted or {}).items():
+        if not (0 <= line.low_kev < line.high_kev and line.low_kev <= energy_kev):
+            raise CpunetError(
+                f"{name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
+                f"the {energy_kev} keV line"
+            )
+        if line.events < 0:
+            raise CpunetError(f"{name}: {line.events} events wanted; give at least 0")
+
+
+def with_resolution(
+    energy_kev: npt.ArrayLike, *, noise_kev2: float, fano_kev: float, seed: int
+) -> npt.NDArray[np.float64]:
+    """Energies as a detector reports them: Gaussian, FWHM² = noise_kev2 + fano_kev E (keV).
+
+    The hits stay as they are.
+
+    Raises
+    ------
+    CpunetError
+        If a coefficient is negative.
+    """
+    if noise_kev2 < 0 or fano_kev < 0:
+        raise CpunetError(f"FWHM² = {noise_kev2} + {fano_kev} E; give numbers from 0 up")
+    energy = np.asarray(energy_kev, float)
+    fwhm = np.sqrt(noise_kev2 + fano_kev * energy)
+    sigma = fwhm / math.sqrt(8 * math.log(2))
+    return np.random.default_rng(seed).normal(energy, sigma)

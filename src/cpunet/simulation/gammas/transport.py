@@ -1,0 +1,191 @@
+"""Compiled event loop: photons from the source followed until absorbed or gone."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.simulation.gammas.electrons import put_photon, record, slow_down
+from cpunet.simulation.gammas.germanium import (
+    ELECTRON_MASS,
+    K_BINDING,
+    PHOTON_CUT,
+    ElectronTable,
+    PhotonTable,
+)
+from cpunet.simulation.gammas.processes import (
+    Direction,
+    compton_energy,
+    forward,
+    pair_share,
+    remainder,
+    turned,
+)
+from cpunet.simulation.gammas.shape import CrystalShape, in_germanium, way_to_cylinder
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+STACK_HEIGHT = 256
+MOST_HITS = 2000
+"""Room for the hits of one event; Tl-208 makes some 200."""
+
+
+class Source(NamedTuple):
+    """A disc above the crystal, emitting into the cone around the crystal's top."""
+
+    energy: float
+    height: float
+    radius: float
+    least_cosine: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def follow_photons(
+    shape: CrystalShape,
+    photons: PhotonTable,
+    electrons: ElectronTable,
+    hits: Array,
+    stack: Array,
+    n_stack: int,
+    rng: np.random.Generator,
+) -> int:
+    """Empty the stack of photons; the number of hits they made.
+
+    The path to the next interaction is drawn as if germanium were everywhere; where it
+    ends in vacuum nothing happens and the photon goes on (Woodcock's method), so that
+    any outline will do.  What leaves the cylinder around the crystal does not return.
+    """
+    n_hits = 0
+    while n_stack > 0:
+        n_stack -= 1
+        x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
+        direction = Direction(stack[n_stack, 3], stack[n_stack, 4], stack[n_stack, 5])
+        energy = stack[n_stack, 6]
+        while True:
+            if energy < PHOTON_CUT:
+                if in_germanium(shape, x, y, z):
+                    n_hits = record(hits, n_hits, x, y, z, energy)
+                break
+            at = (math.log(energy) - photons.log_first) * photons.per_log
+            node = int(at)
+            more = at - node
+            left = photons.attenuation_per_mm[node]
+            attenuation = left + more * (photons.attenuation_per_mm[node + 1] - left)
+            path = -math.log(1.0 - rng.random()) / attenuation
+            x += path * direction.x
+            y += path * direction.y
+            z += path * direction.z
+            if z < 0.0 or z > shape.length or x * x + y * y > shape.radius**2:
+                break
+            if not in_germanium(shape, x, y, z):
+                continue
+            chance = rng.random()
+            if chance < photons.photoelectric[node]:
+                bound = K_BINDING if energy > K_BINDING else energy
+                n_hits = record(hits, n_hits, x, y, z, bound)
+                kinetic = energy - bound
+                away = forward(direction, kinetic, rng)
+                n_hits, n_stack = slow_down(
+                    shape, electrons, (x, y, z), away, kinetic, False,
+                    hits, n_hits, stack, n_stack, rng,
+                )  # fmt: skip
+                break
+            if chance < photons.not_pair[node]:
+                left_over = compton_energy(energy, rng)
+                cosine = 1.0 - ELECTRON_MASS * (1.0 / left_over - 1.0 / energy)
+                scattered = turned(direction, cosine, 2.0 * math.pi * rng.random())
+                recoil = remainder(energy, direction, left_over, scattered)
+                n_hits, n_stack = slow_down(
+                    shape, electrons, (x, y, z), recoil, energy - left_over, False,
+                    hits, n_hits, stack, n_stack, rng,
+                )  # fmt: skip
+                energy, direction = left_over, scattered
+                continue
+            kinetic = energy - 2.0 * ELECTRON_MASS
+            mine = pair_share(rng) * kinetic
+            for positron in (False, True):
+                part = kinetic - mine if positron else mine
+                n_hits, n_stack = slow_down(
+                    shape, electrons, (x, y, z), forward(direction, part, rng), part, positron,
+                    hits, n_hits, stack, n_stack, rng,
+                )  # fmt: skip
+            break
+    return n_hits
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Generator) -> int:
+    """Put a photon of the source where it meets the crystal's cylinder; 0: it misses."""
+    r = source.radius * math.sqrt(rng.random())
+    around = 2.0 * math.pi * rng.random()
+    x, y, z = r * math.cos(around), r * math.sin(around), shape.length + source.height
+    cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
+    down = turned(Direction(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
+    way = way_to_cylinder(shape.radius, shape.length, x, y, z, down.x, down.y, down.z)
+    if way < 0.0:
+        return 0
+    # rounding must not leave it a hair outside, where it would count as gone
+    way += 1e-9
+    return put_photon(
+        stack, 0, x + way * down.x, y + way * down.y, z + way * down.z, down, source.energy
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def simulate_block(
+    shape: CrystalShape,
+    source: Source,
+    photons: PhotonTable,
+    electrons: ElectronTable,
+    n_primaries: int,
+    low: Array,
+    high: Array,
+    wanted: Integers,
+    spectrum: Integers,
+    rng: np.random.Generator,
+    hits: Array,
+    offsets: Integers,
+    primaries: Integers,
+) -> tuple[int, int]:
+    """Simulate until the primaries, the room for hits or what is wanted run out.
+
+    Energies in MeV.  An event is kept if a window (low to high) that still wants events
+    holds it, or always if there are no windows.  `wanted` is counted down; `spectrum`
+    (1 keV bins) counts every event with a deposit.  Returns the numbers of primaries
+    done and of events kept.
+    """
+    stack = np.empty((STACK_HEIGHT, 7))
+    n_kept = 0
+    offsets[0] = 0
+    for primary in range(n_primaries):
+        start = offsets[n_kept]
+        full = len(hits) - start < MOST_HITS or n_kept == len(primaries)
+        if full or (len(wanted) > 0 and wanted.sum() == 0):
+            return primary, n_kept
+        n_stack = emit(shape, source, stack, rng)
+        if n_stack == 0:
+            continue
+        mine = hits[start : start + MOST_HITS]
+        n_hits = follow_photons(shape, photons, electrons, mine, stack, n_stack, rng)
+        energy = 0.0
+        for i in range(n_hits):
+            energy += mine[i, 3]
+        if energy == 0.0:
+            continue
+        spectrum[min(int(energy * 1e3), len(spectrum) - 1)] += 1
+        keep = len(wanted) == 0
+        for line in range(len(wanted)):
+            if wanted[line] > 0 and low[line] <= energy <= high[line]:
+                wanted[line] -= 1
+                keep = True
+                break
+        if keep:
+            primaries[n_kept] = primary
+            n_kept += 1
+            offsets[n_kept] = start + n_hits
+    return n_primaries, n_kept

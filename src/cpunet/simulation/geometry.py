@@ -1,0 +1,255 @@
+"""The detector: crystal, contacts, impurities and bias, all validated.
+
+Cylindrical coordinates with the axis at r = 0; z = 0 is the face with the point
+contact (p+), and a bore, if any, opens at z = ``crystal_length``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from cpunet.recipes.schema import Config, NonNegative, Positive
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+RegionArray = npt.NDArray[np.int8]
+Angle = Annotated[float, Field(ge=0, lt=90)]
+
+POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
+
+# mm: surfaces that a grid line is meant to meet are met in spite of rounding
+_TOLERANCE = 1e-6
+
+
+class Detector(Config):
+    """A p-type detector with a point contact (ICPC, BEGe or PPC); lengths in mm.
+
+    What is 0 by default is absent.  Without a ``wrap_around_radius`` the lithium
+    contact ends where the outer wall meets z = 0.  ``taper_angle_deg`` holds for the
+    outer and, unless ``inner_taper_angle_deg`` is given, for the bore's taper.
+    ``vacuum_gap`` is the distance of a grounded plane below z = 0.
+
+    The net impurity is, in 1e10/cm3 with z and r in cm,
+    ``z0 + gradient z + quadratic (1 - (2 z / L - 1)^2)``, times
+    ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``;
+    it is negative for p-type germanium.
+
+    ``siggen_conventions`` places the lithium boundary on tapers, and charge in the
+    ditch, as fieldgen does, so that its maps can be compared with.
+    """
+
+    name: str = ""
+    crystal_length: Positive
+    crystal_radius: Positive
+    top_bullet_radius: NonNegative = 0.0
+    bottom_bullet_radius: NonNegative = 0.0
+    point_contact_length: NonNegative
+    point_contact_radius: Positive
+    wrap_around_radius: NonNegative = 0.0
+    ditch_depth: NonNegative = 0.0
+    ditch_thickness: NonNegative = 0.0
+    bore_length: NonNegative = 0.0
+    bore_radius: NonNegative = 0.0
+    bore_bullet_radius: NonNegative = 0.0
+    outer_taper_length: NonNegative = 0.0
+    inner_taper_length: NonNegative = 0.0
+    bottom_taper_length: NonNegative = 0.0
+    taper_angle_deg: Angle = 0.0
+    inner_taper_angle_deg: Angle | None = None
+    bottom_taper_angle_deg: Angle = 45.0
+    li_thickness: NonNegative
+    vacuum_gap: NonNegative = 0.0
+    impurity_z0_1e10_per_cm3: float
+    impurity_gradient_1e10_per_cm4: float = 0.0
+    impurity_quadratic_1e10_per_cm3: float = 0.0
+    impurity_radial_add_1e10_per_cm3: float = 0.0
+    impurity_radial_mult: NonNegative = 1.0
+    impurity_radial_power: Positive = 2.0
+    surface_charge_1e10_per_cm2: float = 0.0
+    bias_V: Positive
+    temperature_K: Annotated[float, Field(ge=40, le=120)]
+    grid_mm: Annotated[float, Field(ge=0.02, le=1)] = 0.1
+    siggen_conventions: bool = False
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Detector:
+        for problem in self._problems():
+            raise ValueError(problem)
+        return self
+
+    def _problems(self) -> Iterable[str]:
+        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
+        top_radius = radius - self.outer_taper_length * math.tan(self._angles[0])
+        bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(self._angles[1])
+        bottom_radius = radius - self.bottom_taper_length * math.tan(self._angles[2])
+        ditch_inner = self.wrap_around_radius - self.ditch_thickness
+        if 2 * li >= min(length, radius):
+            yield "li_thickness leaves nothing of the crystal"
+        if self.outer_taper_length + self.bottom_taper_length > length:
+            yield "outer_taper_length and bottom_taper_length exceed crystal_length"
+        if bottom_radius <= max(self.wrap_around_radius, self.point_contact_radius):
+            yield "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0"
+        if (self.bore_length > 0) != (self.bore_radius > 0):
+            yield "bore_length and bore_radius must both be given, or both be 0"
+        if self.bore_length + 2 * li + self.point_contact_length >= length:
+            yield "bore_length (with li_thickness) reaches the point contact"
+        if self.inner_taper_length > self.bore_length:
+            yield "inner_taper_length exceeds bore_length"
+        if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
+            yield "bore_bullet_radius exceeds bore_radius or bore_length"
+        if top_radius - bore_mouth <= 2 * li:
+            yield "outer_taper_length or inner_taper_length leaves no germanium at the top"
+        if self.top_bullet_radius and self.outer_taper_length:
+            yield "top_bullet_radius and outer_taper_length cannot both be given"
+        if self.bottom_bullet_radius and self.bottom_taper_length:
+            yield "bottom_bullet_radius and bottom_taper_length cannot both be given"
+        if self.top_bullet_radius + self.bottom_bullet_radius > min(length, radius):
+            yield "top_bullet_radius and bottom_bullet_radius exceed the crystal"
+        if (self.ditch_depth > 0) != (self.ditch_thickness > 0):
+            yield "ditch_depth and ditch_thickness must both be given, or both be 0"
+        if self.wrap_around_radius and ditch_inner < self.point_contact_radius:
+            yield "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)"
+        if self.ditch_depth and not self.wrap_around_radius:
+            yield "ditch_depth needs a wrap_around_radius, the ditch's outer radius"
+        if self.wrap_around_radius >= radius - max(li, self.bottom_bullet_radius):
+            yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
+        if self.ditch_depth + self.bore_length + li >= length:
+            yield "ditch_depth reaches the bore (bore_length) or the top"
+        if self.grid_mm > self.point_contact_radius / 2:
+            yield "grid_mm does not resolve point_contact_radius; at most half of it"
+        z = np.linspace(0, length, 101)
+        if self.impurity_1e10_per_cm3(np.array([[0.0], [radius]]), z).max() > 0:
+            yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
+
+    @property
+    def _angles(self) -> tuple[float, float, float]:
+        """Angles of the outer, bore and bottom tapers in rad."""
+        inner = self.inner_taper_angle_deg
+        inner = self.taper_angle_deg if inner is None else inner
+        degrees = (self.taper_angle_deg, inner, self.bottom_taper_angle_deg)
+        outer_rad, inner_rad, bottom_rad = (math.radians(d) for d in degrees)
+        return outer_rad, inner_rad, bottom_rad
+
+    @property
+    def ditch_walls(self) -> tuple[float, float, float]:
+        """Inner and outer radius and depth of the ditch in mm."""
+        # fieldgen's ditch owns the nodes on its walls, half a step more on each side
+        extra = self.grid_mm / 2 if self.siggen_conventions and self.ditch_depth else 0.0
+        outer = self.wrap_around_radius
+        return outer - self.ditch_thickness - extra, outer + extra, self.ditch_depth + extra
+
+    def impurity_1e10_per_cm3(self, r: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
+        """Net impurity at `r`, `z` in mm, in 1e10/cm3; negative for p-type."""
+        r, z = np.asarray(r, float), np.asarray(z, float)
+        axial = (
+            self.impurity_z0_1e10_per_cm3
+            + self.impurity_gradient_1e10_per_cm4 * z / 10
+            + self.impurity_quadratic_1e10_per_cm3
+            * (1 - (2 * z / self.crystal_length - 1) ** 2)
+        )
+        radial = (r / self.crystal_radius) ** self.impurity_radial_power
+        scaled = axial * (1 + (self.impurity_radial_mult - 1) * radial)
+        return np.asarray(scaled + self.impurity_radial_add_1e10_per_cm3 * radial)
+
+    def inside(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
+        """Where `r`, `z` (mm) lie in the germanium, lithium layer and surfaces included.
+
+        Examples
+        --------
+        >>> from cpunet.simulation.geometry_readers import read_detector
+        >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
+        array([ True, False, False,  True])
+        """
+        r, z = np.asarray(r, float), np.asarray(z, float)
+        germanium = self._within(r, z, -_TOLERANCE) & ~self._ditch(r, z, -_TOLERANCE)
+        return np.asarray(germanium)
+
+    def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
+        """Where `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
+
+        Examples
+        --------
+        >>> from cpunet.simulation.geometry_readers import read_detector
+        >>> read_detector("icpc").active([0, 0, 12, 40], [10, 1, 1, 50])
+        array([ True, False, False, False])
+        """
+        return np.asarray(self.region(r, z) == GERMANIUM)
+
+    def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
+        """At `r`, `z` (mm): 0 point contact, 1 lithium or outside, 2 germanium, 5 ditch
+
+        Surfaces belong to the contacts and to the ditch.
+        """
+        r, z = np.asarray(r, float), np.asarray(z, float)
+        contact = (r <= self.point_contact_radius + _TOLERANCE) & (
+            z <= self.point_contact_length + _TOLERANCE
+        )
+        lithium = ~self._within(r, z, self.li_thickness + _TOLERANCE)
+        choices = np.where(self._ditch(r, z, _TOLERANCE), DITCH, GERMANIUM)
+        choices = np.where(lithium, LI_CONTACT, choices)
+        return np.where(contact, POINT_CONTACT, choices).astype(np.int8)
+
+    def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
+        """A hash of all values but those of `exclude`: equal detectors, equal hash."""
+        values = self.model_dump(mode="json", exclude=set(exclude))
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
+
+    def _ditch(self, r: FloatArray, z: FloatArray, margin: float) -> BoolArray:
+        """Where the ditch is, its walls moved outwards by `margin`."""
+        inner, outer, depth = self.ditch_walls
+        radial = (r >= inner - margin) & (r <= outer + margin)
+        return (self.ditch_depth > 0) & radial & (z <= depth + margin)
+
+    def _within(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
+        """Where the crystal is (ditch included), its lithium faces moved in by `shift`."""
+        bottom = np.where(r > (self.wrap_around_radius or np.inf), shift, -_TOLERANCE)
+        within = (z > bottom) & (z < self.crystal_length - shift)
+        within &= (r < self._outer_radius(z, shift)) & ~self._bore(r, z, shift)
+        for bullet, side in ((self.top_bullet_radius, 1), (self.bottom_bullet_radius, -1)):
+            if bullet > shift:
+                end = self.crystal_length if side > 0 else 0.0
+                across, along = r - (self.crystal_radius - bullet), side * (z - end) + bullet
+                corner = (across > 0) & (along > 0)
+                within &= ~corner | (np.hypot(across, along) < bullet - shift)
+        return np.asarray(within)
+
+    def _outer_radius(self, z: FloatArray, shift: float) -> FloatArray:
+        top, _, bottom = self._angles
+        into_top = z - (self.crystal_length - self.outer_taper_length)
+        into_bottom = self.bottom_taper_length - z
+        straight = np.full_like(z, self.crystal_radius - shift)
+        if self.outer_taper_length:
+            straight -= self._taper(into_top, top, shift)
+        if self.bottom_taper_length:
+            straight -= self._taper(into_bottom, bottom, shift)
+        return straight
+
+    def _taper(self, depth: FloatArray, angle: float, shift: float) -> FloatArray:
+        """Radius that a taper takes off a wall already moved by `shift`, at `depth` into it."""
+        if self.siggen_conventions:  # the taper's start is moved down with the top
+            extra = shift * math.tan(angle)
+        else:  # the taper itself is moved along its normal
+            extra = shift * (1 / math.cos(angle) - 1)
+        return np.maximum(depth * math.tan(angle) + extra, 0)
+
+    def _bore(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
+        """Where the bore is, its walls moved outwards by `shift`."""
+        if not self.bore_length:
+            return np.zeros(np.broadcast(r, z).shape, bool)
+        end, bullet = self.crystal_length - self.bore_length, self.bore_bullet_radius
+        radius = np.full_like(z, self.bore_radius + shift)
+        if self.inner_taper_length:
+            into_taper = z - (self.crystal_length - self.inner_taper_length)
+            radius += self._taper(into_taper, self._angles[1], shift)
+        across, along = r - (self.bore_radius - bullet), end + bullet - z
+        corner = (across > 0) & (along > 0)
+        rounded = np.hypot(across, along) <= bullet + shift
+        return np.asarray((z >= end - shift) & (r <= radius) & (~corner | rounded))

@@ -1,0 +1,138 @@
+"""The grid on which potentials are solved: its nodes, and how far contacts are from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry import (
+    DITCH,
+    GERMANIUM,
+    LI_CONTACT,
+    POINT_CONTACT,
+    Detector,
+    FloatArray,
+    RegionArray,
+)
+
+# a direct solver's memory: about 1.5 GB at this many nodes
+MAX_NODES = 1_500_000
+PASSIVATED, DITCH_EDGE, CONTACT_EDGE = 3, 6, 7
+
+# of a step: a contact nearer than this is as good as touched
+_NEAREST = 1e-4
+_BISECTIONS = 14
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Nodes of a detector in r and z, and the length of each step between them.
+
+    ``region`` (nr, nz) is `Detector.region` at the nodes.  ``r_steps`` (nr-1, nz) and
+    ``z_steps`` (nr, nz-1) are 1 between two nodes of the same medium, and the fraction
+    of a step to the surface between a node and a contact.
+    """
+
+    r_mm: FloatArray
+    z_mm: FloatArray
+    step_mm: float
+    region: RegionArray
+    r_steps: FloatArray
+    z_steps: FloatArray
+
+    @property
+    def free(self) -> npt.NDArray[np.bool_]:
+        """Nodes (nr, nz) whose potential is to be found: germanium and ditch."""
+        return np.asarray(self.region > LI_CONTACT)
+
+
+def make_grid(detector: Detector) -> Grid:
+    """Lay the nodes over the crystal, up to the first ones on or beyond its surfaces.
+
+    Raises
+    ------
+    CpunetError
+        If ``grid_mm`` would make too many nodes for the memory of a laptop.
+    """
+    h = detector.grid_mm
+    nr, nz = (
+        int(np.ceil(size / h - 1e-6)) + 1
+        for size in (detector.crystal_radius, detector.crystal_length)
+    )
+    if nr * nz > MAX_NODES:
+        raise CpunetError(
+            f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes; "
+            f"give a coarser one (at most {MAX_NODES} nodes)"
+        )
+    # rounded, so that 23 steps of 0.1 mm are 2.3 mm
+    r, z = (np.round(np.arange(n) * h, 9) for n in (nr, nz))
+    rr, zz = np.meshgrid(r, z, indexing="ij")
+    region = detector.region(rr, zz)
+    return Grid(
+        r_mm=r,
+        z_mm=z,
+        step_mm=h,
+        region=region,
+        r_steps=_steps(detector, rr, zz, region, axis=0),
+        z_steps=_steps(detector, rr, zz, region, axis=1),
+    )
+
+
+def _steps(
+    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray, axis: int
+) -> FloatArray:
+    """Fractions of the steps along `axis` that lie outside the contacts."""
+    low, high = _ends(region, axis)
+    steps = np.ones(low.shape)
+    crossing = (low <= LI_CONTACT) != (high <= LI_CONTACT)
+    (r0, r1), (z0, z1) = (_ends(x, axis) for x in (rr, zz))
+    r0, r1, z0, z1 = (x[crossing] for x in (r0, r1, z0, z1))
+    swap = low[crossing] <= LI_CONTACT  # start at the node outside the contact
+    r0, r1, z0, z1 = (
+        np.where(swap, r1, r0),
+        np.where(swap, r0, r1),
+        np.where(swap, z1, z0),
+        np.where(swap, z0, z1),
+    )
+    outside, inside = np.zeros(len(r0)), np.ones(len(r0))
+    for _ in range(_BISECTIONS):
+        middle = (outside + inside) / 2
+        hit = detector.region(r0 + middle * (r1 - r0), z0 + middle * (z1 - z0)) <= LI_CONTACT
+        inside = np.where(hit, middle, inside)
+        outside = np.where(hit, outside, middle)
+    # a surface on the node itself counts as a full step: exact where grid and contact meet
+    steps[crossing] = np.clip(np.where(inside > 1 - 2 * _NEAREST, 1, inside), _NEAREST, 1)
+    return steps
+
+
+def _ends(values: npt.NDArray[Any], axis: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+
+
+def point_types(grid: Grid) -> RegionArray:
+    """Kind of each node (nr, nz), in the numbers that fieldgen uses.
+
+    0 point contact, 1 lithium contact or outside, 2 germanium, 3 passivated face
+    (z = 0), 5 ditch, 6 germanium beside the ditch, 7 germanium beside a contact.
+    """
+    types = grid.region.copy()
+    germanium = grid.region == GERMANIUM
+    types[germanium & _beside(grid.region == DITCH)] = DITCH_EDGE
+    contact = (grid.region == POINT_CONTACT) | (grid.region == LI_CONTACT)
+    types[germanium & _beside(contact)] = CONTACT_EDGE
+    types[germanium[:, 0], 0] = PASSIVATED
+    return types
+
+
+def _beside(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Nodes with one of their four neighbours in `where`."""
+    beside = np.zeros_like(where)
+    beside[:-1] |= where[1:]
+    beside[1:] |= where[:-1]
+    beside[:, :-1] |= where[:, 1:]
+    beside[:, 1:] |= where[:, :-1]
+    return beside

@@ -1,0 +1,56 @@
+"""Step-wise HDF5 ntuples of g4simple: Geant4's own units, MeV and mm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.hit_readers.steps import Steps
+
+NTUPLE = "default_ntuples/g4sntuple"
+
+
+def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps:
+    """Steps in one volume, by its number ``volID``, or in all of the only one."""
+    edep = _column(path, ntuple, "Edep") * 1e3
+    rows = len(edep)
+    x, y, z, event = (_column(path, ntuple, name) for name in ("x", "y", "z", "event"))
+    if any(len(column) != rows for column in (x, y, z, event)):
+        raise CpunetError(f"{path}: columns of {NTUPLE} differ in length; is it truncated?")
+    steps = Steps(event.astype(np.int64), np.stack([x, y, z], axis=1), edep)
+    if "volID" not in ntuple:
+        if detector is not None:
+            raise CpunetError(f"{path}: no column volID to pick detector {detector} by")
+        return steps
+    return of_detector(path, steps, _column(path, ntuple, "volID"), detector)
+
+
+def of_detector(
+    path: Path, steps: Steps, number: npt.NDArray[np.float64], detector: str | None
+) -> Steps:
+    """The steps of a detector given by its number; of the only one if none is given."""
+    # where nothing is deposited there is no detector: world, holders of no interest
+    there = sorted({int(n) for n in np.unique(number[steps.edep_kev > 0])})
+    names = ", ".join(map(str, there))
+    if detector is None:
+        if len(there) > 1:
+            raise CpunetError(f"{path}: holds detectors {names}; give detector as one of them")
+        return steps
+    if not detector.lstrip("-").isdigit() or int(detector) not in there:
+        raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
+    mine = number == int(detector)
+    return Steps(steps.event[mine], steps.position_mm[mine], steps.edep_kev[mine])
+
+
+def _column(path: Path, ntuple: h5py.Group, name: str) -> npt.NDArray[np.float64]:
+    pages = ntuple.get(f"{name}/pages")
+    if not isinstance(pages, h5py.Dataset) or pages.ndim != 1 or pages.dtype.kind not in "iuf":
+        raise CpunetError(
+            f"{path}: no step-wise column {name} in {NTUPLE}; write it with g4simple's "
+            "stepwise option"
+        )
+    return np.asarray(pages[()], float)

@@ -1,0 +1,88 @@
+"""One way in for all formats of hits: recognised by what is in the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.hit_readers.csv_ntuple import read_csv
+from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
+from cpunet.simulation.hit_readers.npz import read_npz
+from cpunet.simulation.hit_readers.remage import read_remage
+from cpunet.simulation.hit_readers.steps import ReadHits, Steps, Transform, Units, to_hits
+
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_ZIP_MAGIC = b"PK"
+_AS_IN_THE_FILE = Transform()
+
+
+def read_hits(
+    path: Path | str,
+    *,
+    detector: str | None = None,
+    transform: Transform = _AS_IN_THE_FILE,
+    length_unit: str | None = None,
+    energy_unit: str | None = None,
+) -> ReadHits:
+    """Read the energy deposits of one detector.
+
+    Formats: remage LH5 (``stp`` tables; the origin in ``detector_origins`` is
+    subtracted), g4simple HDF5 and CSV ntuples (MeV and mm, Geant4's own), other Geant4
+    CSV ntuples, and NPZ with ``x_mm``, ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``.
+
+    Parameters
+    ----------
+    path
+        The file.
+    detector
+        Which detector: the table's name in remage files, the volume's number in g4simple
+        files, the detector's number in other CSV.  Not needed if there is only one.
+    transform
+        From the file's frame to the crystal's (z = 0 at the point contact).
+    length_unit, energy_unit
+        For columns that name no unit; refused units and missing ones are an error.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, is of no known format, lacks a column, a unit or the
+        detector, or holds no energy deposit.
+    """
+    file = Path(path)
+    units = Units(length_unit, energy_unit)
+    return to_hits(file, _steps(file, detector, units), transform)
+
+
+def _steps(path: Path, detector: str | None, units: Units) -> Steps:
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(512)
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    if start.startswith(_HDF5_MAGIC):
+        return _hdf5(path, detector, units)
+    if start.startswith(_ZIP_MAGIC):
+        return read_npz(path)
+    if start.startswith(b"#class tools::wcsv::ntuple"):
+        return read_csv(path, detector, units)
+    raise CpunetError(
+        f"{path}: no known format of hits; expected remage LH5, g4simple HDF5, "
+        "Geant4 CSV or NPZ"
+    )
+
+
+def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
+    try:
+        with h5py.File(path, "r") as file:
+            if NTUPLE in file:
+                return read_g4simple(path, file[NTUPLE], detector)
+            is_remage = "stp" in file
+    except OSError as error:
+        raise CpunetError(f"{path}: not a readable HDF5 file; is it truncated?") from error
+    if is_remage:
+        return read_remage(path, detector, units)
+    raise CpunetError(
+        f"{path}: HDF5 without hits; expected a group stp (remage) or {NTUPLE} (g4simple)"
+    )

@@ -1,0 +1,118 @@
+"""Steps of a simulation as read, and how they become hits of the crystal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.hits import Hits
+
+FloatArray = npt.NDArray[np.float64]
+
+_MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
+_KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
+
+
+@dataclass(frozen=True)
+class Transform:
+    """From the coordinates of a file to the crystal's.
+
+    Subtract `origin_mm`, then, with `flip_z`, mirror z (and y, so that the frame stays
+    right-handed): for crystals placed with the point contact on top, `origin_mm` being
+    the centre of the contact's face.
+    """
+
+    origin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    flip_z: bool = False
+
+    def apply(self, position_mm: FloatArray) -> FloatArray:
+        """Positions of shape ``(n, 3)`` in mm in the crystal's frame."""
+        moved = position_mm - np.asarray(self.origin_mm)
+        mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
+        return np.asarray(moved * mirror, np.float64)
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units to use for columns that name none; None if the user gave none."""
+
+    length: str | None = None
+    energy: str | None = None
+
+    def to_mm(self, path: Path, column: str, named: str | None) -> float:
+        """Factor from a column's unit to mm."""
+        return _factor(path, column, named or self.length, _MM, "length_unit")
+
+    def to_kev(self, path: Path, column: str, named: str | None) -> float:
+        """Factor from a column's unit to keV."""
+        return _factor(path, column, named or self.energy, _KEV, "energy_unit")
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps in a file's own frame, the detector's origin subtracted; any order of events."""
+
+    event: npt.NDArray[np.int64]
+    position_mm: FloatArray
+    edep_kev: FloatArray
+
+
+@dataclass(frozen=True)
+class ReadHits:
+    """Hits of a file, and the number of steps left out since they deposit nothing."""
+
+    hits: Hits
+    steps_without_energy: int
+
+
+def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
+    """Group steps by event, in the order of the file, and bring them to the crystal's frame.
+
+    Raises
+    ------
+    CpunetError
+        If a step has no finite position or energy, a negative energy, or none deposits.
+    """
+    bad = ~(np.isfinite(steps.position_mm).all(axis=1) & np.isfinite(steps.edep_kev))
+    bad |= steps.edep_kev < 0
+    if bad.any():
+        event = steps.event[np.argmax(bad)]
+        raise CpunetError(
+            f"{path}: event {event}: a step has no finite position or no energy of at least 0; "
+            "remove the event or simulate again"
+        )
+    kept = steps.edep_kev > 0
+    if not kept.any():
+        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
+    numbers, first, label = np.unique(steps.event[kept], return_index=True, return_inverse=True)
+    in_file = np.argsort(first)
+    rank = np.empty_like(in_file)
+    rank[in_file] = np.arange(len(in_file))
+    # steps of one event may lie apart, as in files joined from several threads
+    order = np.argsort(rank[label], kind="stable")
+    counts = np.bincount(rank[label], minlength=len(numbers))
+    hits = Hits.of(
+        transform.apply(steps.position_mm[kept][order]),
+        steps.edep_kev[kept][order],
+        np.concatenate([[0], np.cumsum(counts)]),
+        numbers[in_file],
+    )
+    return ReadHits(hits, int((~kept).sum()))
+
+
+def _factor(
+    path: Path, column: str, unit: str | None, known: dict[str, float], option: str
+) -> float:
+    if unit is None:
+        raise CpunetError(
+            f"{path}: column {column} names no unit; give {option} ({', '.join(known)})"
+        )
+    if unit not in known:
+        raise CpunetError(
+            f"{path}: column {column} is in {unit!r}; expected one of {', '.join(known)}"
+        )
+    return known[unit]

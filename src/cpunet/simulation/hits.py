@@ -1,0 +1,151 @@
+"""Energy deposits of events in a crystal, whatever made them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Hits of a set of events, flat: event i owns ``offsets[i]:offsets[i + 1]``.
+
+    Coordinates are the crystal's: its axis is x = y = 0, the point-contact face z = 0,
+    and z grows to the crystal's length.
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm
+        Where, in mm; one value per hit.
+    edep_kev
+        Energy of each hit in keV.
+    offsets
+        Int64 array of ``n_events + 1``, from 0 to the number of hits.
+    event_number
+        The source's own number of each event.
+
+    Raises
+    ------
+    CpunetError
+        If the lengths disagree or the offsets fall.
+
+    Examples
+    --------
+    >>> hits = Hits.of([[0, 0, 10], [5, 0, 12], [1, 1, 1]], [1000, 592.5, 2614.5], [0, 2, 3])
+    >>> hits.n_events, hits.energy_kev
+    (2, array([1592.5, 2614.5]))
+    >>> hits[hits.energy_kev > 2000].z_mm
+    array([1.])
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    z_mm: FloatArray
+    edep_kev: FloatArray
+    offsets: IntArray
+    event_number: IntArray
+
+    def __post_init__(self) -> None:
+        n = len(self.edep_kev)
+        for name in ("x_mm", "y_mm", "z_mm", "edep_kev"):
+            if getattr(self, name).shape != (n,):
+                raise CpunetError(f"hits: {name} does not have one value per hit ({n})")
+        ends_fit = len(self.offsets) > 0 and self.offsets[0] == 0 and self.offsets[-1] == n
+        if not ends_fit or np.any(np.diff(self.offsets) < 0):
+            raise CpunetError(f"hits: offsets must rise from 0 to the number of hits, {n}")
+        if self.event_number.shape != (len(self.offsets) - 1,):
+            raise CpunetError(
+                f"hits: {len(self.event_number)} event numbers for "
+                f"{len(self.offsets) - 1} events"
+            )
+
+    @classmethod
+    def of(
+        cls,
+        position_mm: npt.ArrayLike,
+        edep_kev: npt.ArrayLike,
+        offsets: npt.ArrayLike,
+        event_number: npt.ArrayLike | None = None,
+    ) -> Hits:
+        """Build from anything array-like; positions of shape ``(n_hits, 3)``."""
+        x, y, z = np.asarray(position_mm, float).reshape(-1, 3).T.copy()
+        starts = np.asarray(offsets, np.int64)
+        numbers = np.arange(len(starts) - 1) if event_number is None else event_number
+        return cls(x, y, z, np.asarray(edep_kev, float), starts, np.asarray(numbers, np.int64))
+
+    @property
+    def n_events(self) -> int:
+        """Number of events, those without hits included."""
+        return len(self.offsets) - 1
+
+    def __len__(self) -> int:
+        return self.n_events
+
+    @property
+    def event_of_hit(self) -> IntArray:
+        """Index (not number) of the event of each hit."""
+        return np.repeat(np.arange(self.n_events), np.diff(self.offsets))
+
+    @property
+    def energy_kev(self) -> FloatArray:
+        """Sum of the hits of each event in keV."""
+        return np.bincount(
+            self.event_of_hit, weights=self.edep_kev, minlength=self.n_events
+        ).astype(np.float64)
+
+    @property
+    def position_mm(self) -> FloatArray:
+        """Positions as one array of shape ``(n_hits, 3)``."""
+        return np.stack([self.x_mm, self.y_mm, self.z_mm], axis=1)
+
+    def __getitem__(self, which: slice | npt.NDArray[np.bool_] | IntArray) -> Hits:
+        """The events of a slice, a mask or a list of rows."""
+        rows = np.arange(self.n_events)[which]
+        counts = np.diff(self.offsets)[rows]
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        # hit j of the result is hit j - offsets[i] of its old event
+        take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
+        return Hits(
+            self.x_mm[take],
+            self.y_mm[take],
+            self.z_mm[take],
+            self.edep_kev[take],
+            offsets,
+            self.event_number[rows],
+        )
+
+    def where(self, keep: npt.NDArray[np.bool_]) -> Hits:
+        """The same events with only the hits of a mask (an event may end up empty)."""
+        kept = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
+        return Hits(
+            self.x_mm[keep],
+            self.y_mm[keep],
+            self.z_mm[keep],
+            self.edep_kev[keep],
+            kept[self.offsets],
+            self.event_number,
+        )
+
+    @classmethod
+    def concatenate(cls, sets: Sequence[Hits]) -> Hits:
+        """Join sets into one, events in their order."""
+        if not sets:
+            raise CpunetError("no sets of hits to join")
+        starts = np.cumsum([0, *(len(s.edep_kev) for s in sets)])
+        ends = [s.offsets[1:] + start for s, start in zip(sets, starts, strict=False)]
+        return cls(
+            np.concatenate([s.x_mm for s in sets]),
+            np.concatenate([s.y_mm for s in sets]),
+            np.concatenate([s.z_mm for s in sets]),
+            np.concatenate([s.edep_kev for s in sets]),
+            np.concatenate([np.zeros(1, np.int64), *ends]).astype(np.int64),
+            np.concatenate([s.event_number for s in sets]),
+        )

@@ -1,0 +1,136 @@
+"""LEGEND metadata of germanium detectors (``hardware/detectors/germanium/diodes``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+
+# where a diode says it: the detector's field
+_GEOMETRY = {
+    "height_in_mm": "crystal_length",
+    "radius_in_mm": "crystal_radius",
+    "pp_contact.radius_in_mm": "point_contact_radius",
+    "pp_contact.depth_in_mm": "point_contact_length",
+    "groove.depth_in_mm": "ditch_depth",
+    "groove.radius_in_mm.outer": "wrap_around_radius",
+    "groove.radius_in_mm.inner": "",
+    "borehole.radius_in_mm": "bore_radius",
+    "borehole.depth_in_mm": "bore_length",
+    "taper.top.height_in_mm": "outer_taper_length",
+    "taper.top.angle_in_deg": "taper_angle_deg",
+    "taper.borehole.height_in_mm": "inner_taper_length",
+    "taper.borehole.angle_in_deg": "inner_taper_angle_deg",
+    "taper.bottom.height_in_mm": "bottom_taper_length",
+    "taper.bottom.angle_in_deg": "bottom_taper_angle_deg",
+    "bulletization.top_radius_in_mm": "top_bullet_radius",
+    "bulletization.bottom_radius_in_mm": "bottom_bullet_radius",
+    "bulletization.borehole_radius_in_mm": "bore_bullet_radius",
+    "bulletization.pp-contact_radius_in_mm": "",
+    "bulletization.contact_radius_in_mm": "",
+}
+_REQUIRED = (
+    "height_in_mm",
+    "radius_in_mm",
+    "pp_contact.radius_in_mm",
+    "pp_contact.depth_in_mm",
+)
+_BIAS = (
+    "characterization.l200_site.recommended_voltage_in_V",
+    "characterization.manufacturer.recommended_voltage_in_V",
+)
+_LITHIUM = (
+    "characterization.combined_0vbb_analysis.fccd_in_mm.value",
+    "characterization.manufacturer.dl_thickness_in_mm",
+)
+
+
+def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Fields of `Detector` from a LEGEND diode; those it does not hold are left out.
+
+    Impurities come from ``production.impcc`` (a straight line through its points,
+    net acceptors counted as negative), the bias and the lithium's thickness
+    from ``characterization``.
+
+    Raises
+    ------
+    CpunetError
+        If the geometry has a key that is not known (as without its unit), lacks one, or
+        is not axially symmetric.
+    """
+    if diode.get("type") not in (None, "icpc", "bege", "ppc"):
+        raise CpunetError(
+            f"detector {name}: type {diode['type']!r} is not simulated; icpc, bege and ppc are"
+        )
+    geometry = _flat(diode["geometry"], name)
+    for key in _REQUIRED:
+        if key not in geometry:
+            raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
+    values: dict[str, Any] = {"name": str(diode.get("name", name))}
+    for key, value in geometry.items():
+        if key not in _GEOMETRY:
+            raise CpunetError(
+                f"detector {name}: unknown key geometry.{key} (units belong to the key, "
+                "and only axially symmetric shapes are simulated); correct or remove it"
+            )
+        if field := _GEOMETRY[key]:
+            values[field] = value
+    outer, inner = (geometry.get(f"groove.radius_in_mm.{x}", 0) for x in ("outer", "inner"))
+    if geometry.get("groove.depth_in_mm"):
+        values["ditch_thickness"] = _number(outer, name) - _number(inner, name)
+    for field, places in (("bias_V", _BIAS), ("li_thickness", _LITHIUM)):
+        found = [v for v in (_at(diode, p) for p in places) if isinstance(v, int | float)]
+        if found:
+            values[field] = found[0]
+    return values | _impurities(diode, name)
+
+
+def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
+    table = _at(diode, "production.impcc.array")
+    if not isinstance(table, Mapping):
+        return {}
+    key = next((k for k in ("value_in_1e9e/cm3", "value_in_1e9e_cm3") if k in table), "")
+    try:
+        value = -np.abs(np.array(table[key], float)) / 10  # 1e9 to 1e10 / cm3
+        z_cm = np.array(table["dist_from_contact_in_mm"], float) / 10
+        slope, offset = np.polyfit(z_cm, value, 1) if len(z_cm) > 1 else (0.0, value[0])
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise CpunetError(
+            f"detector {name}: production.impcc.array needs equally long "
+            "value_in_1e9e/cm3 and dist_from_contact_in_mm; correct or remove it"
+        ) from error
+    return {
+        "impurity_z0_1e10_per_cm3": float(offset),
+        "impurity_gradient_1e10_per_cm4": float(slope),
+    }
+
+
+def _flat(values: Any, name: str, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, its keys joined by dots."""
+    if not isinstance(values, Mapping):
+        raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, name, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _at(values: Any, place: str) -> Any:
+    for key in place.split("."):
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return values
+
+
+def _number(value: Any, name: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise CpunetError(
+            f"detector {name}: geometry.groove.radius_in_mm has no numbers; give both"
+        ) from error

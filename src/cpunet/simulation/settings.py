@@ -1,0 +1,81 @@
+"""Settings of the pulse simulation: time steps, charge cloud, grid of the library."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from cpunet.recipes.schema import Config, NonNegative, Positive
+
+
+class SimulationSettings(Config):
+    """How hits become pulses.
+
+    Parameters
+    ----------
+    step_ns
+        Time step of the drift.
+    dt_ns
+        Sampling period of the pulses; each sample is the mean of the steps in it.
+    length_ns
+        Length of the record, which starts when the charge is set free.
+    diffusion
+        Let the charge cloud grow by diffusion.
+    diffusion_constant
+        ``"temperature"``: kT/e at the crystal's temperature; ``"siggen"``: siggen's
+        0.12 V mm/cm, and its rounding of the cloud's duration to whole steps.
+    cloud_fwhm_mm
+        Width of the charge cloud when it is set free.
+    self_repulsion
+        Let the cloud grow by the repulsion of its charges, hit by hit.
+    library_grid_mm, library_angles, library_step_ns
+        Spacing in r and z, number of azimuths between 0 and 45 degrees and sampling of
+        the pre-computed pulses.
+    library_core_mm
+        Within this distance of the contact's centre, where pulses change from one grid
+        point to the next, the library is not used.
+    """
+
+    step_ns: Positive = 1.0
+    dt_ns: Positive = 16.0
+    length_ns: Positive = 3600.0
+    diffusion: bool = True
+    diffusion_constant: Literal["temperature", "siggen"] = "temperature"
+    cloud_fwhm_mm: NonNegative = 0.1
+    self_repulsion: bool = False
+    library_grid_mm: Positive = 1.0
+    library_angles: Annotated[int, Field(ge=2)] = 5
+    library_step_ns: Positive = 2.0
+    library_core_mm: NonNegative = 10.0
+
+    @property
+    def n_steps(self) -> int:
+        """Steps of the drift in one record."""
+        return self.n_samples * self.steps_per_sample
+
+    @property
+    def n_samples(self) -> int:
+        """Samples of one pulse."""
+        return int(self.length_ns / self.dt_ns + 1e-9)
+
+    @property
+    def steps_per_sample(self) -> int:
+        """Steps of the drift in one sample."""
+        return round(self.dt_ns / self.step_ns)
+
+    @model_validator(mode="after")
+    def _whole_steps(self) -> SimulationSettings:
+        for name, whole, part in (
+            ("dt_ns", self.dt_ns, self.step_ns),
+            ("library_step_ns", self.library_step_ns, self.step_ns),
+            ("dt_ns", self.dt_ns, self.library_step_ns),
+        ):
+            ratio = whole / part
+            if name == "dt_ns" and part == self.library_step_ns and ratio < 1:
+                continue
+            if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
+                raise ValueError(f"{name} must be a multiple of {part} ns")
+        if self.length_ns < self.dt_ns:
+            raise ValueError("length_ns must be at least dt_ns")
+        return self

@@ -1,0 +1,192 @@
+"""Charge pulses of single hits: drift of both carriers, Shockley-Ramo, charge cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.cloud import (
+    FWHM_PER_SIGMA,
+    diffusion_constant,
+    repulsion_constant,
+    smear_and_sample,
+    starting_fwhm_mm,
+)
+from cpunet.simulation.drift import DriftMaps, Maps, drift, drift_maps, in_active_volume
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Pulses of single hits, in units of the hit's charge.
+
+    Parameters
+    ----------
+    waveforms
+        Float32 array of shape ``(n, samples)``; 0 where `valid` is false.
+    dt_ns
+        Sampling period in ns.
+    valid
+        Hits that give a signal; the others lie in a contact, outside the crystal or in
+        germanium without a field.
+    collected
+        Hits whose carriers both arrived within the record.
+    drift_time_ns
+        Time at which the last carrier arrived, or the record ended; NaN if not valid.
+    cloud_fwhm_ns
+        Duration (FWHM) by which the charge cloud smears the pulse; NaN if not valid.
+    """
+
+    waveforms: npt.NDArray[np.float32]
+    dt_ns: float
+    valid: npt.NDArray[np.bool_]
+    collected: npt.NDArray[np.bool_]
+    drift_time_ns: FloatArray
+    cloud_fwhm_ns: FloatArray
+
+
+def hit_signals(
+    fields: Maps,
+    x_mm: npt.ArrayLike,
+    y_mm: npt.ArrayLike,
+    z_mm: npt.ArrayLike,
+    edep_kev: npt.ArrayLike,
+    settings: SimulationSettings,
+) -> Signals:
+    """Simulate the charge pulse of each hit, in parallel over the hits.
+
+    Electron and hole drift from the same place in explicit steps; the pulse is the
+    change of the weighting potential at both (Shockley-Ramo), smeared by a Gaussian as
+    long as the cloud takes into the contact, and averaged over each sample.
+
+    Parameters
+    ----------
+    fields
+        Field maps of the detector.
+    x_mm, y_mm, z_mm
+        Places of the hits in the crystal's coordinates.
+    edep_kev
+        Energies; they matter for the self-repulsion of the cloud only.
+
+    Raises
+    ------
+    CpunetError
+        If a coordinate or an energy is no finite number, or their numbers differ.
+
+    References
+    ----------
+    Z. He, NIM A 463 (2001) 250 (Shockley-Ramo); D. C. Radford, siggen.
+    """
+    hits = hit_table(x_mm, y_mm, z_mm, edep_kev)
+    n = len(hits)
+    waveforms = np.zeros((n, settings.n_samples), np.float32)
+    facts = np.full((n, 4), np.nan)
+    maps = drift_maps(fields)
+    _all_signals(
+        maps, hits, cloud_numbers(fields, settings), time_numbers(settings), waveforms, facts
+    )
+    valid = np.isfinite(facts[:, 0])
+    return Signals(
+        waveforms=waveforms,
+        dt_ns=settings.dt_ns,
+        valid=valid,
+        collected=facts[:, 1] == 1.0,
+        drift_time_ns=facts[:, 0] * settings.step_ns,
+        cloud_fwhm_ns=facts[:, 2] * settings.step_ns,
+    )
+
+
+def hit_table(
+    x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
+) -> FloatArray:
+    """Hits as rows x, y, z (mm), energy (keV); see `hit_signals` for what is refused."""
+    try:
+        columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
+    except ValueError as error:
+        raise CpunetError("hits: x, y, z and energy differ in number; give one each") from error
+    table = np.ascontiguousarray(np.stack(columns, axis=-1), dtype=np.float64).reshape(-1, 4)
+    bad = np.flatnonzero(~np.isfinite(table).all(1))
+    if len(bad):
+        raise CpunetError(f"hits: hit {bad[0]}: no finite place or energy; leave it out")
+    return table
+
+
+def time_numbers(settings: SimulationSettings) -> tuple[float, int]:
+    """Step in ns and steps per sample, as the compiled loops want them."""
+    return settings.step_ns, settings.steps_per_sample
+
+
+def cloud_numbers(
+    fields: Maps, settings: SimulationSettings
+) -> tuple[float, float, float, bool]:
+    """First width (mm), diffusion constant, repulsion per keV, siggen's rounding."""
+    siggen = settings.diffusion_constant == "siggen"
+    constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
+    return (
+        starting_fwhm_mm(settings.cloud_fwhm_mm, settings.diffusion or settings.self_repulsion),
+        constant if settings.diffusion else 0.0,
+        repulsion_constant(1.0) if settings.self_repulsion else 0.0,
+        siggen,
+    )
+
+
+@njit(cache=True, nogil=True)
+def point_signal(
+    maps: DriftMaps,
+    hit: FloatArray,
+    cloud: tuple[float, float, float, bool],
+    step_ns: float,
+    signal: FloatArray,
+) -> tuple[int, bool, float]:
+    """Fill `signal` with the pulse of a point charge; give last step, whether all is
+    collected, and the FWHM in steps by which the cloud smears it.
+    """
+    signal[:] = 0.0
+    start = (hit[0], hit[1], hit[2])
+    nowhere = np.empty((0, 3))
+    point = (0.0, 0.0, 0.0)
+    growing = (cloud[0], cloud[1], cloud[2] * hit[3])
+    steps_e, arrived_e, _, _ = drift(maps, ELECTRON, start, step_ns, point, signal, nowhere)
+    steps_h, arrived_h, size, speed = drift(
+        maps, HOLE, start, step_ns, growing, signal, nowhere
+    )
+    fwhm = cloud_steps(size, speed, step_ns, cloud[3])
+    return max(steps_e, steps_h), arrived_e and arrived_h, fwhm
+
+
+@njit(cache=True, nogil=True)
+def cloud_steps(size: float, speed: float, step_ns: float, whole: bool) -> float:
+    """Steps (FWHM) a cloud takes into the contact; siggen counts them in `whole` ones."""
+    if speed <= 0.0:
+        return 0.0
+    fwhm = size / (speed * step_ns)
+    if whole:
+        rounded = int(1.5 + fwhm)
+        return float(rounded) if rounded > 1 else 0.0
+    return fwhm
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _all_signals(
+    maps: DriftMaps,
+    hits: FloatArray,
+    cloud: tuple[float, float, float, bool],
+    times: tuple[float, int],
+    waveforms: npt.NDArray[np.float32],
+    facts: FloatArray,
+) -> None:
+    n_steps = waveforms.shape[1] * times[1]
+    for i in prange(len(hits)):
+        if not in_active_volume(maps, hits[i, 0], hits[i, 1], hits[i, 2]):
+            continue
+        signal = np.empty(n_steps)
+        out = np.zeros(waveforms.shape[1])
+        last, arrived, fwhm = point_signal(maps, hits[i], cloud, times[0], signal)
+        smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, 1.0, out)
+        waveforms[i] = out
+        facts[i, 0], facts[i, 1], facts[i, 2] = last, 1.0 if arrived else 0.0, fwhm

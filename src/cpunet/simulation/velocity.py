@@ -1,0 +1,169 @@
+"""Drift velocity of electrons and holes in cubic germanium, fast enough for every step.
+
+A table along three crystal axes at 77 K, scaled to the crystal's temperature, and the
+anisotropic velocity for any direction of the field.  The velocity is the gradient, in
+the space of fields, of the integral of the speed over the field strength.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from importlib.resources import files
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+FloatArray = npt.NDArray[np.float64]
+
+ELECTRON, HOLE = 0, 1
+
+# Columns of `VelocityTable.coefficients`.
+A, B, C, B_MEAN, C_MEAN, V100 = range(6)
+
+_TABLE_K = 77.0
+_RANGE_K = (40.0, 120.0)
+# mu0 = mobility * T**power (cm2/Vs), vs = speed * sqrt(tanh(theta / 2 T)) (cm/s):
+# Omar and Reggiani, Solid-State Electronics 30 (1987) 1351, values of Radford (2015).
+_MOBILITY = (5.66e7, 1.63e9)
+_POWER = (-1.680, -2.398)
+_SPEED = (1.3e7, 1.2e7)
+_THETA_K = 200.0
+
+
+class VelocityTable(NamedTuple):
+    """Anisotropy coefficients at equidistant field strengths, linear in between.
+
+    ``coefficients`` has shape ``(2 carriers, n fields, 6)`` in mm/ns: a, b, c, the means
+    of b and c from field 0 on, and the speed along <100>.
+    """
+
+    coefficients: FloatArray
+    fields_per_V_per_cm: float
+
+
+def measured_table() -> FloatArray:
+    """The 77 K table: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
+    lines = files("cpunet.simulation").joinpath("drift_velocity.csv").read_text("utf-8")
+    rows = [row for row in csv.reader(lines.splitlines()) if not row[0].startswith("#")]
+    return np.array(rows[1:], dtype=np.float64)
+
+
+def velocity_table(temperature_K: float) -> VelocityTable:
+    """Anisotropy coefficients at a crystal temperature.
+
+    Parameters
+    ----------
+    temperature_K
+        Limited to 40-120 K, the range of the temperature model.
+
+    Examples
+    --------
+    >>> table = velocity_table(90.0)
+    >>> speed = drift_velocity(table, [[1000.0, 0.0, 0.0]], HOLE)
+    >>> round(float(speed[0, 0]), 3)
+    0.081
+    """
+    measured = measured_table()
+    field = measured[:, 0]
+    step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
+    grid = np.arange(round(field[-1] / step) + 1) * step
+    tables = []
+    for carrier in (ELECTRON, HOLE):
+        factor = _temperature_factor(carrier, field, temperature_K)
+        v100, v110, v111 = (measured[:, 1 + 3 * carrier : 4 + 3 * carrier] * factor[:, None]).T
+        a = v100 / 2 - 4 * v110 + 4.5 * v111
+        b = -2.5 * v100 + 16 * v110 - 13.5 * v111
+        c = 3 * v100 - 12 * v110 + 9 * v111
+        columns = (a, b, c, _running_mean(field, b), _running_mean(field, c), v100)
+        tables.append(np.stack([np.interp(grid, field, column) for column in columns], 1))
+    return VelocityTable(np.ascontiguousarray(tables), 1 / step)
+
+
+def drift_velocity(table: VelocityTable, field: npt.ArrayLike, carrier: int) -> FloatArray:
+    """Velocity vectors (n, 3) in mm/ns for field vectors (n, 3) in V/cm.
+
+    The <100> axes are x, y and z.  `carrier` is `ELECTRON` or `HOLE`.
+    """
+    vectors = np.ascontiguousarray(field, dtype=np.float64)
+    velocity: FloatArray = _velocities(table, vectors, carrier)
+    return velocity
+
+
+def _temperature_factor(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:
+    low, high = _RANGE_K
+    now = _speed_model(carrier, field, min(max(temperature_K, low), high))
+    then = _speed_model(carrier, field, _TABLE_K)
+    return np.divide(now, then, out=np.ones_like(field), where=then > 0)
+
+
+def _speed_model(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:
+    saturation = _SPEED[carrier] * math.sqrt(math.tanh(_THETA_K / (2 * temperature_K)))
+    x = field * _MOBILITY[carrier] * temperature_K ** _POWER[carrier] / saturation
+    return np.asarray(saturation * x / np.sqrt(1 + x**2), dtype=np.float64)
+
+
+def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
+    """Mean of `values` from field 0 to each field, by trapezoids."""
+    areas = np.diff(field) * (values[1:] + values[:-1]) / 2
+    integral = np.concatenate([[0.0], np.cumsum(areas)])
+    mean: FloatArray = np.divide(integral, field, out=values.copy(), where=field > 0)
+    return mean
+
+
+@njit(cache=True, nogil=True, inline="always")
+def carrier_velocity(
+    coefficients: FloatArray,
+    per_field: float,
+    carrier: int,
+    ex: float,
+    ey: float,
+    ez: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
+
+    Beyond the last field of the table its last interval goes on.
+    """
+    strength = math.sqrt(ex * ex + ey * ey + ez * ez)
+    if strength <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    nx, ny, nz = ex / strength, ey / strength, ez / strength
+    position = strength * per_field
+    row = min(int(position), coefficients.shape[1] - 2)
+    part = position - row
+    low, high = coefficients[carrier, row], coefficients[carrier, row + 1]
+    a = low[A] + part * (high[A] - low[A])
+    b = low[B] + part * (high[B] - low[B])
+    c = low[C] + part * (high[C] - low[C])
+    b_mean = 4 * (low[B_MEAN] + part * (high[B_MEAN] - low[B_MEAN]))
+    c_mean = 6 * (low[C_MEAN] + part * (high[C_MEAN] - low[C_MEAN]))
+    slope = (high[V100] - low[V100]) * per_field
+    speed = low[V100] + part * (high[V100] - low[V100])
+    x2, y2, z2 = nx * nx, ny * ny, nz * nz
+    x4, y4, z4 = x2 * x2, y2 * y2, z2 * z2
+    s4 = x4 + y4 + z4
+    s6 = x4 * x2 + y4 * y2 + z4 * z2
+    common = a + b * s4 + c * s6 - b_mean * s4 - c_mean * s6
+    sign = 1.0 if carrier == HOLE else -1.0
+    vx = sign * nx * (common + b_mean * x2 + c_mean * x4)
+    vy = sign * ny * (common + b_mean * y2 + c_mean * y4)
+    vz = sign * nz * (common + b_mean * z2 + c_mean * z4)
+    return vx, vy, vz, strength, speed, slope
+
+
+@njit(cache=True, nogil=True)
+def _velocities(table: VelocityTable, field: FloatArray, carrier: int) -> FloatArray:
+    out = np.empty_like(field)
+    for i in range(len(field)):
+        vx, vy, vz, _, _, _ = carrier_velocity(
+            table.coefficients,
+            table.fields_per_V_per_cm,
+            carrier,
+            field[i, 0],
+            field[i, 1],
+            field[i, 2],
+        )
+        out[i, 0], out[i, 1], out[i, 2] = vx, vy, vz
+    return out

@@ -1,0 +1,134 @@
+"""The detector's shape and what it refuses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import detector_names, read_detector
+
+ICPC = read_detector("icpc")
+heights = st.floats(-5, 100)
+radii = st.floats(0, 50)
+
+
+def changed(**values: object) -> Detector:
+    return Detector.model_validate({**ICPC.model_dump(), **values})
+
+
+@pytest.mark.parametrize("name", detector_names())
+@given(r=radii, z=heights)
+def test_active_germanium_is_inside(name: str, r: float, z: float) -> None:
+    detector = read_detector(name)
+    assert not detector.active(r, z) or detector.inside(r, z)
+
+
+@given(z=st.floats(2.1, 60), depth=st.floats(0, 3))
+def test_lithium_is_as_thick_as_said_on_the_wall(z: float, depth: float) -> None:
+    r = ICPC.crystal_radius - depth
+    assert ICPC.inside(r, z)
+    assert ICPC.active(r, z) == (depth > ICPC.li_thickness + 1e-5)
+
+
+@pytest.mark.parametrize("taper", ["outer", "inner", "bottom"])
+def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
+    detector = changed(
+        outer_taper_length=30 if taper == "outer" else 0,
+        inner_taper_length=30 if taper == "inner" else 0,
+        bottom_taper_length=20 if taper == "bottom" else 0,
+        bottom_taper_angle_deg=20,
+    )
+    angle = math.radians(20 if taper == "bottom" else detector.taper_angle_deg)
+    length, radius = detector.crystal_length, detector.crystal_radius
+    r, z, into_r, into_z = {
+        "outer": (radius - 15 * math.tan(angle), length - 15, -1, -1),
+        "inner": (detector.bore_radius + 15 * math.tan(angle), length - 15, 1, -1),
+        "bottom": (radius - 10 * math.tan(angle), 10, -1, 1),
+    }[taper]
+    for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
+        at = (
+            r + depth * into_r * math.cos(angle),
+            z + depth * into_z * math.sin(angle),
+        )
+        assert (detector.inside(*at), detector.active(*at)) == (inside, active)
+
+
+def test_lithium_of_fieldgen_is_thicker_on_a_taper() -> None:
+    theirs = changed(siggen_conventions=True)
+    z, tangent = 80.0, math.tan(math.radians(10))
+    wall = ICPC.crystal_radius - (z - 61) * tangent
+    assert not theirs.active(wall - (1 + tangent) + 0.01, z)
+    assert theirs.active(wall - (1 + tangent) - 0.01, z)
+    assert ICPC.active(wall - 1 / math.cos(math.radians(10)) - 0.01, z)
+
+
+@given(angle=st.floats(0, math.pi / 2), distance=st.floats(5.01, 9))
+def test_the_bore_ends_in_a_hemisphere(angle: float, distance: float) -> None:
+    centre = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
+    r, z = distance * math.sin(angle), centre - distance * math.cos(angle)
+    assert ICPC.inside(r, z)
+    assert ICPC.active(r, z) == (distance > 6 + 1e-5)
+    assert not ICPC.inside(r * 4.99 / distance, centre + (z - centre) * 4.99 / distance)
+
+
+def test_a_bullet_rounds_the_edge() -> None:
+    ppc = read_detector("ppc")
+    edge = (ppc.crystal_radius - 0.1, ppc.crystal_length - 0.1)
+    assert not ppc.inside(*edge)
+    assert ppc.inside(ppc.crystal_radius - 0.4, ppc.crystal_length - 0.4)
+
+
+def test_the_ditch_is_no_germanium() -> None:
+    assert not ICPC.inside(12.5, 1)
+    assert ICPC.inside(12.5, 2.1)
+    assert ICPC.inside(10.9, 1)
+
+
+def test_impurities_follow_their_terms() -> None:
+    assert ICPC.impurity_1e10_per_cm3(0, 50) == pytest.approx(-1.3)
+    quadratic = changed(impurity_quadratic_1e10_per_cm3=-0.2)
+    assert quadratic.impurity_1e10_per_cm3(0, 48) == pytest.approx(-1.8 + 0.48 - 0.2)
+    radial = changed(impurity_radial_mult=1.5, impurity_radial_add_1e10_per_cm3=-0.1)
+    r = ICPC.crystal_radius
+    assert radial.impurity_1e10_per_cm3(r, 0) == pytest.approx(-1.8 * 1.5 - 0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ({"bore_length": 94.0}, "bore_length"),
+        ({"bore_radius": 0}, "bore_radius"),
+        ({"bore_bullet_radius": 6}, "bore_bullet_radius"),
+        ({"point_contact_radius": 11.5}, "point_contact_radius"),
+        ({"wrap_around_radius": 40}, "wrap_around_radius"),
+        ({"wrap_around_radius": 0}, "ditch_depth"),
+        ({"ditch_thickness": 0}, "ditch_thickness"),
+        ({"ditch_depth": 30}, "ditch_depth"),
+        ({"li_thickness": 30}, "li_thickness"),
+        ({"taper_angle_deg": 45}, "taper"),
+        ({"inner_taper_length": 75}, "inner_taper_length"),
+        ({"bottom_taper_length": 35}, "bottom_taper_length"),
+        ({"top_bullet_radius": 2}, "top_bullet_radius"),
+        ({"bottom_bullet_radius": 2, "bottom_taper_length": 2}, "bottom_bullet_radius"),
+        ({"impurity_gradient_1e10_per_cm4": 0.5}, "impurity"),
+        ({"point_contact_radius": 0.15}, "grid_mm"),
+        ({"crystal_length": -1}, "crystal_length"),
+        ({"bias_V": float("nan")}, "bias_V"),
+    ],
+)
+def test_impossible_detectors_are_refused(values: dict[str, float], key: str) -> None:
+    with pytest.raises(ValidationError, match=key):
+        changed(**values)
+
+
+def test_the_fingerprint_tells_detectors_apart() -> None:
+    assert ICPC.fingerprint() == read_detector("icpc").fingerprint()
+    assert ICPC.fingerprint() == changed(name="other").fingerprint()
+    assert ICPC.fingerprint() != changed(bias_V=3999).fingerprint()
+    without = ("name", "bias_V")
+    assert ICPC.fingerprint(without) == changed(bias_V=3999).fingerprint(without)

@@ -1,0 +1,59 @@
+"""The container of hits: events picked, joined and summed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.hits import Hits
+
+
+def hits_with(counts: list[int], seed: int = 0) -> Hits:
+    rng = np.random.default_rng(seed)
+    n = sum(counts)
+    return Hits.of(
+        rng.uniform(0, 40, (n, 3)),
+        rng.uniform(1, 500, n),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.arange(len(counts)) * 10,
+    )
+
+
+@given(st.lists(st.integers(0, 5), max_size=8), st.data())
+def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject) -> None:
+    hits = hits_with(counts)
+    mask = np.array([data.draw(st.booleans()) for _ in counts], bool)
+    picked = hits[mask]
+    np.testing.assert_allclose(picked.energy_kev, hits.energy_kev[mask])
+    np.testing.assert_array_equal(picked.event_number, hits.event_number[mask])
+    np.testing.assert_array_equal(picked.x_mm, hits.x_mm[mask[hits.event_of_hit]])
+    both = Hits.concatenate([picked, hits[~mask]])
+    assert both.edep_kev.sum() == pytest.approx(hits.edep_kev.sum())
+    assert both.n_events == hits.n_events
+
+
+def test_hits_can_be_left_out() -> None:
+    hits = hits_with([2, 0, 3])
+    kept = hits.where(np.array([False, False, True, False, True]))
+    np.testing.assert_array_equal(kept.offsets, [0, 0, 0, 2])
+    np.testing.assert_array_equal(kept.z_mm, hits.z_mm[[2, 4]])
+
+
+def test_order_of_rows_is_kept() -> None:
+    hits = hits_with([1, 2, 3])
+    np.testing.assert_array_equal(hits[np.array([2, 0])].event_number, [20, 0])
+    np.testing.assert_array_equal(hits[1:].offsets, [0, 2, 5])
+
+
+@pytest.mark.parametrize("offsets", [[0, 2], [1, 3], [0, 5, 3], []])
+def test_offsets_that_do_not_fit_are_refused(offsets: list[int]) -> None:
+    with pytest.raises(CpunetError, match="offsets must rise"):
+        Hits.of(np.zeros((3, 3)), np.ones(3), offsets)
+
+
+def test_nothing_to_join_is_refused() -> None:
+    with pytest.raises(CpunetError, match="no sets of hits"):
+        Hits.concatenate([])

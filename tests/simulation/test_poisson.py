@@ -1,0 +1,147 @@
+"""Potentials against shapes that have a formula: concentric cylinders and hemispheres."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.constants import elementary_charge, epsilon_0
+
+from cpunet.simulation.depletion import depletion_voltage
+from cpunet.simulation.fields import electric_field
+from cpunet.simulation.geometry import Detector, RegionArray
+from cpunet.simulation.grid import make_grid
+from cpunet.simulation.poisson import EPSILON_GERMANIUM, solve_potentials
+
+# no multiples of the grid, so that contacts lie between nodes
+INNER, OUTER = 2.04, 8.53
+IMPURITY = -1.5  # 1e10 / cm3
+CURVATURE = 1.5e16 * elementary_charge / (epsilon_0 * EPSILON_GERMANIUM) * 1e-6  # V / mm2
+
+
+class Cylinders(Detector):
+    """The point contact on the axis, lithium around it, the same at all heights."""
+
+    def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
+        r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
+        return np.where(r <= INNER, 0, np.where(r >= OUTER, 1, 2)).astype(np.int8)
+
+
+class Hemispheres(Detector):
+    """The point contact around the origin, lithium around it."""
+
+    def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
+        rho = np.hypot(np.asarray(r, float), np.asarray(z, float))
+        return np.where(rho <= INNER, 0, np.where(rho >= OUTER, 1, 2)).astype(np.int8)
+
+
+def values(grid_mm: float = 0.1) -> dict[str, float]:
+    return {
+        "crystal_length": 9.0,
+        "crystal_radius": 9.0,
+        "point_contact_length": 2.0,
+        "point_contact_radius": 2.0,
+        "li_thickness": 0.5,
+        "impurity_z0_1e10_per_cm3": IMPURITY,
+        "bias_V": 500,
+        "temperature_K": 90,
+        "grid_mm": grid_mm,
+    }
+
+
+def cylinder_potential(r: npt.NDArray[np.float64], volts: float) -> npt.NDArray[np.float64]:
+    """Of the space charge, 0 at INNER and `volts` at OUTER."""
+    log = (volts - CURVATURE / 4 * (OUTER**2 - INNER**2)) / np.log(OUTER / INNER)
+    return CURVATURE / 4 * (r**2 - INNER**2) + log * np.log(r / INNER)
+
+
+def test_cylinders() -> None:
+    detector = Cylinders(**values())
+    grid = make_grid(detector)
+    found = solve_potentials(detector, grid)
+    inside = grid.free[:, 0]
+    r = grid.r_mm[inside]
+    expected = cylinder_potential(r, 500)
+    for row in (0, 37, -1):
+        total = 500 * found.bias[inside, row] + found.impurities[inside, row]
+        np.testing.assert_allclose(total, expected, atol=0.05)
+    wp = np.log(OUTER / r) / np.log(OUTER / INNER)
+    np.testing.assert_allclose(found.point_contact[inside, 5], wp, atol=3e-4)
+    capacitance = 2 * np.pi * EPSILON_GERMANIUM * epsilon_0 * 1e9 * 9  # 9 mm high
+    capacitance /= np.log(OUTER / INNER)
+    assert found.capacitance_pF == pytest.approx(capacitance, rel=1e-3)
+
+
+def test_the_field_of_cylinders() -> None:
+    detector = Cylinders(**values())
+    grid = make_grid(detector)
+    found = solve_potentials(detector, grid)
+    e_r, e_z = electric_field(500 * found.bias + found.impurities, grid, mirror=True)
+    inside = grid.free[:, 0]
+    r = grid.r_mm[inside]
+    log = (500 - CURVATURE / 4 * (OUTER**2 - INNER**2)) / np.log(OUTER / INNER)
+    expected = -10 * (CURVATURE / 2 * r + log / r)
+    np.testing.assert_allclose(e_r[inside, 20][1:-1], expected[1:-1], rtol=5e-3)
+    np.testing.assert_allclose(e_r[inside, 20], expected, rtol=0.1)
+    assert np.abs(e_z).max() < 1e-6
+    assert not e_r[~grid.free].any()
+
+
+def test_hemispheres_and_the_axis() -> None:
+    detector = Hemispheres(**values())
+    grid = make_grid(detector)
+    found = solve_potentials(detector, grid)
+    rho = np.hypot(grid.r_mm[:, np.newaxis], grid.z_mm)[grid.free]
+    wp = (1 / rho - 1 / OUTER) / (1 / INNER - 1 / OUTER)
+    np.testing.assert_allclose(found.point_contact[grid.free], wp, atol=3e-3)
+    on_axis = grid.free[0]
+    z = grid.z_mm[on_axis]
+    wp = (1 / z - 1 / OUTER) / (1 / INNER - 1 / OUTER)
+    np.testing.assert_allclose(found.point_contact[0, on_axis], wp, atol=2e-3)
+    # V = k rho^2 / 6 + c + d / rho, 0 on both
+    k = CURVATURE / 6
+    d = -k * (OUTER**2 - INNER**2) / (1 / OUTER - 1 / INNER)
+    expected = k * rho**2 + d / rho - k * INNER**2 - d / INNER
+    np.testing.assert_allclose(found.impurities[grid.free], expected, atol=0.5)
+    half_sphere = 2 * np.pi * EPSILON_GERMANIUM * epsilon_0 * 1e9 / (1 / INNER - 1 / OUTER)
+    assert found.capacitance_pF == pytest.approx(half_sphere, rel=5e-3)
+
+
+def test_electrodes_share_all_of_the_potential() -> None:
+    detector = Hemispheres(**values(0.2))
+    found = solve_potentials(detector, make_grid(detector))
+    np.testing.assert_allclose(found.point_contact + found.bias, 1, atol=1e-10)
+    grounded = Hemispheres(**values(0.2), vacuum_gap=1.0)
+    found = solve_potentials(grounded, make_grid(grounded))
+    assert (found.point_contact + found.bias).min() < 1 - 1e-3
+
+
+def test_surface_charge_bends_the_potential_down() -> None:
+    plain = Hemispheres(**values(0.2))
+    charged = Hemispheres(**values(0.2), surface_charge_1e10_per_cm2=-0.1)
+    grid = make_grid(plain)
+    without, with_it = (solve_potentials(d, grid).impurities for d in (plain, charged))
+    assert (with_it <= without + 1e-9).all()
+    assert with_it[25, 0] < without[25, 0] - 1
+
+
+@pytest.mark.parametrize("grid_mm", [0.1, 0.2])
+def test_depletion_of_cylinders(grid_mm: float) -> None:
+    detector = Cylinders(**values(grid_mm))
+    grid = make_grid(detector)
+    found = solve_potentials(detector, grid)
+    # the bias at which the field at the inner contact vanishes
+    expected = CURVATURE / 4 * (OUTER**2 - INNER**2)
+    expected -= CURVATURE / 2 * INNER**2 * np.log(OUTER / INNER)
+    depletion = depletion_voltage(found.bias, found.impurities, grid.region)
+    assert depletion == pytest.approx(expected, abs=20 * grid_mm)
+
+
+def test_a_pocket_that_no_bias_reaches() -> None:
+    bias = np.ones((9, 9))
+    bias[0] = 0
+    impurities = np.full((9, 9), 0.0)
+    impurities[5, 5] = -1.0
+    region = np.full((9, 9), 2, np.int8)
+    region[0] = 0
+    assert depletion_voltage(bias, impurities, region) == float("inf")
