@@ -1,40 +1,88 @@
-"""Rates of the pulse simulation on one core; ``python benchmarks/signals.py DETECTOR.yaml``."""
+"""Rates of the pulse simulation on one core, and the library against the exact drift.
+
+Run with ``python benchmarks/signals.py``; takes about a minute.
+"""
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
 
 import numba
 import numpy as np
-import yaml
+import numpy.typing as npt
 
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.fields import compute_fields
-from cpunet.simulation.geometry import Detector
+from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings
 
-N = 4000
+EXACT_HITS, LIBRARY_HITS = 6000, 200_000
+MOST_HITS_PER_EVENT = 5
+
+
+def random_events(fields: FieldMaps, n_hits: int, seed: int) -> Hits:
+    """Events of one to five hits, anywhere in the crystal's cylinder."""
+    rng = np.random.default_rng(seed)
+    radius = fields.r_mm[-1] * np.sqrt(rng.random(n_hits))
+    phi = rng.uniform(0, 2 * np.pi, n_hits)
+    z = rng.uniform(0, fields.z_mm[-1], n_hits)
+    place = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
+    ends = np.cumsum(rng.integers(1, MOST_HITS_PER_EVENT + 1, n_hits))
+    offsets = np.concatenate([[0], ends[ends < n_hits], [n_hits]])
+    return Hits.of(place, rng.uniform(50, 1000, n_hits), offsets)
+
+
+def timed(
+    fields: FieldMaps, hits: Hits, settings: SimulationSettings, **how: object
+) -> tuple[EventPulses, float]:
+    """The events and the rate of hits that give a signal."""
+    start = time.perf_counter()
+    events = simulate_events(fields, hits, settings, **how)  # type: ignore[arg-type]
+    seconds = time.perf_counter() - start
+    return events, (events.counts["hits"] - events.counts["hits without signal"]) / seconds
+
+
+def three(values: npt.NDArray[np.floating]) -> str:
+    """Median, 99 % and worst of absolute values."""
+    absolute = np.abs(values)
+    numbers = (np.median(absolute), np.quantile(absolute, 0.99), absolute.max())
+    return "median {:.2e}, 99 % {:.2e}, worst {:.2e}".format(*numbers)
 
 
 def main() -> None:
     numba.set_num_threads(1)
-    detector = Detector(**yaml.safe_load(Path(sys.argv[1]).read_text("utf-8")))
-    fields, settings = compute_fields(detector), SimulationSettings()
-    top = [fields.r_mm[-1], fields.r_mm[-1], fields.z_mm[-1]]
-    place = np.random.default_rng(0).uniform([-top[0], -top[1], 0], top, (N, 3))
-    hits = Hits.of(place, np.full(N, 500.0), np.arange(N + 1))
-    library = build_library(fields, settings)
+    fields, settings = compute_fields(read_detector("icpc")), SimulationSettings()
+    # compiled, or taken from the compiler's cache, before anything is timed
+    quick = settings.model_copy(update={"library_grid_mm": 20.0, "library_halvings": 0})
     for mode in ("exact", "library"):
-        simulate_events(fields, hits[:5], settings, mode, library=library)
-        start = time.perf_counter()
-        events = simulate_events(fields, hits, settings, mode, library=library)
-        seconds = time.perf_counter() - start
-        drifted = int((events.lost_kev == 0).sum())
-        print(f"{mode}: {drifted / seconds:.0f} pulses/s")
+        simulate_events(fields, random_events(fields, 10, 0), quick, mode)  # type: ignore[arg-type]
+
+    start = time.perf_counter()
+    library = build_library(fields, settings)
+    seconds = time.perf_counter() - start
+    megabytes = sum(np.asarray(part).nbytes for part in library) / 1e6
+    print(f"library: built in {seconds:.1f} s, {len(library.start)} pulses, {megabytes:.0f} MB")
+
+    hits = random_events(fields, LIBRARY_HITS, 1)
+    many, rate = timed(fields, hits, settings, mode="library", library=library)
+    share = many.counts["hits interpolated"] / (
+        many.counts["hits"] - many.counts["hits without signal"]
+    )
+    print(f"library: {rate:.0f} hits/s, {100 * share:.2f} % of the hits interpolated")
+
+    few = random_events(fields, EXACT_HITS, 2)
+    exact, rate = timed(fields, few, settings, mode="exact")
+    print(f"exact: {rate:.0f} hits/s")
+    interpolated, _ = timed(fields, few, settings, mode="library", library=library)
+    kept = exact.collected_kev > 0
+    pulses = [events.waveforms[kept].astype(float) for events in (interpolated, exact)]
+    rise = [np.diff(p, axis=1, prepend=0).max(axis=1) for p in pulses]
+    print(f"RMS of all samples: {np.sqrt(np.mean((pulses[0] - pulses[1]) ** 2)):.2e}")
+    print("RMS:", three(np.sqrt(np.mean((pulses[0] - pulses[1]) ** 2, axis=1))))
+    print("worst sample:", three(np.abs(pulses[0] - pulses[1]).max(axis=1)))
+    print("I_max, relative:", three(rise[0] / rise[1] - 1))
 
 
 if __name__ == "__main__":

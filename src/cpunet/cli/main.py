@@ -9,8 +9,10 @@ from types import FrameType
 
 import typer
 
+from cpunet.cli.fields import fields
 from cpunet.cli.info import info
 from cpunet.cli.messages import fail
+from cpunet.cli.simulate import simulate
 from cpunet.cli.train import train
 from cpunet.cli.translate import translate
 from cpunet.cli.validate import validate
@@ -22,7 +24,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for command in (train, translate, validate, info):
+for command in (simulate, fields, train, translate, validate, info):
     app.command()(command)
 
 

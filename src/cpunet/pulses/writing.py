@@ -130,6 +130,35 @@ class PulseWriter:
         lh5.write(block, name, self._file, group=group or "/", wo_mode="append")
         self.n_pulses += len(pulses)
 
+    def append_rows(self, table: str, columns: Columns) -> None:
+        """Add rows to another, flat table of the file, such as the hits of the events.
+
+        Parameters
+        ----------
+        table
+            Where in the file, as ``"geds/hits"``.
+        columns
+            Name → (array of shape ``(rows,)``, units); the same names each time.
+        """
+        if self._file is None:
+            raise ValueError("append_rows outside of the writer's with block")
+        rows = {name: (np.asarray(values), units) for name, (values, units) in columns.items()}
+        if len({values.shape for values, _ in rows.values()}) != 1:
+            raise CpunetError(f"{self.path}: columns of {table} differ in length")
+        group, _, name = table.strip("/").rpartition("/")
+        content = {
+            key: Array(values, attrs={"units": units} if units else {})
+            for key, (values, units) in rows.items()
+        }
+        if len(next(iter(content.values()))) > 0:
+            lh5.write(Table(content), name, self._file, group=group or "/", wo_mode="append")
+
+    def annotate(self, attrs: Mapping[str, str | float]) -> None:
+        """Add attributes to the table of pulses, once it holds some."""
+        if self._file is None or self._table not in self._file:
+            raise ValueError("annotate before any pulse was appended")
+        self._file[self._table].attrs.update(attrs)
+
     def _waveforms(self, pulses: Pulses) -> WaveformTable:
         n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
         values = ArrayOfEqualSizedArrays(

@@ -17,8 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 # siggen's rounded value, in all that is compared with it
 _SIGGEN_FWHM_PER_SIGMA = 2.355
-# kT/e is set to this in siggen (V mm/cm), after Jacoboni et al., PRB 24 (1981) 1014
-_SIGGEN_KT = 0.12
+# 2.355**2 kT/e in siggen (V mm/cm, rounded there), with kT/e 0.12 after Jacoboni et al.,
+# PRB 24 (1981) 1014
+_SIGGEN_DIFFUSION = 0.67
 _BOLTZMANN_V_PER_K = 8.617333e-5
 _SMALLEST_FWHM_MM = 0.01
 _MAX_REPULSION = 0.05
@@ -31,7 +32,7 @@ def diffusion_constant(mode: str, temperature_K: float) -> float:
     ``mode`` is ``"temperature"`` (Einstein relation, D = kT/e v/E) or ``"siggen"``.
     """
     if mode == "siggen":
-        return _SIGGEN_FWHM_PER_SIGMA**2 * _SIGGEN_KT
+        return _SIGGEN_DIFFUSION
     return FWHM_PER_SIGMA**2 * _BOLTZMANN_V_PER_K * temperature_K * 10.0
 
 

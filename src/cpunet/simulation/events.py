@@ -12,9 +12,10 @@ from numba import njit, prange
 
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
-from cpunet.simulation.drift import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import Library, build_library, covers, interpolate
+from cpunet.simulation.library import build_library
+from cpunet.simulation.library_lookup import Library, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import cloud_numbers, hit_table, point_signal, time_numbers
 from cpunet.simulation.velocity import FloatArray
@@ -23,8 +24,10 @@ Progress = Callable[[int, int], None]
 
 # Events between two calls of `progress`.
 _BLOCK = 2000
+# Events that one thread does at a time.
+_CHUNK = 25
 # Outcomes of a hit.
-_COLLECTED, _NO_SIGNAL, _NOT_COLLECTED = 0, 1, 2
+_COLLECTED, _NO_SIGNAL, _NOT_COLLECTED, _INTERPOLATED = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +81,7 @@ def simulate_events(
     mode: Literal["exact", "library"] = "exact",
     progress: Progress | None = None,
     library: Library | None = None,
+    library_progress: Progress | None = None,
 ) -> EventPulses:
     """Simulate the pulse of each event, in parallel over the events.
 
@@ -85,11 +89,13 @@ def simulate_events(
     ----------
     mode
         ``"exact"`` drifts every hit; ``"library"`` interpolates between pre-computed
-        pulses, and drifts only hits at the edge of the detector and near its contact.
+        pulses, and drifts only hits where these were found not to be good enough.
     progress
         Called now and then with the numbers of events done and in all.
     library
         Pre-computed pulses of the same fields and settings; built if not given.
+    library_progress
+        Called while they are built; see `build_library`.
 
     Raises
     ------
@@ -97,10 +103,10 @@ def simulate_events(
         If a hit's place or energy is no finite number.
     """
     table = hit_table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
-    use_library = mode == "library"
-    if library is None:
-        grid = {} if use_library else {"library_grid_mm": 1e4}
-        library = build_library(fields, settings.model_copy(update=grid))
+    if mode == "exact":
+        library = None
+    elif library is None:
+        library = build_library(fields, settings, library_progress)
     maps = drift_maps(fields)
     n = hits.n_events
     waveforms = np.zeros((n, settings.n_samples), np.float32)
@@ -111,18 +117,11 @@ def simulate_events(
         end = min(begin + _BLOCK, n)
         part = slice(begin, end)
         offsets = hits.offsets[begin : end + 1]
-        _sum_hits(
-            maps,
-            library,
-            use_library,
-            table,
-            offsets,
-            cloud,
-            times,
-            waveforms[part],
-            lost_kev[part],
-            outcome,
-        )
+        sums = (waveforms[part], lost_kev[part], outcome)
+        if library is None:
+            _sum_exact(maps, table, offsets, cloud, times, *sums)
+        else:
+            _sum_library(maps, library, table, offsets, cloud, times, *sums)
         if progress:
             progress(end, n)
     energy = hits.energy_kev
@@ -134,6 +133,7 @@ def simulate_events(
         event_number=hits.event_number,
         counts={
             "hits": len(table),
+            "hits interpolated": int((outcome == _INTERPOLATED).sum()),
             "hits without signal": int((outcome == _NO_SIGNAL).sum()),
             "hits not collected within the record": int((outcome == _NOT_COLLECTED).sum()),
             "events": n,
@@ -143,10 +143,8 @@ def simulate_events(
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _sum_hits(
+def _sum_exact(
     maps: DriftMaps,
-    library: Library,
-    use_library: bool,
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
     cloud: tuple[float, float, float, bool],
@@ -155,13 +153,9 @@ def _sum_hits(
     lost_kev: FloatArray,
     outcome: npt.NDArray[np.int8],
 ) -> None:
-    step_ns, per_sample = times
-    n_samples = waveforms.shape[1]
-    coarse = max(1, round(per_sample * step_ns / library.step_ns))
     for event in prange(len(offsets) - 1):
-        out = np.zeros(n_samples)
-        signal = np.empty(n_samples * per_sample)
-        short = np.empty(n_samples * coarse, np.float32)
+        out = np.zeros(waveforms.shape[1])
+        signal = np.empty(waveforms.shape[1] * times[1])
         lost = collected = 0.0
         for i in range(offsets[event], offsets[event + 1]):
             hit = hits[i]
@@ -170,16 +164,66 @@ def _sum_hits(
                 lost += hit[3]
                 continue
             collected += hit[3]
-            if use_library and covers(library, hit[0], hit[1], hit[2]):
-                last, fwhm_ns = interpolate(library, hit, short)
-                sigma = fwhm_ns / library.step_ns / FWHM_PER_SIGMA
-                smear_and_sample(short, coarse, sigma, last, hit[3], out)
-                continue
-            last, arrived, fwhm = point_signal(maps, hit, cloud, step_ns, signal)
-            if not arrived:
-                outcome[i] = _NOT_COLLECTED
-            smear_and_sample(signal, per_sample, fwhm / FWHM_PER_SIGMA, last, hit[3], out)
+            outcome[i] = _add_drifted(maps, hit, cloud, times, signal, out)
         lost_kev[event] = lost
         if collected > 0.0:
-            for j in range(n_samples):
-                waveforms[event, j] = out[j] / collected
+            waveforms[event] = out / collected
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sum_library(
+    maps: DriftMaps,
+    library: Library,
+    hits: FloatArray,
+    offsets: npt.NDArray[np.int64],
+    cloud: tuple[float, float, float, bool],
+    times: tuple[float, int],
+    waveforms: npt.NDArray[np.float32],
+    lost_kev: FloatArray,
+    outcome: npt.NDArray[np.int8],
+) -> None:
+    n_events, n_samples = waveforms.shape
+    # work arrays serve a chunk of events
+    for chunk in prange((n_events + _CHUNK - 1) // _CHUNK):
+        out = np.empty(n_samples)
+        quick = np.empty(n_samples, np.float32)
+        steps = np.empty(n_samples + 1)
+        signal = np.empty(n_samples * times[1])
+        for event in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n_events)):
+            out[:] = 0.0
+            quick[:] = 0.0
+            steps[:] = 0.0
+            lost = collected = 0.0
+            for i in range(offsets[event], offsets[event + 1]):
+                hit = hits[i]
+                if not in_active_volume(maps, hit[0], hit[1], hit[2]):
+                    outcome[i] = _NO_SIGNAL
+                    lost += hit[3]
+                    continue
+                collected += hit[3]
+                if covers(library, hit[0], hit[1], hit[2], hit[3]):
+                    outcome[i] = _INTERPOLATED
+                    add_pulse(library, hit, hit[3], 0, quick, steps)
+                else:
+                    outcome[i] = _add_drifted(maps, hit, cloud, times, signal, out)
+            lost_kev[event] = lost
+            if collected > 0.0:
+                share, flat = 1.0 / collected, 0.0
+                for j in range(n_samples):
+                    flat += steps[j]
+                    waveforms[event, j] = (out[j] + quick[j] + flat) * share
+
+
+@njit(cache=True, nogil=True)
+def _add_drifted(
+    maps: DriftMaps,
+    hit: FloatArray,
+    cloud: tuple[float, float, float, bool],
+    times: tuple[float, int],
+    signal: FloatArray,
+    out: FloatArray,
+) -> int:
+    """Add the pulse of one drifted hit to `out`; gives its outcome."""
+    last, arrived, fwhm = point_signal(maps, hit, cloud, times[0], signal)
+    smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, hit[3], out)
+    return _COLLECTED if arrived else _NOT_COLLECTED

@@ -42,8 +42,10 @@ class Detector(Config):
     ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``;
     it is negative for p-type germanium.
 
-    ``siggen_conventions`` places the lithium boundary on tapers, and charge in the
-    ditch, as fieldgen does, so that its maps can be compared with.
+    ``siggen_conventions`` places the lithium boundary on tapers, the ditch's walls (half
+    a grid step wider) and charge in the ditch as fieldgen does, so that pulses agree with
+    siggen's.  Without them the geometry is met exactly: docs/simulation.md has the
+    difference that it makes.
     """
 
     name: str = ""
@@ -77,7 +79,7 @@ class Detector(Config):
     bias_V: Positive
     temperature_K: Annotated[float, Field(ge=40, le=120)]
     grid_mm: Annotated[float, Field(ge=0.02, le=1)] = 0.1
-    siggen_conventions: bool = False
+    siggen_conventions: bool = True
 
     @model_validator(mode="after")
     def _is_possible(self) -> Detector:

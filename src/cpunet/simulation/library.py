@@ -1,232 +1,223 @@
-"""Pre-computed pulses on a grid in r, z and azimuth, and interpolation between them.
+"""Building the library of pre-computed pulses, and checking it against the exact drift.
 
-Cubic symmetry leaves azimuths from 0 to 45 degrees.  Pulses of neighbouring grid points
-are shifted to a common half-height time before they are averaged, and that time is
-interpolated on its own, so that edges stay as steep as they are.
+A coarse grid of cells is laid over the detector.  Each cell's interpolated pulses are
+compared with drifted ones in its middle; cells that fail are halved, and what still fails
+in the finest ones is drifted hit by hit later on.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
-from numba import njit, prange
 
-from cpunet.simulation.drift import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps
+from cpunet.simulation.library_drift import (
+    MARGIN_NS,
+    IntArray,
+    Task,
+    bend,
+    compare,
+    drift_nodes,
+)
+from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, Library
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import cloud_numbers, point_signal
+from cpunet.simulation.signals import cloud_numbers
 from cpunet.simulation.velocity import FloatArray
 
-# Energies (keV) at which the width of a self-repelling cloud is tabulated.
-_ENERGIES_KEV = (0.0, 30.0, 100.0, 250.0, 500.0, 1000.0, 1750.0, 2650.0)
-# Grid points whose half-height times differ by more belong to different kinds of pulses
-# (collected along another path, or reaching half height by the other carrier).
-_MAX_SPREAD_NS_PER_MM = 60.0
+Progress = Callable[[int, int], None]
+
+# Energies of the pulses of a self-repelling cloud: Chebyshev points of the squared width.
+_ENERGIES_KEV = (0.0, 430.0, 1820.0, 2700.0)
+# Places between two calls of `progress`.
+_BLOCK = 256
+_CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 
 
-class Library(NamedTuple):
-    """Pulses of point charges at grid nodes (r, z, azimuth).
+class _Meter:
+    """Counts places done; their number grows as cells are halved."""
 
-    ``pulses`` is (nr, nz, na, samples), block means of ``step_ns``; ``half_ns`` the time
-    of half height and ``last`` the sample from which on a pulse is flat, (nr, nz, na);
-    ``fwhm_ns`` (nr, nz, na, energies) the duration of the cloud; ``known`` (nr, nz) the
-    nodes with pulses.  Azimuths are equidistant in cos 4 phi.
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._done = self._total = 0
+
+    def blocks(self, n: int) -> list[slice]:
+        self._total += n
+        return [slice(b, min(b + _BLOCK, n)) for b in range(0, n, _BLOCK)]
+
+    def add(self, block: slice) -> None:
+        self._done += block.stop - block.start
+        if self._progress:
+            self._progress(self._done, self._total)
+
+
+def build_library(
+    fields: Maps, settings: SimulationSettings, progress: Progress | None = None
+) -> Library:
+    """Simulate pulses on a grid that is as fine as its own checks demand, in parallel.
+
+    In the middle of each cell, at azimuths between those of its nodes, the interpolated
+    pulse is compared with a drifted one.  Where samples differ by more than
+    ``library_tolerance`` of full scale, or the largest rise in one sample by more than
+    that relative to itself, the cell is halved, up to ``library_halvings`` times.
+
+    Parameters
+    ----------
+    fields
+        Field maps of the detector.
+    settings
+        What is to be simulated, and the `library_...` settings.
+    progress
+        Called with the numbers of places done and known so far; the second grows.
     """
+    maps, task = drift_maps(fields), _task(fields, settings)
+    library = _empty(fields, settings)
+    meter = _Meter(progress)
+    size = 2**settings.library_halvings
+    nr, nz = library.cell.shape
+    cells = size * _lattice(nr // size, nz // size)
+    while size > 0:
+        library = _with_nodes(library, maps, task, _new_corners(library, cells, size), meter)
+        complete, halved = _sorted(library, cells, size)
+        library = _with_cells(library, complete, size)
+        worst = _deviations(library, maps, task, complete + size / 2, meter)
+        bad = complete[worst > settings.library_tolerance]
+        _enter(library.cell, bad, size, np.zeros(len(bad), np.int64))
+        size //= 2
+        cells = np.concatenate([halved, bad])
+        cells = (cells[:, None] + size * _CORNERS).reshape(-1, 2)
+    return library
 
-    pulses: npt.NDArray[np.float32]
-    half_ns: FloatArray
-    last: npt.NDArray[np.int64]
-    fwhm_ns: FloatArray
-    energies_kev: FloatArray
-    known: npt.NDArray[np.bool_]
-    per_mm: float
-    step_ns: float
-    core_mm: float
 
-
-def build_library(fields: Maps, settings: SimulationSettings) -> Library:
-    """Simulate a pulse at every node of the library's grid, in parallel.
-
-    Times scale with the number of nodes: seconds for a large detector at 1 mm.
-    """
-    maps = drift_maps(fields)
-    shape = [
-        math.floor((n - 1) * fields.grid_mm / settings.library_grid_mm) + 2
-        for n in fields.potential_V.shape
-    ]
-    nodes = (shape[0], shape[1], settings.library_angles)
-    group = round(settings.library_step_ns / settings.step_ns)
-    energies = np.array(_ENERGIES_KEV if settings.self_repulsion else _ENERGIES_KEV[:1])
-    library = Library(
-        pulses=np.zeros((*nodes, settings.n_steps // group), np.float32),
-        half_ns=np.zeros(nodes),
-        last=np.zeros(nodes, np.int64),
-        fwhm_ns=np.zeros((*nodes, len(energies))),
-        energies_kev=energies,
-        known=np.zeros(nodes[:2], np.bool_),
-        per_mm=1 / settings.library_grid_mm,
-        step_ns=settings.library_step_ns,
-        core_mm=settings.library_core_mm,
+def _task(fields: Maps, settings: SimulationSettings) -> Task:
+    start, diffusion, repulsion, siggen = cloud_numbers(fields, settings)
+    return Task(
+        cloud_fwhm_mm=start,
+        diffusion=diffusion,
+        repulsion=repulsion,
+        rounding=1.0 if siggen else 0.0,
+        step_ns=settings.step_ns,
+        per_sample=settings.steps_per_sample,
+        n_samples=settings.n_samples,
     )
-    _fill(library, maps, cloud_numbers(fields, settings), settings.step_ns, group)
-    longest = int(library.last.max()) + 2
-    return library._replace(pulses=np.ascontiguousarray(library.pulses[..., :longest]))
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _fill(
-    library: Library,
-    maps: DriftMaps,
-    cloud: tuple[float, float, float, bool],
-    step_ns: float,
-    group: int,
-) -> None:
-    for row in prange(library.known.shape[0]):
-        _fill_row(library, row, maps, cloud, step_ns, group)
+def _empty(fields: Maps, settings: SimulationSettings) -> Library:
+    finest = settings.library_grid_mm / 2**settings.library_halvings
+    nr, nz = (
+        2**settings.library_halvings
+        * math.ceil((n - 1) * fields.grid_mm / settings.library_grid_mm)
+        for n in fields.potential_V.shape
+    )
+    energies = _ENERGIES_KEV if settings.self_repulsion else _ENERGIES_KEV[:1]
+    return Library(
+        pulses=np.zeros(0, np.float32),
+        start=np.zeros(0, np.int64),
+        samples=np.zeros(0, np.int64),
+        half_ns=np.zeros(0),
+        final=np.zeros(0, np.float32),
+        cell=np.zeros((nr, nz), np.int64),
+        number=np.zeros((nr, nz), np.int64),
+        bend_ns=np.zeros((0, 2, settings.library_angles), np.float32),
+        column=np.full((nr + 1, nz + 1), UNTRIED, np.int64),
+        energies_kev=np.array(energies),
+        cos4=np.cos(np.linspace(0, np.pi, settings.library_angles)),
+        phases=_phases(settings),
+        margin=math.ceil(MARGIN_NS / settings.dt_ns) + 1,
+        dt_ns=settings.dt_ns,
+        per_mm=1 / finest,
+    )
 
 
-@njit(cache=True, nogil=True)
-def _fill_row(
-    library: Library,
-    row: int,
-    maps: DriftMaps,
-    cloud: tuple[float, float, float, bool],
-    step_ns: float,
-    group: int,
-) -> None:
-    _, nz, na, n = library.pulses.shape
-    signal = np.empty(n * group)
-    hit = np.zeros(4)
-    r = row / library.per_mm
-    for j in range(nz):
-        hit[2] = j / library.per_mm
-        if not in_active_volume(maps, r, 0.0, hit[2]):
-            continue
-        library.known[row, j] = True
-        for k in range(na):
-            phi = math.acos(1.0 - 2.0 * k / (na - 1)) / 4.0
-            hit[0], hit[1] = r * math.cos(phi), r * math.sin(phi)
-            widths = library.fwhm_ns[row, j, k]
-            # the last energy's pulse is that of any: the cloud does not change it
-            for e in range(len(widths)):
-                hit[3] = library.energies_kev[e]
-                last, _, fwhm = point_signal(maps, hit, cloud, step_ns, signal)
-                widths[e] = fwhm * step_ns
-            library.last[row, j, k] = min(last // group + 1, n - 1)
-            library.half_ns[row, j, k] = _half_time(signal) * step_ns
-            for m in range(n):
-                library.pulses[row, j, k, m] = signal[m * group : (m + 1) * group].mean()
+def _phases(settings: SimulationSettings) -> int:
+    """Fine samples per sample: whole steps each, none longer than asked for."""
+    per_sample = settings.steps_per_sample
+    wanted = settings.dt_ns / settings.library_step_ns - 1e-9
+    return next(
+        n
+        for n in range(1, per_sample + 1)
+        if (per_sample % n == 0 and n >= wanted) or n == per_sample
+    )
 
 
-@njit(cache=True, nogil=True)
-def _half_time(signal: FloatArray) -> float:
-    """Step, with its fraction, at which a pulse first passes half its final height."""
-    half = 0.5 * signal[len(signal) - 1]
-    for k in range(1, len(signal)):
-        if signal[k] >= half and signal[k] > signal[k - 1]:
-            return float(k - (signal[k] - half) / (signal[k] - signal[k - 1]))
-    return 0.0
+def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
+    """Corners (n, 2) of cells at which no charge has been drifted yet."""
+    new = np.zeros(library.column.shape, np.bool_)
+    new[tuple((cells[:, None] + size * _CORNERS).reshape(-1, 2).T)] = True
+    return np.argwhere(new & (library.column == UNTRIED))
 
 
-@njit(cache=True, nogil=True)
-def covers(library: Library, x: float, y: float, z: float) -> bool:
-    """Whether all nodes around a place have pulses and the contact is far enough."""
-    r = math.hypot(x, y)
-    if z < 0.0 or r * r + z * z < library.core_mm**2:
-        return False
-    i, j = int(r * library.per_mm), int(z * library.per_mm)
-    nr, nz = library.known.shape
-    if i + 1 >= nr or j + 1 >= nz:
-        return False
-    known = library.known
-    if not (known[i, j] and known[i + 1, j] and known[i, j + 1] and known[i + 1, j + 1]):
-        return False
-    half = library.half_ns
-    for k in range(half.shape[2]):
-        a, b, c, d = half[i, j, k], half[i + 1, j, k], half[i, j + 1, k], half[i + 1, j + 1, k]
-        if (max(a, b, c, d) - min(a, b, c, d)) * library.per_mm > _MAX_SPREAD_NS_PER_MM:
-            return False
-    return True
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def interpolate(
-    library: Library, hit: FloatArray, signal: npt.NDArray[np.float32]
-) -> tuple[int, float]:
-    """Fill `signal` with the pulse of a point charge at a hit that `covers` accepts.
-
-    Returns the sample from which on it is flat, and the duration (FWHM, ns) of its cloud.
-    """
-    x, y, z = hit[0], hit[1], hit[2]
-    r = math.hypot(x, y)
-    p, q = r * library.per_mm, z * library.per_mm
-    i, j = int(p), int(q)
-    u, v = p - i, q - j
-    # cos 4 phi = 8 c^4 - 8 c^2 + 1 with c = x / r
-    c2 = x * x / (r * r) if r > 0.0 else 1.0
-    s = 4.0 * c2 * (1.0 - c2) * (library.half_ns.shape[2] - 1)
-    k = min(int(s), library.half_ns.shape[2] - 2)
-    w = s - k
-    e, part = _energy_row(library.energies_kev, hit[3])
-    half, fwhm = 0.0, 0.0
-    for corner in range(8):
-        di, dj, dk = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (u if di else 1 - u) * (v if dj else 1 - v) * (w if dk else 1 - w)
-        half += weight * library.half_ns[i + di, j + dj, k + dk]
-        widths = library.fwhm_ns[i + di, j + dj, k + dk]
-        upper = min(e + 1, len(widths) - 1)
-        fwhm += weight * ((1 - part) * widths[e] + part * widths[upper])
-    end = 0
-    for corner in range(8):
-        di, dj, dk = corner & 1, (corner >> 1) & 1, corner >> 2
-        shift = (library.half_ns[i + di, j + dj, k + dk] - half) / library.step_ns
-        end = max(end, library.last[i + di, j + dj, k + dk] - math.floor(shift))
-    end = min(end, len(signal) - 1)
-    signal[: end + 1] = 0.0
-    for corner in range(8):
-        di, dj, dk = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (u if di else 1 - u) * (v if dj else 1 - v) * (w if dk else 1 - w)
-        shift = (library.half_ns[i + di, j + dj, k + dk] - half) / library.step_ns
-        _add_shifted(
-            library.pulses[i + di, j + dj, k + dk],
-            np.float32(weight),
-            shift,
-            library.last[i + di, j + dj, k + dk],
-            signal[: end + 1],
+def _with_nodes(
+    library: Library, maps: DriftMaps, task: Task, places: IntArray, meter: _Meter
+) -> Library:
+    """The library with columns of pulses at more places (n, 2), in fine steps."""
+    azimuths = len(library.cos4)
+    longest = library.margin + task.n_samples
+    rows = len(library.energies_kev) * library.phases
+    pulses, found = [library.pulses], []
+    n_columns = len(library.samples) // azimuths
+    for block in meter.blocks(len(places)):
+        here = places[block]
+        scratch = np.empty((len(here) * azimuths, rows, longest), np.float32)
+        facts = np.zeros((len(here) * azimuths, 4))
+        drift_nodes(library, maps, task, here, scratch, facts)
+        state = facts[:, 0].reshape(-1, azimuths).min(axis=1)
+        stored = state >= 0
+        library.column[tuple(here.T)] = np.where(
+            stored, n_columns + np.cumsum(stored) - 1, state.astype(np.int64)
         )
-    signal[end + 1 :] = signal[end]
-    return end, fwhm
+        n_columns += int(stored.sum())
+        kept = np.repeat(stored, azimuths)
+        facts, scratch = facts[kept], scratch[kept]
+        within = np.arange(longest) < facts[:, 1, None]
+        pulses.append(scratch[np.broadcast_to(within[:, None], scratch.shape)])
+        found.append(facts)
+        meter.add(block)
+    new = np.concatenate([np.zeros((0, 4)), *found])
+    samples = np.concatenate([library.samples, new[:, 1].astype(np.int64)])
+    return library._replace(
+        pulses=np.concatenate(pulses),
+        start=np.cumsum(samples * rows) - samples * rows,
+        samples=samples,
+        half_ns=np.concatenate([library.half_ns, new[:, 2]]),
+        final=np.concatenate([library.final, new[:, 3].astype(np.float32)]),
+    )
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _add_shifted(
-    pulse: npt.NDArray[np.float32],
-    weight: np.float32,
-    shift: float,
-    last: int,
-    signal: npt.NDArray[np.float32],
-) -> None:
-    """Add `weight` times `pulse`, read `shift` samples later, to `signal`."""
-    base = math.floor(shift)
-    w1 = np.float32(weight * (shift - base))
-    w0 = np.float32(weight) - w1
-    n = len(signal)
-    begin = min(max(0, -base), n)
-    flat = min(max(last - base, begin), n)
-    for m in range(flat - begin):
-        signal[begin + m] += w0 * pulse[begin + base + m] + w1 * pulse[begin + base + m + 1]
-    final = weight * pulse[len(pulse) - 1]
-    for m in range(flat, n):
-        signal[m] += final
+def _sorted(library: Library, cells: IntArray, size: int) -> tuple[IntArray, IntArray]:
+    """Cells with pulses at all corners, and those at an edge, which are to be halved."""
+    corners = library.column[tuple(np.moveaxis(cells[:, None] + size * _CORNERS, -1, 0))]
+    known, outside, late = corners >= 0, corners == OUTSIDE, corners == LATE
+    # what is late stays late in smaller cells
+    return cells[known.all(1)], cells[known.any(1) & outside.any(1) & ~late.any(1)]
 
 
-@njit(cache=True, nogil=True)
-def _energy_row(energies: FloatArray, energy: float) -> tuple[int, float]:
-    if len(energies) == 1:
-        return 0, 0.0
-    row = 0
-    while row < len(energies) - 2 and energies[row + 1] <= energy:
-        row += 1
-    return row, (energy - energies[row]) / (energies[row + 1] - energies[row])
+def _with_cells(library: Library, cells: IntArray, size: int) -> Library:
+    """The library with cells in which pulses are interpolated."""
+    _enter(library.cell, cells, size, np.full(len(cells), size))
+    _enter(library.number, cells, size, len(library.bend_ns) + np.arange(len(cells)))
+    bends = np.zeros((len(cells), *library.bend_ns.shape[1:]), np.float32)
+    bend(library, cells, size, bends)
+    return library._replace(bend_ns=np.concatenate([library.bend_ns, bends]))
+
+
+def _deviations(
+    library: Library, maps: DriftMaps, task: Task, places: FloatArray, meter: _Meter
+) -> FloatArray:
+    worst = np.zeros(len(places))
+    for block in meter.blocks(len(places)):
+        compare(library, maps, task, places[block], worst[block])
+        meter.add(block)
+    return worst
+
+
+def _enter(table: IntArray, cells: IntArray, size: int, values: IntArray) -> None:
+    """Give all fine cells of each cell its value."""
+    inside = cells[:, None] + _lattice(size, size)
+    table[tuple(np.moveaxis(inside, -1, 0))] = values[:, None]
+
+
+def _lattice(nr: int, nz: int) -> IntArray:
+    """All pairs (nr * nz, 2) of whole numbers from 0."""
+    return np.indices((nr, nz)).reshape(2, -1).T.astype(np.int64)

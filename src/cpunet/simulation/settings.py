@@ -29,12 +29,17 @@ class SimulationSettings(Config):
         Width of the charge cloud when it is set free.
     self_repulsion
         Let the cloud grow by the repulsion of its charges, hit by hit.
-    library_grid_mm, library_angles, library_step_ns
-        Spacing in r and z, number of azimuths between 0 and 45 degrees and sampling of
-        the pre-computed pulses.
-    library_core_mm
-        Within this distance of the contact's centre, where pulses change from one grid
-        point to the next, the library is not used.
+    library_grid_mm, library_halvings
+        Spacing in r and z of the coarsest pre-computed pulses, and how often a cell of
+        them is halved where it is not good enough.
+    library_angles
+        Number of azimuths from 0 to 45 degrees.
+    library_step_ns
+        Longest sampling of the pre-computed pulses; that of the pulses if it is shorter.
+    library_tolerance
+        What a cell may be wrong by in its middle: any sample, of full scale, and the
+        largest rise in one sample, relative to itself.  Where cells of the smallest size
+        miss it, hits are drifted.
     """
 
     step_ns: Positive = 1.0
@@ -44,10 +49,11 @@ class SimulationSettings(Config):
     diffusion_constant: Literal["temperature", "siggen"] = "temperature"
     cloud_fwhm_mm: NonNegative = 0.1
     self_repulsion: bool = False
-    library_grid_mm: Positive = 1.0
-    library_angles: Annotated[int, Field(ge=2)] = 5
-    library_step_ns: Positive = 2.0
-    library_core_mm: NonNegative = 10.0
+    library_grid_mm: Positive = 2.0
+    library_halvings: Annotated[int, Field(ge=0, le=6)] = 4
+    library_angles: Annotated[int, Field(ge=2)] = 6
+    library_step_ns: Positive = 4.0
+    library_tolerance: Positive = 0.005
 
     @property
     def n_steps(self) -> int:
@@ -66,16 +72,9 @@ class SimulationSettings(Config):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:
-        for name, whole, part in (
-            ("dt_ns", self.dt_ns, self.step_ns),
-            ("library_step_ns", self.library_step_ns, self.step_ns),
-            ("dt_ns", self.dt_ns, self.library_step_ns),
-        ):
-            ratio = whole / part
-            if name == "dt_ns" and part == self.library_step_ns and ratio < 1:
-                continue
-            if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
-                raise ValueError(f"{name} must be a multiple of {part} ns")
+        ratio = self.dt_ns / self.step_ns
+        if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
+            raise ValueError(f"dt_ns must be a multiple of {self.step_ns} ns")
         if self.length_ns < self.dt_ns:
             raise ValueError("length_ns must be at least dt_ns")
         return self

@@ -16,7 +16,8 @@ from cpunet.simulation.cloud import (
     smear_and_sample,
     starting_fwhm_mm,
 )
-from cpunet.simulation.drift import DriftMaps, Maps, drift, drift_maps, in_active_volume
+from cpunet.simulation.drift import drift
+from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
 

@@ -38,7 +38,9 @@ def of_detector(
     names = ", ".join(map(str, there))
     if detector is None:
         if len(there) > 1:
-            raise CpunetError(f"{path}: holds detectors {names}; give detector as one of them")
+            raise CpunetError(
+                f"{path}: holds detectors {names}; give detector (--hits-detector) as one"
+            )
         return steps
     if not detector.lstrip("-").isdigit() or int(detector) not in there:
         raise CpunetError(f"{path}: no detector {detector}; it holds {names}")

@@ -9,6 +9,7 @@ import h5py
 from cpunet.errors import CpunetError
 from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
+from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
 from cpunet.simulation.hit_readers.npz import read_npz
 from cpunet.simulation.hit_readers.remage import read_remage
 from cpunet.simulation.hit_readers.steps import ReadHits, Steps, Transform, Units, to_hits
@@ -28,9 +29,10 @@ def read_hits(
 ) -> ReadHits:
     """Read the energy deposits of one detector.
 
-    Formats: remage LH5 (``stp`` tables; the origin in ``detector_origins`` is
-    subtracted), g4simple HDF5 and CSV ntuples (MeV and mm, Geant4's own), other Geant4
-    CSV ntuples, and NPZ with ``x_mm``, ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``.
+    Formats: the hits kept beside simulated pulses (``geds/hits``), remage LH5 (``stp``
+    tables; the origin in ``detector_origins`` is subtracted), g4simple HDF5 and CSV
+    ntuples (MeV and mm, Geant4's own), other Geant4 CSV ntuples, and NPZ with ``x_mm``,
+    ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``.
 
     Parameters
     ----------
@@ -78,11 +80,14 @@ def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
         with h5py.File(path, "r") as file:
             if NTUPLE in file:
                 return read_g4simple(path, file[NTUPLE], detector)
-            is_remage = "stp" in file
+            is_remage, is_kept = "stp" in file, TABLE in file
     except OSError as error:
         raise CpunetError(f"{path}: not a readable HDF5 file; is it truncated?") from error
     if is_remage:
         return read_remage(path, detector, units)
+    if is_kept:
+        return read_hit_table(path, units)
     raise CpunetError(
-        f"{path}: HDF5 without hits; expected a group stp (remage) or {NTUPLE} (g4simple)"
+        f"{path}: HDF5 without hits; expected stp (remage), {TABLE} (cpunet simulate) or "
+        f"{NTUPLE} (g4simple)"
     )

@@ -48,7 +48,9 @@ def _detector(path: Path, detector: str | None) -> str:
     names = ", ".join(there)
     if detector is None:
         if len(there) != 1:
-            raise CpunetError(f"{path}: holds detectors {names}; give detector as one of them")
+            raise CpunetError(
+                f"{path}: holds detectors {names}; give detector (--hits-detector) as one"
+            )
         return there[0]
     if detector not in there:
         raise CpunetError(f"{path}: no detector {detector}; it holds {names}")

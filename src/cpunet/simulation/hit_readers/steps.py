@@ -109,7 +109,8 @@ def _factor(
 ) -> float:
     if unit is None:
         raise CpunetError(
-            f"{path}: column {column} names no unit; give {option} ({', '.join(known)})"
+            f"{path}: column {column} names no unit; give {option} "
+            f"(--{option.replace('_', '-')}): {', '.join(known)}"
         )
     if unit not in known:
         raise CpunetError(

@@ -1,0 +1,51 @@
+"""``cpunet fields``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+
+DetectorFile = Annotated[
+    str,
+    typer.Argument(
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
+        metavar="DETECTOR",
+    ),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+]
+Out = Annotated[Path | None, typer.Option("--out", help="Picture to make: .png, .pdf or .svg.")]
+Paths = Annotated[bool, typer.Option("--paths/--no-paths", help="Draw drift paths.")]
+
+
+def fields(
+    detector: DetectorFile,
+    out_file: Out = None,
+    set_values: Set = None,
+    paths: Paths = True,
+    force: options.Force = False,
+) -> None:
+    """Solve for a detector's fields; tell its capacitance and depletion, and draw them.
+
+    Example: cpunet fields icpc --out icpc.png
+    """
+    from cpunet.jobs.fields import describe_fields
+    from cpunet.simulation.geometry_readers import read_detector
+
+    told = describe_fields(
+        read_detector(detector, set_values or ()),
+        out_file,
+        paths=paths,
+        force=force,
+        monitor=monitor(),
+    )
+    width = max(map(len, told))
+    for name, value in told.items():
+        out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)

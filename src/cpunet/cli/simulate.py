@@ -1,0 +1,305 @@
+"""``cpunet simulate``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+from cpunet.errors import CpunetError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from cpunet.jobs.hit_sources import HitSource, Window
+    from cpunet.jobs.simulate import Resolution
+    from cpunet.jobs.simulation_summary import Summary
+    from cpunet.recipes.schema import PeakConfig
+
+HITS, GAMMAS = "Hits from a file", "Hits from the built-in gamma Monte Carlo"
+PULSES, OUTPUT = "Pulses", "Output"
+
+DetectorFile = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
+    ),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+]
+Temperature = Annotated[
+    float | None, typer.Option("--temperature", help="Of the crystal in K; the detector's own.")
+]
+Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.", rich_help_panel=OUTPUT)]
+HitFileName = Annotated[
+    Path | None,
+    typer.Option(
+        "--hits",
+        help="remage LH5, g4simple or Geant4 CSV/HDF5, NPZ, or an earlier output.",
+        rich_help_panel=HITS,
+    ),
+]
+HitTable = Annotated[
+    str | None,
+    typer.Option(
+        "--hits-detector", help="Which of the file's detectors.", rich_help_panel=HITS
+    ),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        help="X,Y,Z in mm: the point contact's centre in the file's frame.",
+        rich_help_panel=HITS,
+    ),
+]
+FlipZ = Annotated[
+    bool,
+    typer.Option("--flip-z", help="The file's point contact is on top.", rich_help_panel=HITS),
+]
+LengthUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+EnergyUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+Events = Annotated[
+    str | None,
+    typer.Option(
+        help="N events of each peak, or FEP=10000,SEP=3000,1500-1580=500 (keV).",
+        rich_help_panel=GAMMAS,
+    ),
+]
+Peak = Annotated[
+    str | None,
+    typer.Option(
+        help="FEP,SEP,DEP or ranges in keV; with --hits, only these events (else all).",
+        show_default="FEP,SEP,DEP",
+    ),
+]
+WindowKev = Annotated[
+    float,
+    typer.Option(help="Half-width about a peak; wider ones bring the continuum with them."),
+]
+SourceHeight = Annotated[
+    float, typer.Option(help="Of the source above the crystal, mm.", rich_help_panel=GAMMAS)
+]
+SourceRadius = Annotated[
+    float, typer.Option(help="Of the source, a disc, mm.", rich_help_panel=GAMMAS)
+]
+Exact = Annotated[
+    bool | None,
+    typer.Option(
+        "--exact/--library",
+        help="Drift every hit, or interpolate between pulses of a grid (for many hits).",
+        show_default="exact below a million hits",
+        rich_help_panel=PULSES,
+    ),
+]
+ClusterMm = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        help="Merge hits nearer than this; 0.05 changes no sample by more than 0.001.",
+        rich_help_panel=PULSES,
+    ),
+]
+ResolutionText = Annotated[
+    str | None,
+    typer.Option(
+        "--resolution",
+        help="A,B: smear the energies written, FWHM² = A + B E in keV, as 0.5,0.0018.",
+        rich_help_panel=PULSES,
+    ),
+]
+SettingsFile = Annotated[
+    Path | None,
+    typer.Option("--settings", help="YAML file of all settings.", rich_help_panel=PULSES),
+]
+Dt = Annotated[
+    float | None,
+    typer.Option(
+        "--dt-ns", "--dt", help="Sampling period.", show_default="16", rich_help_panel=PULSES
+    ),
+]
+Length = Annotated[
+    float | None,
+    typer.Option(
+        "--length-ns",
+        "--length",
+        help="Length of the pulses.",
+        show_default="3600",
+        rich_help_panel=PULSES,
+    ),
+]
+Diffusion = Annotated[
+    bool | None,
+    typer.Option(
+        "--diffusion/--no-diffusion", show_default="diffusion", rich_help_panel=PULSES
+    ),
+]
+CloudFwhm = Annotated[
+    float | None,
+    typer.Option(
+        help="Width of the charge cloud at first.", show_default="0.1", rich_help_panel=PULSES
+    ),
+]
+SelfRepulsion = Annotated[
+    bool | None,
+    typer.Option(
+        "--self-repulsion/--no-self-repulsion",
+        show_default="no-self-repulsion",
+        rich_help_panel=PULSES,
+    ),
+]
+
+
+def simulate(
+    detector: DetectorFile,
+    out_file: Out,
+    hits: HitFileName = None,
+    events: Events = None,
+    peak: Peak = None,
+    window_kev: WindowKev = 0.5,
+    set_values: Set = None,
+    temperature: Temperature = None,
+    hits_detector: HitTable = None,
+    origin: Origin = None,
+    flip_z: FlipZ = False,
+    length_unit: LengthUnit = None,
+    energy_unit: EnergyUnit = None,
+    source_height_mm: SourceHeight = 20.0,
+    source_radius_mm: SourceRadius = 5.0,
+    settings_file: SettingsFile = None,
+    dt: Dt = None,
+    length: Length = None,
+    diffusion: Diffusion = None,
+    cloud_fwhm_mm: CloudFwhm = None,
+    self_repulsion: SelfRepulsion = None,
+    exact: Exact = None,
+    cluster_mm: ClusterMm = 0.05,
+    resolution: ResolutionText = None,
+    seed: options.Seed = 0,
+    force: options.Force = False,
+) -> None:
+    """Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.
+
+    Example: cpunet simulate --detector icpc --events FEP=10000,DEP=3000 --out sim.lh5
+
+    Example: cpunet simulate --detector V01.json --hits stp.lh5 --flip-z --out sim.lh5
+    """
+    from cpunet.jobs.hit_sources import GammaSource, HitFile, energy_windows
+    from cpunet.jobs.simulate import simulate_file
+    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.recipes import load_recipe
+    from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.hit_readers import Transform
+
+    if (hits is None) == (events is None):
+        raise CpunetError("give either --hits FILE or --events N (for the gamma Monte Carlo)")
+    peaks = load_recipe("small").peaks
+    source: HitSource
+    if hits is not None:
+        chosen = energy_windows(peak, peaks, window_kev) if peak else []
+        x, y, z = _numbers(origin or "0,0,0", 3, "--origin")
+        transform = Transform((x, y, z), flip_z)
+        source = HitFile(
+            hits, hits_detector, transform, length_unit, energy_unit, tuple(chosen)
+        )
+    else:
+        chosen, numbers = _wanted(str(events), peak, peaks, window_kev)
+        source = GammaSource(tuple(chosen), numbers, source_height_mm, source_radius_mm, seed)
+    overrides = [*(set_values or ())]
+    if temperature is not None:
+        overrides.append(f"temperature_K={temperature}")
+    values = {
+        "dt_ns": dt,
+        "length_ns": length,
+        "diffusion": diffusion,
+        "cloud_fwhm_mm": cloud_fwhm_mm,
+        "self_repulsion": self_repulsion,
+    }
+    summary = simulate_file(
+        read_detector(detector, overrides),
+        source,
+        out_file,
+        load_settings(settings_file, values),
+        windows=tuple(chosen or energy_windows(",".join(peaks), peaks, window_kev)),
+        mode="auto" if exact is None else "exact" if exact else "library",
+        cluster_mm=cluster_mm,
+        resolution=_resolution(resolution),
+        seed=seed,
+        force=force,
+        monitor=monitor(),
+    )
+    for line in summary_lines(summary):
+        out.print(f"{out_file}: {line}", markup=False, highlight=False, soft_wrap=True)
+
+
+def summary_lines(summary: Summary) -> list[str]:
+    """The summary of a simulation in words, for stdout."""
+    seconds = sum(summary.seconds.values())
+    spent = ", ".join(f"{name} {s:.1f}" for name, s in summary.seconds.items())
+    lines = ", ".join(f"{n} {name}" for name, n in summary.lines.items())
+    told = [
+        f"{summary.n_written} of {summary.n_events} events written ({lines} by collected "
+        f"energy); {summary.without_signal} without any signal",
+        f"{summary.hits} hits ({summary.hits_before_merging} before merging): "
+        f"{summary.hits_in_contacts} in contacts and the lithium layer, "
+        f"{summary.hits_outside} outside the crystal",
+        f"{summary.lost_kev / summary.energy_kev:.2%} of the energy lost there, in "
+        f"{summary.events_with_loss} events",
+        f"{summary.mode} pulses, {summary.n_events / seconds:.0f} events/s, "
+        f"{seconds:.1f} s: {spent}",
+    ]
+    if summary.not_collected:
+        told.insert(3, f"{summary.not_collected} hits not collected in full; lengthen --length")
+    return told
+
+
+def _wanted(
+    events: str, peak: str | None, peaks: Mapping[str, PeakConfig], window_kev: float
+) -> tuple[list[Window], tuple[int, ...]]:
+    """Windows and the events wanted in each, of ``"1000"`` or ``"FEP=1000,DEP=300"``."""
+    from cpunet.jobs.hit_sources import energy_windows
+
+    if "=" not in events:
+        windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
+        return windows, (_count(events),) * len(windows)
+    if peak is not None:
+        raise CpunetError(f"--events {events} names its peaks; leave out --peak")
+    pairs = [part.partition("=") for part in events.split(",")]
+    windows = energy_windows(",".join(name for name, _, _ in pairs), peaks, window_kev)
+    return windows, tuple(_count(number) for _, _, number in pairs)
+
+
+def _count(text: str) -> int:
+    # underscores and signs, which int() takes, are more likely slips
+    if not text.strip().isdecimal():
+        raise CpunetError(f"--events: {text!r} is no number of events; give N or FEP=N,DEP=M")
+    return int(text)
+
+
+def _numbers(text: str, n: int, option: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise CpunetError(f"{option} {text}: expected {n} numbers separated by commas")
+    return numbers
+
+
+def _resolution(text: str | None) -> Resolution | None:
+    from cpunet.jobs.simulate import Resolution
+
+    if text is None:
+        return None
+    noise, fano = _numbers(text, 2, "--resolution")
+    return Resolution(noise, fano)

@@ -1,0 +1,234 @@
+"""Where a simulation's hits come from, block by block: a file, or the gamma Monte Carlo."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_readers import Transform, read_hits
+from cpunet.simulation.hits import Hits
+
+BLOCK_EVENTS = 2000
+# Events of one round of the Monte Carlo, and gammas tried for each before it gives up: the
+# rarest windows, 1 keV of the continuum, take some ten thousand.
+_ROUND_EVENTS = 1000
+_GAMMAS_PER_EVENT = 100_000
+# Each round under way holds some ten MB of hits.
+_MOST_WORKERS = 8
+
+
+class Window(NamedTuple):
+    """Energies (keV) from `low_kev` to `high_kev`, both included, under a name."""
+
+    name: str
+    low_kev: float
+    high_kev: float
+
+
+def energy_windows(
+    text: str, peaks: Mapping[str, PeakConfig], half_width_kev: float
+) -> list[Window]:
+    """Windows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
+
+    Parameters
+    ----------
+    text
+        Names and ranges, separated by commas.
+    peaks
+        The lines known.
+    half_width_kev
+        Of the windows about the lines.
+
+    Raises
+    ------
+    CpunetError
+        If a part is neither a known line nor a range, or the half-width is not above 0.
+
+    Examples
+    --------
+    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
+    >>> [tuple(window) for window in energy_windows("FEP,1500-1580", lines, 0.5)]
+    [('FEP', 2614.0, 2615.0), ('1500-1580', 1500.0, 1580.0)]
+    """
+    if not half_width_kev > 0:
+        raise CpunetError(f"--window-kev {half_width_kev}: give a half-width above 0")
+    windows = []
+    for name in (part.strip() for part in text.split(",")):
+        chosen = parse_selection(name, peaks)
+        if chosen.chosen:
+            line = peaks[name].energy_kev
+            windows.append(Window(name, line - half_width_kev, line + half_width_kev))
+        else:
+            windows.append(Window(name, *chosen.ranges_kev[0]))
+    return windows
+
+
+@dataclass(frozen=True)
+class HitFile:
+    """Hits of a file, see `cpunet.simulation.hit_readers.read_hits`.
+
+    With `windows`, only events whose deposits add up to an energy in one of them.
+    """
+
+    path: Path
+    table: str | None = None
+    transform: Transform = field(default_factory=Transform)
+    length_unit: str | None = None
+    energy_unit: str | None = None
+    windows: tuple[Window, ...] = ()
+
+    def open(self, detector: Detector) -> OpenHits:
+        """Read the file.
+
+        Raises
+        ------
+        CpunetError
+            As `read_hits`; also if no event is in a window, or no hit in the crystal.
+        """
+        hits = read_hits(
+            self.path,
+            detector=self.table,
+            transform=self.transform,
+            length_unit=self.length_unit,
+            energy_unit=self.energy_unit,
+        ).hits
+        if self.windows:
+            hits = hits[_in_windows(hits.energy_kev, self.windows)]
+            if not hits.n_events:
+                names = ", ".join(window.name for window in self.windows)
+                raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
+        self._require_inside(hits, detector)
+        blocks = (hits[i : i + BLOCK_EVENTS] for i in range(0, hits.n_events, BLOCK_EVENTS))
+        return OpenHits(hits.n_events, blocks)
+
+    def provenance(self) -> dict[str, Any]:
+        """What the output tells of its hits."""
+        return {
+            "file": str(self.path),
+            "table": self.table,
+            "origin_mm": list(self.transform.origin_mm),
+            "flip_z": self.transform.flip_z,
+            "windows_kev": _by_name(self.windows),
+        }
+
+    def _require_inside(self, hits: Hits, detector: Detector) -> None:
+        if detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).any():
+            return
+        spans = (
+            f"{axis} {values.min():.4g} to {values.max():.4g}"
+            for axis, values in zip("xyz", (hits.x_mm, hits.y_mm, hits.z_mm), strict=True)
+        )
+        raise CpunetError(
+            f"{self.path}: all {len(hits.edep_kev)} hits lie outside {detector.name} "
+            f"(radius {detector.crystal_radius:g}, z 0 to {detector.crystal_length:g} mm); "
+            f"they span {', '.join(spans)} mm; move them with --origin and --flip-z"
+        )
+
+
+@dataclass(frozen=True)
+class GammaSource:
+    """Events of the built-in Monte Carlo: so many in each window of energy.
+
+    A disc of `radius_mm` lies `height_mm` above the crystal's top, see
+    `cpunet.simulation.gammas.simulate_gammas`.
+    """
+
+    windows: tuple[Window, ...]
+    events: tuple[int, ...]
+    height_mm: float
+    radius_mm: float
+    seed: int
+
+    def open(self, detector: Detector) -> OpenHits:
+        """Start the Monte Carlo.
+
+        Raises
+        ------
+        CpunetError
+            If no event is wanted; later as `simulate_gammas`.
+        """
+        total = sum(self.events)
+        if total < 1:
+            raise CpunetError("--events: no event is wanted; give at least 1")
+        return OpenHits(total, self._blocks(detector, -(-total // _ROUND_EVENTS)))
+
+    def provenance(self) -> dict[str, Any]:
+        """What the output tells of its hits."""
+        return {
+            "monte_carlo": "Tl-208, 2614.511 keV",
+            "windows_kev": _by_name(self.windows),
+            "events": {w.name: n for w, n in zip(self.windows, self.events, strict=True)},
+            "source_height_mm": self.height_mm,
+            "source_radius_mm": self.radius_mm,
+            "seed": self.seed,
+        }
+
+    def _blocks(self, detector: Detector, rounds: int) -> Iterator[Hits]:
+        """Rounds in parallel, in their order; as many ahead as there are cores.
+
+        Each round has a seed of its own, so that the events do not depend on the cores.
+        """
+        seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
+        workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS, rounds)
+        waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
+        pool = ThreadPoolExecutor(workers)
+        primaries = 0
+        try:
+            for i in range(rounds + workers):
+                if i < rounds:
+                    waiting.append(pool.submit(self._round, detector, i, rounds, int(seeds[i])))
+                if i >= workers:
+                    hits, statistics = waiting.popleft().result()
+                    yield replace(hits, event_number=hits.event_number + primaries)
+                    primaries += statistics.n_primaries
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _round(
+        self, detector: Detector, i: int, rounds: int, seed: int
+    ) -> tuple[Hits, GammaStatistics]:
+        wanted = {
+            w.name: WantedLine(w.low_kev, w.high_kev, n * (i + 1) // rounds - n * i // rounds)
+            for w, n in zip(self.windows, self.events, strict=True)
+        }
+        return simulate_gammas(
+            detector,
+            source_height_mm=self.height_mm,
+            source_radius_mm=self.radius_mm,
+            n_primaries=_GAMMAS_PER_EVENT * sum(line.events for line in wanted.values()),
+            seed=seed,
+            wanted=wanted,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class OpenHits:
+    """The number of events, and the events in blocks, to be taken once."""
+
+    n_events: int
+    blocks: Iterator[Hits]
+
+
+HitSource = HitFile | GammaSource
+
+
+def _in_windows(energy_kev: Any, windows: tuple[Window, ...]) -> Any:
+    # deposits add up to a line only within rounding, as float32 of some formats
+    inside = [(energy_kev >= w.low_kev) & (energy_kev <= w.high_kev) for w in windows]
+    return np.logical_or.reduce(inside)
+
+
+def _by_name(windows: tuple[Window, ...]) -> dict[str, tuple[float, float]]:
+    return {window.name: (window.low_kev, window.high_kev) for window in windows}

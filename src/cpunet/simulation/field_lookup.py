@@ -1,0 +1,212 @@
+"""Field maps as the drift looks them up: refined, extrapolated, bilinear in (r, z).
+
+Nodes inside a contact carry no field; the first layers of them are extrapolated from the
+germanium, so that a contact's surface lies where the potential reaches the contact's,
+between the nodes.  Maps coarser than a tenth of a millimetre are refined by cubic
+splines: bilinear steps would flatten the weighting potential beside the contact.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.interpolate import RectBivariateSpline
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry import DITCH
+from cpunet.simulation.velocity import FloatArray, velocity_table
+
+BoolArray = npt.NDArray[np.bool_]
+
+# Columns of `DriftMaps.values`.
+E_R, E_Z, WP, POTENTIAL = range(4)
+
+# Maps are refined to steps of at most this.
+_FINE_MM = 0.1
+# Nodes that splines see beyond the first ones in a contact, and beyond a mirror.
+_SPLINE_GHOSTS, _SPLINE_MIRROR = 8, 6
+
+
+class Maps(Protocol):
+    """What a drift needs of `cpunet.simulation.fields.FieldMaps`."""
+
+    @property
+    def grid_mm(self) -> float: ...
+    @property
+    def potential_V(self) -> FloatArray: ...
+    @property
+    def e_r_V_per_cm(self) -> FloatArray: ...
+    @property
+    def e_z_V_per_cm(self) -> FloatArray: ...
+    @property
+    def weighting_potential(self) -> FloatArray: ...
+    @property
+    def point_type(self) -> npt.NDArray[np.int8]: ...
+    @property
+    def temperature_K(self) -> float: ...
+
+
+class DriftMaps(NamedTuple):
+    """Field maps and velocities as the compiled loops want them.
+
+    ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential
+    (V); ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, and
+    ``ditch`` (nr, nz) the nodes that stop it.
+    """
+
+    values: FloatArray
+    usable: BoolArray
+    ditch: BoolArray
+    per_mm: float
+    bias_V: float
+    coefficients: FloatArray
+    fields_per_V_per_cm: float
+
+
+def drift_maps(fields: Maps) -> DriftMaps:
+    """Arrange maps for the drift: extrapolated into the contacts, refined if coarse.
+
+    Raises
+    ------
+    CpunetError
+        If no cell of the maps has a field.
+    """
+    stacked = np.stack(
+        [
+            fields.e_r_V_per_cm,
+            fields.e_z_V_per_cm,
+            fields.weighting_potential,
+            fields.potential_V,
+        ],
+        axis=-1,
+    ).astype(np.float64)
+    # nothing drifts in the ditch, and the field jumps at its walls
+    ditch = np.asarray(fields.point_type) == DITCH
+    with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
+    if not with_field.any():
+        raise CpunetError("the field maps hold no field; compute them again")
+    bias = float(np.nanmax(stacked[..., POTENTIAL]))
+    values, known = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
+    usable = _all_corners(known) & ~_all_corners(~with_field)
+    parts = math.ceil(fields.grid_mm / _FINE_MM - 1e-6)
+    if parts > 1:
+        for _ in range(_SPLINE_GHOSTS):
+            values, known = with_ghost_nodes(values, known)
+        values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
+        ditch = _nodes_of(np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_)))
+        usable = np.kron(usable, np.ones((parts, parts), np.bool_))
+    table = velocity_table(fields.temperature_K)
+    return DriftMaps(
+        values=np.ascontiguousarray(values),
+        usable=usable,
+        ditch=ditch,
+        per_mm=parts / fields.grid_mm,
+        bias_V=bias,
+        coefficients=table.coefficients,
+        fields_per_V_per_cm=table.fields_per_V_per_cm,
+    )
+
+
+def _all_corners(nodes: BoolArray) -> BoolArray:
+    """Cells (nr - 1, nz - 1) with all four corners in `nodes` (nr, nz)."""
+    return np.asarray(nodes[:-1, :-1] & nodes[1:, :-1] & nodes[:-1, 1:] & nodes[1:, 1:])
+
+
+def _nodes_of(cells: BoolArray) -> BoolArray:
+    """Nodes (nr, nz) at the corners of `cells` (nr - 1, nz - 1)."""
+    padded = np.pad(cells, 1)
+    return np.asarray(padded[1:, 1:] | padded[:-1, 1:] | padded[1:, :-1] | padded[:-1, :-1])
+
+
+def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
+    """Values (nr, nz, 4) on a grid `parts` times finer, by bicubic splines.
+
+    The axis is a mirror, and so is z = 0 if `mirror`: the field across it is odd.
+    """
+    n = _SPLINE_MIRROR
+    odd_r, odd_z = np.ones(4), np.ones(4)
+    odd_r[E_R] = odd_z[E_Z] = -1
+    values = np.concatenate([values[n:0:-1] * odd_r, values])
+    below = n if mirror else 0
+    if mirror:
+        values = np.concatenate([values[:, n:0:-1] * odd_z, values], axis=1)
+    r, z = np.arange(values.shape[0]) - n, np.arange(values.shape[1]) - below
+    fine_r = np.arange(r[-1] * parts + 1) / parts
+    fine_z = np.arange(z[-1] * parts + 1) / parts
+    splines = [RectBivariateSpline(r, z, values[..., k], s=0) for k in range(4)]
+    return np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
+
+
+def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Extrapolate linearly by one node along r and z, then around the corners.
+
+    Parameters
+    ----------
+    values
+        Array of shape ``(nr, nz, ...)``.
+    known
+        Boolean array (nr, nz): nodes with a value of their own.
+    """
+    for _ in range(2):
+        total = np.zeros_like(values)
+        ways = np.zeros(known.shape)
+        for axis in (0, 1):
+            for near, far in ((1, 2), (-1, -2)):
+                usable = _shifted(known, near, axis) & _shifted(known, far, axis) & ~known
+                guess = 2 * _shifted(values, near, axis) - _shifted(values, far, axis)
+                total[usable] += guess[usable]
+                ways += usable
+        found = ways > 0
+        filled = values.copy()
+        filled[found] = (total[found].T / ways[found]).T
+        values, known = filled, known | found
+    return values, known
+
+
+def _shifted(array: npt.NDArray[Any], by: int, axis: int) -> npt.NDArray[Any]:
+    """The array whose entry i is the old entry i + by; zeros come in at the end."""
+    out = np.zeros_like(array)
+    n = array.shape[axis]
+    target = slice(0, n - by) if by > 0 else slice(-by, n)
+    source = slice(by, n) if by > 0 else slice(0, n + by)
+    index = (slice(None),) * axis
+    out[(*index, target)] = array[(*index, source)]
+    return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, float, bool]:
+    """Field in r and z (V/cm), weighting potential, potential (V); False outside."""
+    p, q = r * maps.per_mm, z * maps.per_mm
+    i, j = int(p), int(q)
+    if not (p >= 0.0 and q >= 0.0) or i >= maps.usable.shape[0] or j >= maps.usable.shape[1]:
+        return 0.0, 0.0, 0.0, 0.0, False
+    if not maps.usable[i, j]:
+        return 0.0, 0.0, 0.0, 0.0, False
+    u, v = p - i, q - j
+    if maps.ditch[int(p + 0.5), int(q + 0.5)]:
+        return 0.0, 0.0, 0.0, 0.0, False
+    w00, w10, w01, w11 = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
+    m00, m10 = maps.values[i, j], maps.values[i + 1, j]
+    m01, m11 = maps.values[i, j + 1], maps.values[i + 1, j + 1]
+    er = w00 * m00[E_R] + w10 * m10[E_R] + w01 * m01[E_R] + w11 * m11[E_R]
+    ez = w00 * m00[E_Z] + w10 * m10[E_Z] + w01 * m01[E_Z] + w11 * m11[E_Z]
+    wp = w00 * m00[WP] + w10 * m10[WP] + w01 * m01[WP] + w11 * m11[WP]
+    potential = (
+        w00 * m00[POTENTIAL]
+        + w10 * m10[POTENTIAL]
+        + w01 * m01[POTENTIAL]
+        + w11 * m11[POTENTIAL]
+    )
+    return er, ez, min(max(wp, 0.0), 1.0), potential, True
+
+
+@njit(cache=True, nogil=True)
+def in_active_volume(maps: DriftMaps, x: float, y: float, z: float) -> bool:
+    """Whether a charge set free here drifts: germanium with a field, no contact."""
+    _, _, _, potential, usable = look_up(maps, math.hypot(x, y), z)
+    return usable and 0.0 < potential < maps.bias_V

@@ -1,0 +1,245 @@
+"""Simulating files: what is written, read back, counted, merged and left behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.hit_sources import GammaSource, HitFile, OpenHits, Window, energy_windows
+from cpunet.jobs.inputs import InputFile, load_simulated
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.simulate import Resolution, merge_hits, simulate_file
+from cpunet.jobs.simulation_settings import load_settings
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading import open_pulses
+from cpunet.recipes import load_recipe
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_readers import Transform, read_hits
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+
+SETTINGS = SimulationSettings(length_ns=1600)
+# in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
+PLACES = [[10, 0, 20], [12, 0, 25], [5, 0, 45.5], [5, 3, 45.6], [0, 0, 300]]
+HITS = Hits.of(PLACES, [1000, 600, 600, 2614.5, 500], [0, 1, 3, 4, 5], [7, 3, 20, 21])
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch) -> None:
+    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture(scope="module")
+def ppc() -> Detector:
+    return read_detector("ppc", ["grid_mm=0.5"])
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> HitFile:
+    return HitFile(npz(tmp_path / "hits.npz", HITS))
+
+
+def npz(path: Path, hits: Hits) -> Path:
+    """Hits as an archive of this kind holds them: events are numbered by their rows."""
+    columns = {"x_mm": hits.x_mm, "y_mm": hits.y_mm, "z_mm": hits.z_mm}
+    np.savez(path, **columns, edep_keV=hits.edep_kev, offsets=hits.offsets)
+    return path
+
+
+def gammas(**changed: object) -> GammaSource:
+    lines = energy_windows("FEP,SEP,DEP", load_recipe("small").peaks, 0.5)
+    source = GammaSource(tuple(lines), (30, 3, 3), height_mm=20, radius_mm=5, seed=4)
+    return replace(source, **changed)
+
+
+def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
+    out = tmp_path / "sim.lh5"
+    source = gammas()
+    summary = simulate_file(ppc, source, out, SETTINGS, windows=source.windows)
+    assert (summary.n_events, summary.mode) == (36, "exact")
+    assert summary.n_written + summary.without_signal == 36
+    assert summary.hits < summary.hits_before_merging
+    recipe = load_recipe("small")
+    selection = parse_selection("FEP", recipe.peaks)
+    used = load_simulated(InputFile(out), recipe, selection, Monitor()).prepared
+    assert len(used) >= summary.lines["FEP"] > 10
+    pulses = next(open_pulses(out).blocks())
+    assert pulses.waveforms.shape == (summary.n_written, 100)
+    assert pulses.dt_ns == 16
+    assert pulses.waveforms[:, -1] == pytest.approx(1, abs=1e-3)
+    assert len(np.unique(pulses.event_number)) == summary.n_written
+
+
+def test_events_do_not_depend_on_threads_but_on_the_seed(ppc, monkeypatch):
+    def numbers(source: GammaSource) -> list[float]:
+        return np.concatenate([b.edep_kev for b in source.open(ppc).blocks]).tolist()
+
+    monkeypatch.setattr("cpunet.jobs.hit_sources._ROUND_EVENTS", 10)
+    many = numbers(gammas())
+    monkeypatch.setattr("cpunet.jobs.hit_sources._MOST_WORKERS", 1)
+    assert numbers(gammas()) == many
+    assert numbers(gammas(seed=5)) != many
+
+
+def test_rounds_add_up_and_number_events_anew(ppc, monkeypatch):
+    monkeypatch.setattr("cpunet.jobs.hit_sources._ROUND_EVENTS", 10)
+    hits = Hits.concatenate(list(gammas().open(ppc).blocks))
+    energy = np.round(hits.energy_kev - 0.011, 1)
+    assert [int((energy == e).sum()) for e in (2614.5, 2103.5, 1592.5)] == [30, 3, 3]
+    assert np.all(np.diff(hits.event_number) > 0)
+
+
+def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
+    out = tmp_path / "sim.lh5"
+    summary = simulate_file(ppc, source, out, SETTINGS, cluster_mm=0)
+    # of the events with numbers 0 to 3 the last two leave no charge that moves
+    assert (summary.n_events, summary.n_written, summary.without_signal) == (4, 2, 2)
+    assert (summary.hits_outside, summary.hits_in_contacts) == (1, 2)
+    assert summary.lost_kev == pytest.approx(600 + 2614.5 + 500)
+    table = lh5.read("geds/sim", str(out))
+    assert table["energy"].nda.tolist() == [1000, 600]
+    assert table["lost_energy"].nda.tolist() == [0, 600]
+    assert table["lost_energy"].attrs["units"] == "keV"
+    assert table["event_number"].nda.tolist() == [0, 1]
+    assert table["n_hits"].nda.tolist() == [1, 2]
+
+
+def test_kept_hits_read_back_as_they_were(ppc, source, tmp_path: Path):
+    out, again = tmp_path / "sim.lh5", tmp_path / "again.lh5"
+    simulate_file(ppc, source, out, SETTINGS)
+    kept = read_hits(out).hits
+    assert np.array_equal(kept.position_mm, HITS[:2].position_mm)
+    assert np.array_equal(kept.edep_kev, HITS[:2].edep_kev)
+    assert np.array_equal(kept.offsets, HITS[:2].offsets)
+    table = lh5.read("geds/hits", str(out))
+    assert table["x"].attrs["units"] == "mm"
+    simulate_file(ppc, HitFile(out), again, SETTINGS)
+    first, second = (next(open_pulses(path).blocks()) for path in (out, again))
+    assert np.array_equal(first.waveforms, second.waveforms)
+
+
+def test_the_file_tells_how_it_was_made(ppc, source, tmp_path: Path):
+    out = tmp_path / "sim.lh5"
+    simulate_file(ppc, source, out, SETTINGS, seed=11)
+    with h5py.File(out) as file:
+        attributes = dict(file["geds/sim"].attrs)
+    made = json.loads(attributes["simulation"])
+    assert Detector.model_validate(made["detector"]) == ppc
+    assert SimulationSettings.model_validate(made["settings"]) == SETTINGS
+    assert (made["seed"], made["hits"]["file"]) == (11, str(source.path))
+    assert attributes["made_by"].startswith("cpunet simulate ")
+
+
+def test_resolution_changes_energies_and_nothing_else(ppc, source, tmp_path: Path):
+    sharp, broad = tmp_path / "sharp.lh5", tmp_path / "broad.lh5"
+    simulate_file(ppc, source, sharp, SETTINGS)
+    simulate_file(ppc, source, broad, SETTINGS, resolution=Resolution(1.0, 0.01))
+    first, second = (next(open_pulses(path).blocks()) for path in (sharp, broad))
+    assert np.array_equal(first.waveforms, second.waveforms)
+    assert np.all(first.energy_kev != second.energy_kev)
+    assert second.energy_kev == pytest.approx(first.energy_kev, abs=30)
+    true = lh5.read("geds/sim/true_energy", str(broad)).nda
+    assert np.array_equal(true, first.energy_kev)
+
+
+def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
+    # ppc's layer is 1 mm below the top at 46 mm: z = 44.99 is active, 45.01 is not
+    places = [[10, 0, 44.97], [10, 0, 45.01], [10, 0, 44.99], [10, 0, 20]]
+    merged = merge_hits(Hits.of(places, [100, 50, 300, 10], [0, 4, 4]), ppc, 0.05)
+    assert merged.edep_kev.tolist() == [400, 10, 50]
+    assert merged.z_mm == pytest.approx([44.985, 20, 45.01])
+    assert merged.offsets.tolist() == [0, 3, 3]
+
+
+def test_default_merging_changes_no_sample_by_a_permille(ppc, tmp_path: Path):
+    out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
+    simulate_file(ppc, gammas(events=(10, 0, 5)), out, SETTINGS, cluster_mm=0)
+    simulate_file(ppc, gammas(events=(10, 0, 5)), merged, SETTINGS)
+    first, second = (next(open_pulses(path).blocks()) for path in (out, merged))
+    assert np.abs(first.waveforms - second.waveforms).max() < 1e-3
+    assert first.energy_kev == pytest.approx(second.energy_kev)
+
+
+def test_only_events_in_the_windows_of_a_file(ppc, source, tmp_path: Path):
+    window = Window("low", 900, 1100)
+    chosen = replace(source, windows=(window,))
+    summary = simulate_file(ppc, chosen, tmp_path / "sim.lh5", SETTINGS, windows=(window,))
+    assert (summary.n_events, summary.lines) == (1, {"low": 1})
+    with pytest.raises(CpunetError, match="no event in none"):
+        replace(source, windows=(Window("none", 1, 2),)).open(ppc)
+
+
+def test_hits_all_outside_say_where_they_are(ppc, source):
+    away = replace(source, transform=Transform((0, 0, -500)))
+    with pytest.raises(CpunetError, match=r"5 hits lie outside ppc .* z 520 to 800 mm; move"):
+        away.open(ppc)
+
+
+def test_no_event_with_a_signal(ppc, tmp_path: Path):
+    dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
+    with pytest.raises(CpunetError, match="none of 1 events gives a signal"):
+        simulate_file(ppc, dead, tmp_path / "sim.lh5", SETTINGS)
+    assert not (tmp_path / "sim.lh5").exists()
+
+
+class Interrupted:
+    """Hits of two blocks, the second of which never comes."""
+
+    def open(self, detector: Detector) -> OpenHits:
+        def blocks() -> Iterator[Hits]:
+            yield HITS
+            raise KeyboardInterrupt
+
+        return OpenHits(8, blocks())
+
+
+def test_an_interrupted_run_leaves_nothing(ppc, tmp_path: Path):
+    with pytest.raises(KeyboardInterrupt):
+        simulate_file(ppc, Interrupted(), tmp_path / "sim.lh5", SETTINGS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_reaches_the_number_of_events(ppc, source, tmp_path: Path):
+    seen: list[int] = []
+
+    class Listening(Monitor):
+        def stage(self, title, total=None):
+            return nullcontext(seen.append if total else lambda _steps: None)
+
+    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS, monitor=Listening())
+    assert sum(seen) == 4
+
+
+def test_settings_of_a_file_and_on_top(tmp_path: Path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("dt_ns: 8\nlength_ns: 800\n")
+    settings = load_settings(path, {"length_ns": 1600, "diffusion": None})
+    assert (settings.dt_ns, settings.length_ns, settings.diffusion) == (8, 1600, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("dt: 8", "dt: no such setting; there are step_ns"),
+        ("dt_ns: 1.5", "dt_ns must be a multiple"),
+        ("- 3", "holds no settings"),
+        ("a: [", "not YAML"),
+    ],
+)
+def test_wrong_settings_name_the_file(tmp_path: Path, text: str, said: str):
+    path = tmp_path / "settings.yaml"
+    path.write_text(text)
+    with pytest.raises(CpunetError, match=said) as error:
+        load_settings(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
