@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.gammas.sample import simulate_gammas
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings
 
-EXACT_HITS, LIBRARY_HITS = 6000, 200_000
+EXACT_HITS, LIBRARY_HITS, GAMMAS = 6000, 200_000, 100_000
 MOST_HITS_PER_EVENT = 5
 
 
@@ -53,7 +54,8 @@ def three(values: npt.NDArray[np.floating]) -> str:
 
 def main() -> None:
     numba.set_num_threads(1)
-    fields, settings = compute_fields(read_detector("icpc")), SimulationSettings()
+    detector, settings = read_detector("icpc"), SimulationSettings()
+    fields = compute_fields(detector)
     # compiled, or taken from the compiler's cache, before anything is timed
     quick = settings.model_copy(update={"library_grid_mm": 20.0, "library_halvings": 0})
     for mode in ("exact", "library"):
@@ -65,12 +67,16 @@ def main() -> None:
     megabytes = sum(np.asarray(part).nbytes for part in library) / 1e6
     print(f"library: built in {seconds:.1f} s, {len(library.start)} pulses, {megabytes:.0f} MB")
 
-    hits = random_events(fields, LIBRARY_HITS, 1)
-    many, rate = timed(fields, hits, settings, mode="library", library=library)
-    share = many.counts["hits interpolated"] / (
-        many.counts["hits"] - many.counts["hits without signal"]
+    gammas, _ = simulate_gammas(
+        detector, source_height_mm=20, source_radius_mm=5, n_primaries=GAMMAS, seed=1
     )
-    print(f"library: {rate:.0f} hits/s, {100 * share:.2f} % of the hits interpolated")
+    samples = {"uniform": random_events(fields, LIBRARY_HITS, 1), "gammas": gammas}
+    for name, hits in samples.items():
+        many, rate = timed(fields, hits, settings, mode="library", library=library)
+        share = many.counts["hits interpolated"] / (
+            many.counts["hits"] - many.counts["hits without signal"]
+        )
+        print(f"library, {name}: {rate:.0f} hits/s, {100 * share:.2f} % interpolated")
 
     few = random_events(fields, EXACT_HITS, 2)
     exact, rate = timed(fields, few, settings, mode="exact")
