@@ -1,10 +1,10 @@
-# `make test` sets everything up and tests it.
+# `make demo` sets everything up and runs the whole job; `make test` sets up and tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install test test-slow lint clean
+.PHONY: install demo test test-slow lint clean
 
 install: $(STAMP)
 
@@ -13,6 +13,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
+
+demo: install
+	$(BIN)/cpunet demo --out demo
 
 test: install
 	$(BIN)/python -m pytest

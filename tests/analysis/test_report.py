@@ -111,8 +111,8 @@ def test_page_shows_scores_counts_and_provenance(report):
     html = (report / "report.html").read_text()
     for text in (
         "SEP: 200 simulated, 200 measured pulses",
-        "IoU REN translation [%]",
-        "Ceiling [%]",
+        '<th scope="col">IoU [%]</th>',
+        "<td>Ceiling</td>",
         "Drift time",
         "<td>REN translation</td><td>0.25</td><td>–</td>",
         "<td>data: saturated</td><td>3</td>",

@@ -173,8 +173,10 @@ def test_metrics_have_their_schema(report, trained):
         assert 18 <= scores["n_data"] <= 24
         assert set(scores["parameters"]) == PARAMETERS
         for comparison in scores["parameters"].values():
-            assert set(comparison["iou"]) == {"raw", "ren", "ceiling"}
-            assert set(comparison["wasserstein"]) == set(comparison["ks"]) == {"raw", "ren"}
+            # too few pulses to fit the rivals to, but the truth needs no fit
+            methods = {"raw", "ren", "truth_no_noise"}
+            assert methods <= set(comparison["wasserstein"]) == set(comparison["ks"])
+            assert {*comparison["wasserstein"], "ceiling"} == set(comparison["iou"])
             for value in comparison["iou"].values():
                 assert 0 <= value <= 100
             for value in comparison["ks"].values():

@@ -86,22 +86,26 @@ def _peak_html(peak: str, scores: Mapping[str, Any]) -> str:
 
 
 def _parameter_table(parameters: Mapping[str, Any]) -> str:
-    methods = list(dict.fromkeys(m for p in parameters.values() for m in p["wasserstein"]))
-    head = ["Parameter", *(f"IoU {label(m)} [%]" for m in methods), "Ceiling [%]"]
-    head += [f"{kind} {label(m)}" for kind in ("W₁", "KS") for m in methods]
+    """One row per parameter and method, and one with the ceiling."""
     rows = []
     for name, values in parameters.items():
         unit = PARAMETERS[name].unit if name in PARAMETERS else ""
         iou, error = values["iou"], values.get("iou_std", {})
-        rows.append(
-            [
-                name.replace("_", " ").capitalize(),
-                *(_percent(iou.get(m), error.get(m)) for m in [*methods, "ceiling"]),
-                *(f"{_number(values['wasserstein'].get(m))} {unit}" for m in methods),
-                *(_number(values["ks"].get(m)) for m in methods),
-            ]
-        )
-    return _table(head, rows)
+        title = name.replace("_", " ").capitalize()
+        for method, distance in values["wasserstein"].items():
+            rows.append(
+                [
+                    title,
+                    label(method),
+                    _percent(iou.get(method), error.get(method)),
+                    f"{_number(distance)} {unit}",
+                    _number(values["ks"].get(method)),
+                ]
+            )
+            title = ""
+        ceiling = _percent(iou.get("ceiling"), error.get("ceiling"))
+        rows.append([title, "Ceiling", ceiling, "", ""])
+    return _table(["Parameter", "Method", "IoU [%]", "W₁", "KS"], rows)
 
 
 def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:

@@ -20,12 +20,19 @@ COLOURS = {
 SPARE_COLOURS = ("#E69F00", "#56B4E9", "#7F7F7F", "#8C6D1F", "#5B3A8C")
 DATA_FILL = "0.80"
 
+# end of the name of a method whose noise is left out
+NO_NOISE = "_no_noise"
+
 LABELS = {
     "data": "Data",
     "raw": "Simulation",
     "ren": "REN translation",
     "iren": "IREN translation",
     "truth": "True response",
+    "rc": "RC",
+    "gauss_exp": "Gaussian ⊗ exponential",
+    "superpulse": "Superpulse ratio",
+    "ceiling": "Ceiling",
 }
 
 _STYLE = {
@@ -74,4 +81,5 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
 
 def label(method: str) -> str:
     """What a legend calls a method."""
-    return LABELS.get(method, method)
+    name = method.removesuffix(NO_NOISE)
+    return LABELS.get(name, name) + (", no noise" if name != method else "")

@@ -9,10 +9,12 @@ from types import FrameType
 
 import typer
 
+from cpunet.cli.demo import demo
 from cpunet.cli.fields import fields
 from cpunet.cli.info import info
 from cpunet.cli.messages import fail
 from cpunet.cli.simulate import simulate
+from cpunet.cli.stand import stand
 from cpunet.cli.train import train
 from cpunet.cli.translate import translate
 from cpunet.cli.validate import validate
@@ -24,7 +26,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for command in (simulate, fields, train, translate, validate, info):
+for command in (demo, simulate, fields, stand, train, translate, validate, info):
     app.command()(command)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.cli.scores import score_table
 
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 Truth = Annotated[
@@ -51,24 +51,5 @@ def validate(
         force=force,
         monitor=monitor(),
     )
-    out.print(_score_table(metrics))
+    out.print(score_table(metrics))
     out.print(f"{out_folder / 'report.html'}", soft_wrap=True)
-
-
-def _score_table(metrics: dict[str, Any]) -> Table:
-    """Draw IoU by peak and parameter, in percent."""
-    table = Table(title="Overlap with data (IoU, %)")
-    for column in ("peak", "parameter", "raw", "REN", "ceiling"):
-        table.add_column(column, justify="left" if column in ("peak", "parameter") else "right")
-    for peak, scores in metrics["peaks"].items():
-        if "missing" in scores:
-            table.add_row(peak, scores["missing"], "", "", "")
-        for parameter, comparison in scores["parameters"].items():
-            iou = comparison["iou"]
-            cells = [_number(iou[key]) for key in ("raw", "ren", "ceiling")]
-            table.add_row(peak, parameter.replace("_", " "), *cells)
-    return table
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.1f}"

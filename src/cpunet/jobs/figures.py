@@ -22,6 +22,8 @@ from cpunet.translation.translator import IREN, REN
 if TYPE_CHECKING:
     from cpunet.jobs.validate import PeakSets
 
+# methods in the figures; more lines could not be told apart
+DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 
@@ -58,7 +60,7 @@ def validation_figures(
     figures |= _cycles(max(scored, key=lambda s: min(len(s.raw), len(s.data))), ren, iren)
     for peak in scored:
         for parameter, comparison in scores[peak.name]["parameters"].items():
-            by_method = {m: v[parameter] for m, v in values[peak.name].items()}
+            by_method = {m: v[parameter] for m, v in values[peak.name].items() if m in DRAWN}
             if not np.isfinite(by_method["data"]).any():
                 continue
             axis = data_axis(by_method["data"], ren.recipe.scores.max_bins)
@@ -68,9 +70,16 @@ def validation_figures(
         pulses = {
             "data": peak.data.waveforms,
             "raw": peak.raw.waveforms,
+            "gauss_exp": peak.others.get("gauss_exp"),
+            "superpulse": peak.others.get("superpulse"),
             "ren": peak.ren.waveforms,
+            "truth": peak.others.get("truth"),
         }
-        figures[f"{peak.name} mean pulse"] = mean_pulses(pulses, ren.dt_ns, peak.name)
+        figures[f"{peak.name} mean pulse"] = mean_pulses(
+            {name: drawn for name, drawn in pulses.items() if drawn is not None and len(drawn)},
+            ren.dt_ns,
+            peak.name,
+        )
     if losses:
         figures["losses"] = loss_curves(losses)
     return figures

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from cpunet.electronics.rivals.finish import finish
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputSet
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import PreparationConfig
 
 
@@ -19,10 +19,8 @@ def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArr
 
     Parameters
     ----------
-    path
-        ``.npz`` with ``response``, shape (pulses of the simulation file, samples).
-    sim
-        The simulated pulses in use.
+    path, sim
+        As for `read_response`.
     config
         The preparation of the run.
 
@@ -30,6 +28,29 @@ def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArr
     -------
     array
         Shape (pulses in use, window); NaN where a response cannot be prepared.
+
+    Raises
+    ------
+    CpunetError
+        If the file is not readable or belongs to other pulses.
+    """
+    return finish(read_response(path, sim), config, dt_ns=sim.dt_ns)
+
+
+def read_response(path: Path, sim: InputSet) -> FloatArray:
+    """Read the noise-free trace of each simulated pulse in use.
+
+    Parameters
+    ----------
+    path
+        ``.npz`` with ``response``, shape (pulses of the simulation file, samples).
+    sim
+        The simulated pulses in use.
+
+    Returns
+    -------
+    array
+        Float32, shape (pulses in use, samples).
 
     Raises
     ------
@@ -50,8 +71,4 @@ def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArr
             f"{path}: response has shape {response.shape}, but {sim.path} holds "
             f"{sim.prepared.n_read} pulses; give the truth of that file"
         )
-    used = Pulses.of(response[sim.prepared.index], dt_ns=sim.dt_ns)
-    prepared = prepare(used, config, "measured")
-    windows = np.full((len(used), config.length), np.nan, np.float32)
-    windows[prepared.index] = prepared.pulses.waveforms
-    return windows
+    return np.ascontiguousarray(response[sim.prepared.index], dtype=np.float32)

@@ -24,8 +24,9 @@ from cpunet.jobs.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.rivals import RivalWindows, rival_windows
 from cpunet.jobs.train import resolve_device
-from cpunet.jobs.truth import load_truth
+from cpunet.jobs.truth import read_response
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
@@ -38,14 +39,19 @@ FEWEST = 10  # pulses, below which a distribution says nothing
 
 @dataclass(frozen=True, eq=False)
 class PeakSets:
-    """The pulses of one peak: raw simulation, its translation, measured."""
+    """The pulses of one peak: raw simulation, its translation, measured.
+
+    ``clean`` holds noise-free windows by method, for the comparison with ``truth``;
+    ``others`` the windows of the rivals and of the truth, with noise and without.
+    """
 
     name: str
     raw: Pulses
     ren: Pulses
     data: Pulses
-    clean: FloatArray
+    clean: Mapping[str, FloatArray]
     truth: FloatArray | None
+    others: Mapping[str, FloatArray]
 
     def missing(self) -> str | None:
         """Say what keeps the peak from being scored, if anything does."""
@@ -113,14 +119,23 @@ def validate_run(
                 f"{sim_set.path}: sampled every {sim_set.dt_ns:g} ns, the run was trained on "
                 f"{ren.dt_ns:g} ns; resample the pulses"
             )
-        true_windows = None if truth is None else load_truth(truth, sim_set, recipe.preparation)
+        response = None if truth is None else read_response(truth, sim_set)
+        rivals = rival_windows(
+            sim_set,
+            data_set,
+            data,
+            parse_selection(str(info["peak"]), recipe.peaks),
+            recipe,
+            response=response,
+            seed=seed,
+            monitor=monitor,
+        )
         windows = sim_set.prepared.pulses.waveforms
         with monitor.stage("Translating", 2 * len(windows)) as advance:
             noisy = ren.apply(windows, generator=ren.seeded(seed), progress=advance)
             clean = ren.apply(windows, noise=False, progress=advance)
         sets = [
-            _peak_sets(name, recipe, sim_set, data_set, noisy, clean, true_windows)
-            for name in names
+            _peak_sets(name, recipe, sim_set, data_set, noisy, clean, rivals) for name in names
         ]
         values: dict[str, dict[str, dict[str, Values]]] = {}
         peaks: dict[str, Any] = {}
@@ -135,6 +150,7 @@ def validate_run(
             )
         metrics = {
             "peaks": peaks,
+            "rivals": {"fits": rivals.fits, "missing": rivals.missing},
             "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
             | {"peak": info["peak"]},
             "rejections": {
@@ -155,7 +171,7 @@ def _peak_sets(
     data_set: InputSet,
     noisy: FloatArray,
     clean: FloatArray,
-    truth: FloatArray | None,
+    rivals: RivalWindows,
 ) -> PeakSets:
     selection = parse_selection(name, recipe.peaks)
     sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
@@ -166,9 +182,17 @@ def _peak_sets(
         raw=raw,
         ren=raw.with_waveforms(noisy[chosen]),
         data=data[selection.select(data.energy_kev)],
-        clean=clean[chosen],
-        truth=None if truth is None else truth[chosen],
+        clean={"raw": raw.waveforms}
+        | {name: windows[chosen] for name, windows in rivals.clean.items() if name != "truth"}
+        | {"ren": clean[chosen]},
+        truth=rivals.clean["truth"][chosen] if "truth" in rivals.clean else None,
+        others={name: _prepared(w[chosen]) for name, w in rivals.methods().items()},
     )
+
+
+def _prepared(windows: FloatArray) -> FloatArray:
+    """Leave out the rows that could not be prepared."""
+    return windows[np.isfinite(windows).all(axis=1)]
 
 
 def _score(
@@ -181,21 +205,38 @@ def _score(
         return {}, scores | {"parameters": {}, "missing": missing}
     values = {
         method: pulse_parameters(pulses, recipe.preparation, recipe.scores)
-        for method, pulses in (("data", peak.data), ("raw", peak.raw), ("ren", peak.ren))
+        for method, pulses in _by_method(peak)
     }
-    methods: Mapping[str, Mapping[str, Values]] = {m: values[m] for m in ("raw", "ren")}
+    methods: Mapping[str, Mapping[str, Values]] = {
+        method: of_method for method, of_method in values.items() if method != "data"
+    }
     scores["parameters"] = compare(values["data"], methods, recipe.scores, seed)
     if peak.truth is not None:
         scores["paired"] = _paired(peak, recipe.scores.edge_samples)
     return values, scores
 
 
+def _by_method(peak: PeakSets) -> list[tuple[str, Pulses]]:
+    """Pulses by method, from the simplest to the known answer."""
+    others = {
+        name: Pulses.of(windows, dt_ns=peak.raw.dt_ns)
+        for name, windows in peak.others.items()
+        if len(windows) >= FEWEST
+    }
+    rivals = {name: p for name, p in others.items() if not name.startswith("truth")}
+    truth = {name: p for name, p in others.items() if name.startswith("truth")}
+    scored = {"data": peak.data, "raw": peak.raw} | rivals | {"ren": peak.ren} | truth
+    return list(scored.items())
+
+
 def _paired(peak: PeakSets, edge_samples: int) -> dict[str, Any]:
     assert peak.truth is not None
     known = np.isfinite(peak.truth).all(axis=1)
+    for windows in peak.clean.values():
+        known &= np.isfinite(windows).all(axis=1)
     return {
         method: paired_scores(waveforms[known], peak.truth[known], edge_samples)
-        for method, waveforms in (("raw", peak.raw.waveforms), ("ren", peak.clean))
+        for method, waveforms in peak.clean.items()
     }
 
 

@@ -1,0 +1,85 @@
+"""Recipes on stands, seed by seed: one table with medians, the worst 5 %, and failures.
+
+Run with ``python benchmarks/closure.py STAND [STAND ...] --recipe small --seeds 3``; a stand
+is a folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and truth.npz.  A seed has
+failed if its score is below 0.9 of the median's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.train import train_run
+from cpunet.jobs.validate import validate_run
+from cpunet.recipes import load_recipe
+
+FAILED = 0.9
+
+
+def scores_of(stand: Path, recipe: str, overrides: list[str], seed: int) -> dict[str, Any]:
+    """Metrics of one run, trained and scored in a temporary folder."""
+    sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
+    truth = stand / "truth.npz"
+    with tempfile.TemporaryDirectory() as folder:
+        run, report = Path(folder) / "run", Path(folder) / "report"
+        train_run(sim, data, run, load_recipe(recipe, overrides), seed=seed)
+        known = truth if truth.exists() else None
+        return validate_run(run, sim, data, report, truth=known, seed=seed)
+
+
+def summarise(title: str, runs: list[dict[str, Any]]) -> Table:
+    """IoU by peak, parameter and method over the seeds of one recipe on one stand."""
+    table = Table(title=title)
+    for column in ("peak", "parameter", "method", "median", "worst 5 %", "failures", "ceiling"):
+        table.add_column(column, no_wrap=True)
+    for peak in ("SEP", "DEP"):
+        for parameter, first in runs[0]["peaks"][peak]["parameters"].items():
+            compared = [run["peaks"][peak]["parameters"][parameter]["iou"] for run in runs]
+            ceiling = np.median([iou["ceiling"] for iou in compared])
+            for method in first["wasserstein"]:
+                values = np.array([iou.get(method, np.nan) for iou in compared], float)
+                middle = np.nanmedian(values)
+                failures = int((~(values >= FAILED * middle)).sum())
+                table.add_row(
+                    peak,
+                    parameter,
+                    method,
+                    f"{middle:.1f}",
+                    f"{np.nanquantile(values, 0.05):.1f}",
+                    str(failures),
+                    f"{ceiling:.1f}",
+                )
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("stands", nargs="+", type=Path)
+    parser.add_argument("--recipe", action="append")
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--seeds", type=int, default=3)
+    arguments = parser.parse_args()
+    console = Console()
+    for stand in arguments.stands:
+        for recipe in arguments.recipe or ["small"]:
+            runs = []
+            for seed in range(arguments.seeds):
+                try:
+                    runs.append(scores_of(stand, recipe, arguments.overrides, seed))
+                except CpunetError as error:
+                    console.print(f"seed {seed} failed: {error}")
+            if runs:
+                console.print(summarise(f"{recipe} on {stand.name}, {len(runs)} seeds", runs))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""``cpunet demo``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+from cpunet.cli.scores import score_table
+from cpunet.cli.stand import DetectorFile, Events, Kind, KindOption, wanted_events
+
+Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
+Preset = Annotated[
+    str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
+]
+RecipeName = Annotated[
+    str, typer.Option("--recipe", help="small, paper, or a YAML file of your own.")
+]
+Iterations = Annotated[int, typer.Option(min=2, help="Training iterations.")]
+
+
+def demo(
+    out_folder: Out = Path("demo"),
+    preset: Preset = "legend200",
+    detector: DetectorFile = "icpc",
+    events: Events = "FEP=2500,SEP=1000,DEP=1000",
+    kind: KindOption = Kind.matched,
+    recipe: RecipeName = "small",
+    iterations: Iterations = 120,
+    seed: options.Seed = 0,
+    device: options.Device = "auto",
+    force: options.Force = False,
+) -> None:
+    """Simulate, digitise, train, translate and validate on a stand with a known answer.
+
+    Example: cpunet demo --out demo
+
+    Example: cpunet demo --preset ringing --kind shifted --iterations 400 --out demo2
+    """
+    from cpunet.electronics.presets import read_electronics
+    from cpunet.jobs.demo import demonstrate
+    from cpunet.recipes import load_recipe
+    from cpunet.simulation.geometry_readers import read_detector
+
+    shorter = [
+        f"training.iterations={iterations}",
+        f"training.decay_start={iterations // 2}",
+    ]
+    names, numbers = wanted_events(events)
+    metrics = demonstrate(
+        read_electronics(preset),
+        read_detector(detector),
+        load_recipe(recipe, shorter),
+        dict(zip(names, numbers, strict=True)),
+        out_folder,
+        kind=kind.value,
+        seed=seed,
+        device=device,
+        force=force,
+        monitor=monitor(),
+    )
+    out.print(score_table(metrics, leave_out=("FEP",)))
+    out.print(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)

@@ -1,0 +1,102 @@
+"""``cpunet stand``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+from cpunet.errors import CpunetError
+
+if TYPE_CHECKING:
+    from cpunet.jobs.stand import StandSummary
+
+
+class Kind(StrEnum):
+    """Whether the data's detector is the simulated one."""
+
+    matched = "matched"
+    shifted = "shifted"
+
+
+Preset = Annotated[
+    str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
+]
+Out = Annotated[Path, typer.Option("--out", help="Folder to make.")]
+DetectorFile = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
+    ),
+]
+Events = Annotated[
+    str, typer.Option(help="Events of each peak or range (keV), for sim and data each.")
+]
+KindOption = Annotated[
+    Kind, typer.Option("--kind", help="shifted: the data's detector differs a little.")
+]
+WindowKev = Annotated[float, typer.Option(help="Half-width about a peak.")]
+
+
+def stand(
+    preset: Preset,
+    out_folder: Out,
+    detector: DetectorFile = "icpc",
+    events: Events = "FEP=4000,SEP=1500,DEP=1500",
+    kind: KindOption = Kind.matched,
+    window_kev: WindowKev = 0.5,
+    seed: options.Seed = 0,
+    force: options.Force = False,
+) -> None:
+    """Make a test stand: simulated pulses, raw traces of other events, and the truth.
+
+    Example: cpunet stand --preset legend200 --out stand
+    """
+    from cpunet.electronics.presets import read_electronics
+    from cpunet.jobs.hit_sources import energy_windows
+    from cpunet.jobs.stand import make_stand
+    from cpunet.recipes import load_recipe
+    from cpunet.simulation.geometry_readers import read_detector
+
+    names, numbers = wanted_events(events)
+    summary = make_stand(
+        read_electronics(preset),
+        read_detector(detector),
+        tuple(energy_windows(",".join(names), load_recipe("small").peaks, window_kev)),
+        numbers,
+        out_folder,
+        kind=kind.value,
+        seed=seed,
+        force=force,
+        monitor=monitor(),
+    )
+    for line in _lines(summary):
+        out.print(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+
+
+def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
+    """Names and numbers of ``"FEP=4000,DEP=1500"``."""
+    pairs = [part.partition("=") for part in events.split(",")]
+    for name, _, number in pairs:
+        if not (name.strip() and number.strip().isdecimal()):
+            raise CpunetError(f"--events {events}: expected FEP=N,DEP=M and the like")
+    names = [name.strip() for name, _, _ in pairs]
+    if len(set(names)) < len(names):
+        raise CpunetError(f"--events {events}: names a peak twice; give each once")
+    return names, tuple(int(number) for _, _, number in pairs)
+
+
+def _lines(summary: StandSummary) -> list[str]:
+    def told(counts: dict[str, int]) -> str:
+        return ", ".join(f"{n} {name}" for name, n in counts.items())
+
+    return [
+        f"sim.lh5: {summary.n_sim} pulses ({told(summary.sim_lines)}), with truth.npz",
+        f"data.lh5: {summary.n_data} traces ({told(summary.data_lines)}); "
+        f"{told(summary.flags)}",
+    ]

@@ -1,0 +1,1 @@
+"""The readout of a detector: from ideal charge pulses to raw traces with a known answer."""

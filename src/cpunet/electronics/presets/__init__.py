@@ -1,0 +1,88 @@
+"""Readout chains from files: those of the package, and the user's own."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from cpunet.electronics.chain import Electronics
+from cpunet.errors import CpunetError
+
+
+def electronics_names() -> list[str]:
+    """Names of the readout chains that come with the package.
+
+    Examples
+    --------
+    >>> electronics_names()
+    ['legend200', 'ornl', 'ringing']
+    """
+    folder = files("cpunet.electronics.presets")
+    return sorted(
+        f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml")
+    )
+
+
+def read_electronics(path: str | Path) -> Electronics:
+    """Read a readout chain.
+
+    Parameters
+    ----------
+    path
+        One of `electronics_names`, or a YAML file with the fields of `Electronics`.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, or the chain is impossible; it names the field.
+
+    Examples
+    --------
+    >>> read_electronics("ornl").decays[0].tau_us
+    54.6
+    """
+    name = str(path)
+    if name in electronics_names():
+        text = (files("cpunet.electronics.presets") / f"{name}.yaml").read_text()
+    else:
+        text = _text(Path(path))
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise CpunetError(f"electronics {name}: not YAML ({reason})") from error
+    if not isinstance(values, dict):
+        raise CpunetError(f"electronics {name}: holds no fields; write lines such as dt_ns: 16")
+    try:
+        return Electronics.model_validate(values)
+    except ValidationError as error:
+        raise CpunetError(f"electronics {name}: {_first_problem(error)}") from error
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise CpunetError(
+            f"electronics {path}: neither a file nor one of {', '.join(electronics_names())}"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise CpunetError(f"electronics {path}: cannot be read ({reason})") from error
+
+
+def _first_problem(error: ValidationError) -> str:
+    first: Any = error.errors(include_url=False)[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] == "missing":
+        return f"no {key}; add it to the file"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {key}; remove or correct it"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key} = {first['input']!r}: {message[0].lower()}{message[1:]}; correct it"

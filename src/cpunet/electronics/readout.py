@@ -1,0 +1,148 @@
+"""Ideal pulses become raw traces, as a digitiser would write them, with a known answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics
+from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.noise import noise_of
+from cpunet.electronics.response import distorted, linear_response, required_energy_kev
+from cpunet.pulses.container import Pulses
+from cpunet.simulation.gammas import with_resolution
+
+DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
+"""Bits of the flags of a trace."""
+
+
+@dataclass(frozen=True, eq=False)
+class RawTraces:
+    """Raw traces, and what is known of them.
+
+    Parameters
+    ----------
+    waveforms
+        Uint16 array of shape ``(n, length)``, ADC counts.
+    dt_ns
+        Sampling period in ns.
+    energy_kev
+        Calibrated energies, with the resolution.
+    event_number
+        The source's own numbers.
+    flags
+        Uint8: 1 decaying baseline, 2 pile-up, 4 saturated, added up.
+    response
+        Float32 ``(n, length)``: the noise-free pulse at its own clock phase in units of
+        the full charge, without baseline, earlier or second pulses.
+    true_energy_kev, baseline_adc
+        What scales and lifts it.
+    """
+
+    waveforms: npt.NDArray[np.uint16]
+    dt_ns: float
+    energy_kev: FloatArray
+    event_number: npt.NDArray[np.int64]
+    flags: npt.NDArray[np.uint8]
+    response: npt.NDArray[np.float32]
+    true_energy_kev: FloatArray
+    baseline_adc: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.waveforms)
+
+
+def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
+    """Pass ideal pulses through a readout chain.
+
+    Parameters
+    ----------
+    pulses
+        Charge from 0 to 1, sampled more finely than the digitiser (1 to 4 ns), with true
+        energies.  A set is held as a whole: give large ones in blocks.
+    electronics
+        The chain.
+    seed
+        The same seed gives the same traces.
+
+    Raises
+    ------
+    CpunetError
+        As `cpunet.electronics.response.respond` and `noise_of`.
+
+    Examples
+    --------
+    >>> from cpunet.electronics.presets import read_electronics
+    >>> step = Pulses.of(np.ones((2, 900)), dt_ns=4, energy_kev=[1592.5, 2614.5])
+    >>> traces = read_out(step, read_electronics("legend200"), seed=1)
+    >>> traces.waveforms.shape, traces.waveforms.dtype
+    ((2, 1200), dtype('uint16'))
+    """
+    energy, n = required_energy_kev(pulses), len(pulses)
+    clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
+    linear = linear_response(pulses, electronics, _shift_ns(electronics, n, clock))
+    own_kev = energy[:, None] * linear
+    added_kev, flags = _other_pulses(pulses, electronics, others)
+    total_kev = own_kev + added_kev
+    response = linear
+    if electronics.non_linearity is not None:
+        figures, dt_ns = electronics.non_linearity, electronics.dt_ns
+        response = distorted(own_kev, figures, dt_ns) / energy[:, None]
+        total_kev = distorted(total_kev, figures, dt_ns)
+    total_kev += noise_of(electronics, n, noise)
+    baseline = level.normal(
+        electronics.baseline_mean_adc, electronics.baseline_spread_adc, size=n
+    )
+    adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
+    beyond = (adc > electronics.adc_top) | (adc < 0)
+    flags |= np.where(beyond.any(axis=1), SATURATED, 0).astype(np.uint8)
+    return RawTraces(
+        waveforms=np.clip(adc, 0, electronics.adc_top).astype(np.uint16),
+        dt_ns=electronics.dt_ns,
+        energy_kev=with_resolution(
+            energy,
+            noise_kev2=0.0,
+            fano_kev=electronics.resolution_fwhm_kev**2 / REFERENCE_KEV,
+            seed=int(resolution.integers(2**63)),
+        ),
+        event_number=pulses.event_number,
+        flags=flags,
+        response=response.astype(np.float32),
+        true_energy_kev=energy,
+        baseline_adc=baseline,
+    )
+
+
+def _shift_ns(electronics: Electronics, n: int, rng: np.random.Generator) -> FloatArray:
+    """When pulses begin, after `n_pre` samples: any phase of the clock, and the trigger's."""
+    phase = rng.uniform(0, electronics.dt_ns, size=n)
+    return phase + rng.normal(0, electronics.trigger_jitter_ns, size=n)
+
+
+def _other_pulses(
+    pulses: Pulses, electronics: Electronics, rng: np.random.Generator
+) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
+    """Tails of earlier pulses and second pulses, in keV, and the flags of their traces."""
+    n, dt_ns, length = len(pulses), electronics.dt_ns, electronics.length
+    added_kev = np.zeros((n, length))
+    earlier, second = electronics.earlier_pulses, electronics.pile_up
+    on_tail = rng.random(n) < earlier.fraction
+    rows = np.flatnonzero(on_tail)
+    kev = rng.uniform(0, earlier.largest_kev, size=len(rows))
+    before_ns = rng.uniform(0, 1e3 * earlier.longest_us, size=len(rows))
+    centres_ns = (np.arange(length) + 0.5) * dt_ns
+    for row, height, time_ns in zip(rows, kev, before_ns, strict=True):
+        added_kev[row] = height * electronics.step_response(centres_ns + time_ns)
+    expected = second.rate_kHz * 1e-6 * length * dt_ns
+    piled = rng.random(n) < -np.expm1(-expected)
+    rows = np.flatnonzero(piled)
+    # anywhere in the record, and of the shape of any other pulse of the set
+    shift_ns = rng.uniform(-electronics.n_pre, length - electronics.n_pre, size=len(rows))
+    which = rng.integers(n, size=len(rows)) if n else rows
+    shapes = linear_response(pulses[which], electronics, shift_ns * dt_ns)
+    kev = rng.uniform(0, second.largest_kev, size=len(rows))
+    added_kev[rows] += kev[:, None] * shapes
+    flags = np.where(on_tail, DECAYING_BASELINE, 0) | np.where(piled, PILE_UP, 0)
+    return added_kev, flags.astype(np.uint8)

@@ -1,0 +1,204 @@
+"""Charge pulses through the chain, exactly: what the digitiser would see without noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NonLinearity
+from cpunet.electronics.exponentials import ComplexArray, FloatArray
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+
+
+def respond(
+    pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
+) -> npt.NDArray[np.float32]:
+    """The noise-free traces of charge pulses, in units of the full charge.
+
+    Each sample of a pulse is taken as the charge during its period, which the chain's
+    exponentials follow without approximation; the digitiser's samples are means over its
+    own period.  Before a pulse there is no charge; after its last sample it stays.
+
+    Parameters
+    ----------
+    pulses
+        Ideal pulses, 0 to 1, with energies; their period must divide the digitiser's.
+    electronics
+        The chain.
+    shift_ns
+        How much later than `n_pre` samples each pulse begins; ``(n,)`` or a number, in ns.
+
+    Returns
+    -------
+    array
+        Float32 of shape ``(n, electronics.length)``.
+
+    Raises
+    ------
+    CpunetError
+        If the pulses are sampled too coarsely for the chain, hold NaN, or lack energies.
+    """
+    linear = linear_response(pulses, electronics, shift_ns)
+    if electronics.non_linearity is None:
+        return linear.astype(np.float32)
+    energy = required_energy_kev(pulses)[:, None]
+    signal = distorted(energy * linear, electronics.non_linearity, electronics.dt_ns)
+    return (signal / energy).astype(np.float32)
+
+
+def required_energy_kev(pulses: Pulses) -> FloatArray:
+    """Energies of the pulses in keV.
+
+    Raises
+    ------
+    CpunetError
+        If one is not known or not above 0.
+    """
+    bad = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
+    if bad.any():
+        i = int(bad.argmax())
+        raise CpunetError(
+            f"event {pulses.event_number[i]}: energy {pulses.energy_kev[i]} keV; the readout "
+            "needs an energy above 0 for each pulse"
+        )
+    return pulses.energy_kev
+
+
+def linear_response(
+    pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
+) -> FloatArray:
+    """As `respond`, by the linear part of the chain alone, in float64."""
+    per_sample = _fine_per_sample(pulses, electronics)
+    n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
+    shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
+    start = electronics.n_pre * dt + shift
+    first = np.floor(start / dt).astype(np.int64)
+    phase = start - first * dt
+    # where in a fine sample the digitiser's clock ticks, and in which one it does so first
+    tick = np.mod(-phase, fine)
+    first_tick = np.rint((dt - phase - tick) / fine).astype(np.int64)
+    transfer = electronics.transfer
+    traces = np.zeros((n, electronics.length))
+    _follow(
+        np.ascontiguousarray(pulses.waveforms),
+        _steps(transfer.poles, tick),
+        _steps(transfer.poles, fine - tick),
+        _steps(transfer.poles, np.array([dt]))[0],
+        transfer.residues / dt,
+        first,
+        first_tick,
+        per_sample,
+        traces,
+    )
+    return traces
+
+
+def distorted(signal_kev: FloatArray, figures: NonLinearity, dt_ns: float) -> FloatArray:
+    """Signals in keV, shape ``(n, samples)``, as a chain that is not linear gives them."""
+    if figures.slew_kev_per_ns is not None:
+        signal_kev = _slewed(signal_kev, figures.slew_kev_per_ns * dt_ns)
+    return signal_kev * (1 + figures.quadratic_fraction * signal_kev / REFERENCE_KEV)
+
+
+def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
+    where = f"electronics {electronics.name}"
+    ratio = electronics.dt_ns / pulses.dt_ns
+    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"{where}: dt_ns = {electronics.dt_ns:g} is no multiple of the pulses' "
+            f"{pulses.dt_ns:g} ns; simulate them with 1, 2 or 4 ns"
+        )
+    for field, time_ns in electronics.times_ns.items():
+        if time_ns < pulses.dt_ns:
+            raise CpunetError(
+                f"{where}: {field} means {time_ns:.3g} ns, faster than the pulses' grid of "
+                f"{pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
+            )
+    bad = ~np.isfinite(pulses.waveforms).all(axis=1)
+    if bad.any():
+        number = pulses.event_number[int(bad.argmax())]
+        raise CpunetError(f"event {number}: its pulse holds NaN; leave it out")
+    return round(ratio)
+
+
+def _steps(poles: ComplexArray, h_ns: FloatArray) -> ComplexArray:
+    """Factors of steps of `h_ns`, shape ``(steps, poles, 3)``, under a constant input.
+
+    For ``y' = p y + x``: y gains ``e y + a x`` (with ``e = exp(p h) - 1``), and its integral
+    over the step is ``a y + b x``.
+    """
+    h = h_ns[:, None]
+    gain = np.expm1(poles * h)
+    a = gain / poles
+    return np.stack([1 + gain, a, (a - h) / poles], axis=-1)
+
+
+@njit(cache=True, nogil=True)
+def _advance(
+    state: Any, total: Any, factors: Any, x: float
+) -> None:  # pragma: no cover - compiled
+    for k in range(len(state)):
+        total[k] += factors[k, 1] * state[k] + factors[k, 2] * x
+        state[k] = factors[k, 0] * state[k] + factors[k, 1] * x
+
+
+@njit(cache=True, nogil=True)
+def _read(total: Any, weights: Any) -> float:  # pragma: no cover - compiled
+    value = 0.0
+    for k in range(len(total)):
+        value += (weights[k] * total[k]).real
+        total[k] = 0.0
+    return value
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _follow(
+    pulses: Any,
+    to_tick: Any,
+    from_tick: Any,
+    whole: Any,
+    weights: Any,
+    first: Any,
+    first_tick: Any,
+    per_sample: int,
+    traces: Any,
+) -> None:  # pragma: no cover - compiled
+    """Fill each trace: fine steps as long as charge moves, then whole samples."""
+    n_fine, length = pulses.shape[1], traces.shape[1]
+    for i in prange(len(pulses)):
+        state = np.zeros(len(weights), np.complex128)
+        total = np.zeros(len(weights), np.complex128)
+        row, j = first[i], 0
+        while row < length:
+            x = float(pulses[i, min(j, n_fine - 1)])
+            _advance(state, total, to_tick[i], x)
+            if j >= first_tick[i] and (j - first_tick[i]) % per_sample == 0:
+                value = _read(total, weights)
+                if row >= 0:
+                    traces[i, row] = value
+                row += 1
+                if j >= n_fine:
+                    break
+            _advance(state, total, from_tick[i], x)
+            j += 1
+        last = float(pulses[i, n_fine - 1])
+        while row < length:
+            _advance(state, total, whole, last)
+            value = _read(total, weights)
+            if row >= 0:
+                traces[i, row] = value
+            row += 1
+
+
+@njit(cache=True, nogil=True)
+def _slewed(signal: Any, most: float) -> Any:  # pragma: no cover - compiled
+    out = signal.copy()
+    for i in range(signal.shape[0]):
+        for j in range(1, signal.shape[1]):
+            change = signal[i, j] - out[i, j - 1]
+            out[i, j] = out[i, j - 1] + min(max(change, -most), most)
+    return out

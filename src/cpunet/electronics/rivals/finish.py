@@ -1,0 +1,147 @@
+"""From the response of a rival to windows made exactly as those of the data are."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.electronics.rivals.base import Rival
+from cpunet.electronics.rivals.noise import BaselineNoise
+from cpunet.electronics.rivals.response import BLOCK, blocks
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes.schema import PreparationConfig
+
+
+def finish(
+    records: FloatArray,
+    config: PreparationConfig,
+    *,
+    dt_ns: float,
+    noise: BaselineNoise | None = None,
+    energy_kev: npt.NDArray[np.float64] | None = None,
+    seed: int | np.random.Generator = 0,
+) -> FloatArray:
+    """Align and normalise noise-free records as measured traces, with noise if asked.
+
+    Noise is added to the whole record once its tail has the level of the data's, and
+    the record is prepared again: alignment, baseline and scale then suffer from noise
+    as those of the data do.  A pulse without any decay has no place at which noise would
+    let it be aligned, so finish `Raw` without noise.
+
+    Parameters
+    ----------
+    records
+        Noise-free pulses of any height with room around the window, shape
+        ``(n, samples)``, see `base.Rival.translate`.
+    config
+        The preparation of the data.
+    dt_ns
+        Sampling period in ns.
+    noise
+        What to add; None for noise-free windows.
+    energy_kev
+        Energy of each pulse, shape ``(n,)``; needed for the noise.
+    seed
+        Of the noise.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape ``(n, config.length)``; a row of NaN where a pulse cannot be
+        prepared.
+
+    Raises
+    ------
+    CpunetError
+        If shapes, sampling or energies do not fit.
+    """
+    if records.ndim != 2:
+        raise CpunetError(
+            f"translated waveforms have shape {records.shape}; expected (pulses, samples)"
+        )
+    if noise is not None:
+        _check_noise(noise, dt_ns, energy_kev, len(records))
+    # A record without noise may well have equal samples at its top; none is clipped.
+    config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
+    rng = np.random.default_rng(seed)
+    windows = np.full((len(records), config.length), np.nan, np.float32)
+    for rows in blocks(len(records)):
+        block, kept = records[rows], np.arange(len(records))[rows]
+        if noise is not None and energy_kev is not None:
+            clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
+            kept = kept[clean.index]
+            height = clean.scale[:, np.newaxis]
+            level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
+            drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
+            block = np.asarray(level + drawn, np.float32)
+        prepared = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
+        windows[kept[prepared.index]] = prepared.pulses.waveforms
+    return windows
+
+
+def translate_like_data(
+    rival: Rival,
+    pulses: Pulses,
+    config: PreparationConfig,
+    *,
+    noise: BaselineNoise | None = None,
+    seed: int | np.random.Generator = 0,
+) -> Pulses:
+    """Translate prepared simulated pulses and finish them like data.
+
+    Parameters
+    ----------
+    rival
+        A fitted method.
+    pulses
+        Prepared simulated pulses.
+    config
+        The preparation of the run.
+    noise, seed
+        As for `finish`; the energies are the pulses' own.
+
+    Returns
+    -------
+    Pulses
+        The same events; a row of NaN where a pulse cannot be prepared.
+
+    Raises
+    ------
+    CpunetError
+        If the pulses are sampled otherwise than those of the fit, or as `finish`.
+    """
+    if not np.isclose(pulses.dt_ns, rival.dt_ns):
+        raise CpunetError(
+            f"the pulses are sampled every {pulses.dt_ns:g} ns, {rival.name} was fitted to "
+            f"{rival.dt_ns:g} ns; resample the pulses"
+        )
+    rng = np.random.default_rng(seed)
+    windows = np.empty((len(pulses), config.length), np.float32)
+    for first in range(0, len(pulses), BLOCK):
+        part = pulses[first : first + BLOCK]
+        windows[first : first + BLOCK] = finish(
+            rival.translate(part.waveforms),
+            config,
+            dt_ns=pulses.dt_ns,
+            noise=noise,
+            energy_kev=part.energy_kev,
+            seed=rng,
+        )
+    return pulses.with_waveforms(windows)
+
+
+def _check_noise(
+    noise: BaselineNoise, dt_ns: float, energy_kev: npt.NDArray[np.float64] | None, n: int
+) -> None:
+    if not np.isclose(noise.dt_ns, dt_ns):
+        raise CpunetError(
+            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
+            "take it from the data of the fit"
+        )
+    if energy_kev is None or energy_kev.shape != (n,):
+        raise CpunetError(
+            f"noise for {n} pulses needs {n} energies, since it is scaled by 1/energy; "
+            "give energy_kev"
+        )

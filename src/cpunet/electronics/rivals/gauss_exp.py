@@ -1,0 +1,121 @@
+"""Gaussian and exponential kernel fitted to superpulses: the method of LEGEND's production.
+
+The response to a step is the convolution of a Gaussian (sigma) with an exponential (tau)
+and a decay; sigma and tau are fitted to mean current pulses in slices of the drift time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+import scipy.fft
+import scipy.optimize
+
+from cpunet.electronics.rivals.base import Values, check_sets, check_windows
+from cpunet.electronics.rivals.response import (
+    Spectrum,
+    currents,
+    frequencies_mhz,
+    record_length,
+    respond,
+)
+from cpunet.electronics.rivals.superpulses import (
+    Groups,
+    crossing,
+    fitted_tail_slope,
+    slices,
+    superpulses,
+    without_decay,
+)
+from cpunet.pulses.container import FloatArray
+
+MOST = 2000  # pulses of either side that the fit is made on
+ROUNDS = 3  # of fit and of slices drawn again with what was fitted
+EDGE = 96  # samples before and after the half height that are compared
+START = 2.0  # sigma and tau at first, in samples
+LONGEST = 64.0  # the largest sigma and tau, in samples
+
+
+@dataclass(frozen=True)
+class GaussExp:
+    """A Gaussian and an exponential kernel followed by an exponential decay.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns.
+    sigma_ns, tau_ns
+        Standard deviation of the Gaussian and constant of the exponential, in ns.
+    tail_slope_per_ms
+        Slope of the logarithm of the tail, in 1/ms.
+    """
+
+    dt_ns: float
+    sigma_ns: float
+    tau_ns: float
+    tail_slope_per_ms: float
+    name: ClassVar[str] = "gauss_exp"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Fit superpulses in slices of the drift time, see `base.Rival.fit`."""
+        check_sets(sim, data, dt_ns, align)
+        slope = fitted_tail_slope(data, dt_ns, align)
+        steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
+        measured = currents(steps)
+        wanted = _mean_currents(measured, slices(measured))
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:MOST]), axis=1))
+        length = record_length(sim.shape[1])
+
+        def response(parameters: Values) -> Values:
+            transfer = _transfer(length, 1.0, parameters[0], parameters[1])
+            return np.asarray(scipy.fft.irfft(spectra * transfer, length, axis=1), float)
+
+        best = np.array([START, START])
+        for _ in range(ROUNDS):
+            groups = slices(response(best))
+
+            def residual(parameters: Values, groups: Groups = groups) -> Values:
+                return (_mean_currents(response(parameters), groups) - wanted).ravel()
+
+            best = scipy.optimize.least_squares(
+                residual, best, bounds=(0.0, LONGEST), diff_step=1e-3, xtol=1e-4
+            ).x
+        sigma, tau = (best * dt_ns).tolist()
+        return cls(dt_ns, sigma, tau, slope)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Smooth and let decay, see `base.Rival.translate`."""
+        check_windows(waveforms, "simulated")
+        length = record_length(waveforms.shape[1])
+        transfer = _transfer(length, self.dt_ns, self.sigma_ns, self.tau_ns)
+        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+
+    def describe(self) -> Mapping[str, float]:
+        """Widths of the kernel and tail slope."""
+        return {
+            "sigma_ns": self.sigma_ns,
+            "tau_ns": self.tau_ns,
+            "tail_slope_per_ms": self.tail_slope_per_ms,
+        }
+
+
+def _transfer(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spectrum:
+    """Fourier transform of the kernel at the frequencies of a record."""
+    omega = 2e-3 * np.pi * frequencies_mhz(length, dt_ns)  # 1/ns
+    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
+    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
+
+
+def _mean_currents(current: Values, groups: Groups) -> Values:
+    """Superpulses around the half height, shape ``(slices, 2 * EDGE)``."""
+    length = current.shape[1]
+    half = crossing(np.cumsum(current, axis=1), 0.5)
+    means = superpulses(scipy.fft.rfft(current, axis=1), half, groups, length)
+    return np.asarray(
+        np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)[:, : 2 * EDGE],
+        float,
+    )

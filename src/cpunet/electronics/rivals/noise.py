@@ -1,0 +1,177 @@
+"""Noise with the spectrum of the data's own baselines, of any length.
+
+Noise in ADC counts is the same for all pulses of a channel, so after normalisation it
+goes as 1/energy: it is kept as prepared units times keV.  The spectrum comes from the
+raw samples before the pulse and not from the short baseline of the prepared window,
+which would lose the low frequencies that decide drift time and tail slope.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from cpunet.electronics.rivals.base import Values
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes.schema import PreparationConfig
+
+LEAST_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
+FEWEST = 30  # flat baselines
+SHORTEST_SHARE = 0.1  # of the baselines may be shorter than those used
+START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 16  # where the pulse begins, with room
+FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and how often
+SIGMA_PER_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineNoise:
+    """Spectrum of baseline noise.
+
+    Parameters
+    ----------
+    density
+        Mean square per sample and frequency bin, at the frequencies of a real FFT of
+        `samples`: the expected square of a bin over `samples`, (prepared units x keV)^2.
+    samples, dt_ns
+        Length of the baselines and their sampling period.
+    n_baselines
+        How many flat baselines it was estimated from.
+    """
+
+    density: Values
+    samples: int
+    dt_ns: float
+    n_baselines: int
+
+    @classmethod
+    def from_traces(cls, raw: Pulses, config: PreparationConfig) -> Self:
+        """Estimate the spectrum from what precedes the pulses of raw traces.
+
+        Parameters
+        ----------
+        raw
+            Measured traces of one channel with their energies, any mixture of peaks.
+        config
+            How they are prepared: gives baseline and scale of each.
+
+        Raises
+        ------
+        CpunetError
+            If too few traces have a known energy and a flat baseline, or the
+            baselines are shorter than 400 samples.
+        """
+        baselines = _baselines(raw, config)
+        flat = baselines[_flat(baselines)]
+        if len(flat) < FEWEST:
+            raise CpunetError(
+                f"only {len(flat)} flat baselines among {len(raw)} traces; give more traces "
+                f"(at least {FEWEST} with known energy)"
+            )
+        samples = flat.shape[1]
+        window = np.hanning(samples + 1)[:-1]
+        centred = (flat - flat.mean(axis=1, keepdims=True)) * window
+        power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+        density = power.mean(axis=0) / (window @ window)
+        # What the mean took away leaks from 0 into the neighbouring bin.
+        density[:2] = density[2]
+        return cls(density, samples, raw.dt_ns, len(flat))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square in prepared units times keV."""
+        return float(np.sqrt(self._density_for(self.samples).mean()))
+
+    def draw(
+        self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw Gaussian noise for pulses of these energies.
+
+        Parameters
+        ----------
+        energy_kev
+            Energy of each pulse, shape ``(n,)``.
+        length
+            Samples of each.
+        rng
+            Where the randomness comes from.
+
+        Returns
+        -------
+        numpy.ndarray
+            Float32, shape ``(n, length)``, in prepared units.
+
+        Raises
+        ------
+        CpunetError
+            If an energy is not a positive number.
+        """
+        usable = np.isfinite(energy_kev) & (energy_kev > 0)
+        if not usable.all():
+            row = int(np.argmin(usable))
+            raise CpunetError(
+                f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
+                "1/energy, so give the energies"
+            )
+        # Twice as long as needed, so that end and beginning know nothing of each other.
+        long = scipy.fft.next_fast_len(2 * length, real=True)
+        density = self._density_for(long)[: long // 2 + 1]
+        bins = rng.standard_normal((len(energy_kev), len(density), 2)).view(complex)[..., 0]
+        noise = scipy.fft.irfft(bins * np.sqrt(0.5 * long * density), long, axis=1)
+        return np.asarray(noise[:, :length] / energy_kev[:, np.newaxis], np.float32)
+
+    def _density_for(self, length: int) -> Values:
+        """Density at all frequencies, of both signs, of a complex FFT of `length`."""
+        known = np.arange(len(self.density)) / self.samples
+        wanted = np.abs(scipy.fft.fftfreq(length))
+        return np.asarray(np.interp(wanted, known, self.density), float)
+
+
+def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
+    """Samples before the pulse in prepared units times keV, equally many of each trace."""
+    known = np.flatnonzero(np.isfinite(raw.energy_kev) & (raw.energy_kev > 0))
+    prepared = prepare(raw[known], config, "measured")
+    if len(prepared) < FEWEST:
+        raise CpunetError(
+            f"only {len(prepared)} of {len(raw)} traces have a known energy and can be "
+            f"prepared; give {FEWEST} or more to take the noise from"
+        )
+    windows = prepared.pulses.waveforms[:, : config.samples_before]
+    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+    above = windows >= level[:, np.newaxis]
+    # The start of the pulse proper: everything from there to the alignment is above.
+    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
+    free = prepared.align_sample - config.samples_before + start - MARGIN
+    length = int(np.quantile(free, SHORTEST_SHARE))
+    if length < LEAST_SAMPLES:
+        raise CpunetError(
+            f"the traces have {max(length, 0)} samples before the pulse; the noise needs "
+            f"{LEAST_SAMPLES} or more, so give traces with a longer baseline"
+        )
+    used = np.flatnonzero(free >= length)
+    samples = raw.waveforms[known[prepared.index[used]], :length].astype(float)
+    kev = prepared.pulses.energy_kev[used] / prepared.scale[used]
+    return np.asarray(
+        (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
+    )
+
+
+def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
+    """Tell which baselines neither slope nor hold another pulse."""
+    lever = np.arange(baselines.shape[1]) - 0.5 * (baselines.shape[1] - 1)
+    slope = baselines @ lever / (lever @ lever)
+    mean = baselines.mean(axis=1)
+    lines = mean[:, np.newaxis] + slope[:, np.newaxis] * lever
+    width = (baselines - lines).std(axis=1)
+    flat = np.ones(len(baselines), bool)
+    for _ in range(CLIPS):
+        for values in (slope, width):
+            centre = np.median(values[flat])
+            sigma = SIGMA_PER_MAD * np.median(np.abs(values[flat] - centre))
+            flat &= np.abs(values - centre) <= FLAT_SIGMAS * sigma
+    return flat

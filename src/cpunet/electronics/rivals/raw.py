@@ -1,0 +1,38 @@
+"""The simulation as it is: what no translation at all scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from cpunet.electronics.rivals.base import check_sets, check_windows
+from cpunet.electronics.rivals.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.pulses.container import FloatArray
+
+
+@dataclass(frozen=True)
+class Raw:
+    """No electronics: the window, extended."""
+
+    dt_ns: float
+    name: ClassVar[str] = "raw"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Fit nothing, see `base.Rival.fit`."""
+        check_sets(sim, data, dt_ns, align)
+        return cls(dt_ns)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Extend the windows to records, see `base.Rival.translate`."""
+        check_windows(waveforms, "simulated")
+        before = np.zeros((len(waveforms), ROOM_BEFORE), np.float32)
+        after = np.repeat(waveforms[:, -1:], ROOM_AFTER, axis=1)
+        return np.concatenate([before, waveforms, after], axis=1, dtype=np.float32)
+
+    def describe(self) -> Mapping[str, float]:
+        """Nothing was fitted."""
+        return {}

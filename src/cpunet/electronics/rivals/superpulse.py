@@ -1,0 +1,131 @@
+"""A free kernel from superpulses: the Wiener-regularised ratio of mean spectra.
+
+In each slice of the drift time the mean measured current is the mean simulated one
+passed through the kernel, so the kernel's transfer function is the ratio of their
+spectra, H = sum(D S*) / sum(|S|^2) over the slices.  Where the measured spectrum is no
+larger than its statistical error, a Wiener factor takes H to zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+import scipy.fft
+
+from cpunet.electronics.rivals.base import Values, check_sets, check_windows
+from cpunet.electronics.rivals.response import (
+    ROOM_BEFORE,
+    Spectrum,
+    currents,
+    record_length,
+    respond,
+)
+from cpunet.electronics.rivals.superpulses import (
+    Superpulses,
+    crossing,
+    fitted_tail_slope,
+    slices,
+    superpulses,
+    without_decay,
+)
+from cpunet.pulses.container import FloatArray
+
+MOST = 4000  # pulses of either side that the kernel is made of
+ROUNDS = 4  # of the kernel and of half heights found again with it
+LEAD, LAG = 32, 256  # samples of the kernel before and after the half height
+FADE_IN, FADE_OUT = 8, 64  # of these, over how many it is faded in and out
+
+
+@dataclass(frozen=True, eq=False)
+class Superpulse:
+    """A free kernel followed by an exponential decay.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns.
+    kernel
+        Weights of sum 1, `LEAD` samples before zero delay and `LAG` from it on.
+    tail_slope_per_ms
+        Slope of the logarithm of the tail, in 1/ms.
+    """
+
+    dt_ns: float
+    kernel: Values
+    tail_slope_per_ms: float
+    name: ClassVar[str] = "superpulse"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Divide the mean spectra, see `base.Rival.fit`."""
+        check_sets(sim, data, dt_ns, align)
+        slope = fitted_tail_slope(data, dt_ns, align)
+        steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
+        length = record_length(sim.shape[1])
+        current = currents(steps)
+        wanted = _superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
+
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:MOST]), axis=1))
+        kernel = np.zeros(LEAD + LAG)
+        kernel[LEAD] = 1.0
+        for _ in range(ROUNDS):
+            # The simulated pulses are placed by the half height of their response, which
+            # no shift of their own half height gives exactly.
+            response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
+            kernel = _kernel(wanted, _superpulses(spectra, response), length)
+        return cls(dt_ns, kernel, slope)._with_tail_of(slope, sim[:MOST], align)
+
+    def _with_tail_of(self, slope: float, sim: FloatArray, align: int) -> Self:
+        """Take from the decay what the late part of the kernel adds to the tail slope."""
+        windows = self.translate(sim)[:, ROOM_BEFORE : ROOM_BEFORE + sim.shape[1]]
+        excess = fitted_tail_slope(windows, self.dt_ns, align) - slope
+        return replace(self, tail_slope_per_ms=self.tail_slope_per_ms - excess)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Pass through the kernel and let decay, see `base.Rival.translate`."""
+        check_windows(waveforms, "simulated")
+        transfer = _transfer(self.kernel, record_length(waveforms.shape[1]))
+        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+
+    def describe(self) -> Mapping[str, float]:
+        """Mean and standard deviation of the kernel, and tail slope."""
+        time = np.arange(len(self.kernel)) * self.dt_ns
+        mean = float(self.kernel @ time)
+        variance = float(self.kernel @ (time - mean) ** 2)
+        return {
+            "kernel_mean_ns": mean - LEAD * self.dt_ns,
+            "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
+            "tail_slope_per_ms": self.tail_slope_per_ms,
+        }
+
+
+def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
+    """Superpulses of currents that are placed and sliced by their responses."""
+    steps = np.cumsum(response, axis=1)
+    half_times = crossing(steps, 0.5)
+    return superpulses(spectra, half_times, slices(response), response.shape[1])
+
+
+def _kernel(data: Superpulses, sim: Superpulses, length: int) -> Values:
+    """The regularised ratio as weights around zero delay, of sum 1."""
+    power = (np.abs(data.spectra) ** 2).sum(axis=0)
+    wiener = np.clip(1 - data.error.sum(axis=0) / power, 0, 1)
+    below = (np.abs(sim.spectra) ** 2 + sim.error).sum(axis=0)
+    ratio = wiener * (data.spectra * sim.spectra.conj()).sum(axis=0) / below
+    weights = np.roll(scipy.fft.irfft(ratio, length), LEAD)[: LEAD + LAG]
+    weights[:FADE_IN] *= _fade(FADE_IN)
+    weights[-FADE_OUT:] *= _fade(FADE_OUT)[::-1]
+    return np.asarray(weights / weights.sum(), float)
+
+
+def _fade(samples: int) -> Values:
+    return np.asarray(np.sin(0.5 * np.pi * (np.arange(samples) + 0.5) / samples) ** 2, float)
+
+
+def _transfer(kernel: Values, length: int) -> Spectrum:
+    around_zero = np.zeros(length)
+    around_zero[: len(kernel)] = kernel
+    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -LEAD)), complex)

@@ -1,0 +1,171 @@
+"""Superpulses: mean currents of pulses alike in drift time, aligned at half height.
+
+Simulated and measured pulses are of different events, so single pulses cannot be
+compared.  Their means can, once both sets are divided at the same quantiles of the
+drift time: pulses of one slice come from the same places of the detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from cpunet.analysis.parameters import tail_slope
+from cpunet.electronics.rivals.base import Values
+from cpunet.electronics.rivals.response import Spectrum
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Groups = list[npt.NDArray[np.int64]]
+
+SLICES = 8
+SINGLE_SITE = 0.35  # of the pulses of a slice are kept
+TAIL_SHARE = 0.75  # of the samples after the alignment: 300 of 400, as in the paper
+RISE_START, RISE_END = 0.02, 0.95  # free of noise at the start, of the slow top at the end
+
+
+@dataclass(frozen=True, eq=False)
+class Superpulses:
+    """Spectra of the mean currents, shape ``(slices, frequencies)``.
+
+    ``error`` is the expected square of the difference from the mean of infinitely many
+    pulses: noise, and the differences of the pulses within a slice.
+    """
+
+    spectra: Spectrum
+    error: Values
+
+
+def tail_samples(length: int, align: int) -> int:
+    """Samples at the end of a window that hold nothing but the decay."""
+    return max(3, int(TAIL_SHARE * (length - align)))
+
+
+def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
+    """Median slope of the logarithm of the tails, in 1/ms.
+
+    Raises
+    ------
+    CpunetError
+        If no tail is positive.
+    """
+    slopes = tail_slope(data, dt_ns, tail_samples(data.shape[1], align))
+    slopes = slopes[np.isfinite(slopes)]
+    if not slopes.size:
+        raise CpunetError("no measured pulse has a positive tail; check their polarity")
+    return float(np.median(slopes))
+
+
+def without_decay(
+    data: FloatArray, tail_slope_per_ms: float, dt_ns: float, align: int
+) -> Values:
+    """Undo the decay (pole-zero correction) and scale the pulses to unit height.
+
+    Parameters
+    ----------
+    data
+        Windows of shape ``(n, length)`` with the baseline at 0.
+    tail_slope_per_ms
+        Slope of the logarithm of the tail in 1/ms.
+    dt_ns
+        Sampling period in ns.
+    align
+        Sample of the windows' alignment.
+    """
+    kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
+    current = data.astype(float)
+    current[:, 1:] -= kept * data[:, :-1]
+    steps = np.cumsum(current, axis=1)
+    heights = steps[:, -tail_samples(data.shape[1], align) :].mean(axis=1, keepdims=True)
+    return np.asarray(steps / heights, float)
+
+
+def crossing(steps: Values, fraction: float) -> Values:
+    """Sample at which each pulse of unit height last rises through a fraction of it.
+
+    Interpolated linearly; NaN where there is no such crossing before `RISE_END`.
+
+    Examples
+    --------
+    >>> crossing(np.array([[0.0, 0.0, 0.4, 0.8, 1.0, 1.0]]), 0.5)
+    array([2.25])
+    """
+    samples = np.arange(steps.shape[1])
+    top = (steps >= RISE_END).argmax(axis=1)[:, np.newaxis]
+    below = (steps < fraction) & (samples < top)
+    last = steps.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    last = np.minimum(last, steps.shape[1] - 2)
+    rows = np.arange(len(steps))
+    low, high = steps[rows, last], steps[rows, last + 1]
+    known = below.any(axis=1)
+    rise = np.where(known, high - low, 1.0)
+    return np.asarray(np.where(known, last + (fraction - low) / rise, np.nan), float)
+
+
+def rise_times(steps: Values) -> Values:
+    """Samples from 2 to 95 % of pulses of unit height; NaN where one is missing."""
+    return crossing(steps, RISE_END) - crossing(steps, RISE_START)
+
+
+def slices(current: Values) -> Groups:
+    """Rows of the single-site-like pulses between quantiles of the drift time.
+
+    Of each slice the pulses with the highest current are kept.  They differ far less
+    from each other than pulses of several sites, and so do their means between sets.
+
+    Parameters
+    ----------
+    current
+        Currents of pulses of unit height, shape ``(n, length)``.
+
+    Raises
+    ------
+    CpunetError
+        If too few pulses rise from baseline to top.
+    """
+    drift_times = rise_times(np.cumsum(current, axis=1))
+    rows = np.flatnonzero(np.isfinite(drift_times))
+    if len(rows) < 2 * SLICES / SINGLE_SITE:
+        raise CpunetError(
+            f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
+            "check that they are prepared charge pulses"
+        )
+    # Three samples: the peak then hardly depends on where on it the samples lie.
+    height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
+    ordered = rows[np.argsort(drift_times[rows], kind="stable")]
+    return [
+        group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
+        for group in np.array_split(ordered, SLICES)
+    ]
+
+
+def superpulses(
+    spectra: Spectrum,
+    half_times: Values,
+    groups: Groups,
+    length: int,
+) -> Superpulses:
+    """Mean current spectra by slice after moving each pulse's half height to sample 0.
+
+    Parameters
+    ----------
+    spectra
+        Spectra of the currents, shape ``(n, length // 2 + 1)``.
+    half_times
+        Sample of the half height of each, finite in all groups.
+    groups
+        Rows of each slice.
+    length
+        Samples that the spectra stand for.
+    """
+    turn = 2j * np.pi * scipy.fft.rfftfreq(length)
+    means = np.empty((len(groups), spectra.shape[1]), complex)
+    error = np.empty(means.shape)
+    for k, rows in enumerate(groups):
+        moved = spectra[rows] * np.exp(half_times[rows, np.newaxis] * turn)
+        means[k] = moved.mean(axis=0)
+        error[k] = moved.var(axis=0) / max(1, len(rows) - 1)
+    return Superpulses(means, error)

@@ -1,0 +1,96 @@
+"""The whole story on a stand with a known answer: stand, training, validation, report."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from cpunet.electronics.chain import Electronics
+from cpunet.errors import CpunetError
+from cpunet.files import refuse_existing
+from cpunet.jobs.hit_sources import energy_windows
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.stand import Kind, make_stand
+from cpunet.jobs.train import train_run
+from cpunet.jobs.validate import validate_run
+from cpunet.recipes.schema import Recipe
+from cpunet.simulation.geometry import Detector
+
+QUIET = Monitor()
+PARTS = ("stand", "run", "report")
+_HALF_WINDOW_KEV = 0.5  # of deposited energy about each line
+
+
+def demonstrate(
+    electronics: Electronics,
+    detector: Detector,
+    recipe: Recipe,
+    events: dict[str, int],
+    out: Path,
+    *,
+    kind: Kind = "matched",
+    seed: int = 0,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Make a stand, train on its FEP, and score every method on all its lines.
+
+    Parameters
+    ----------
+    electronics, detector, kind
+        Of the stand, as for `cpunet.jobs.stand.make_stand`.
+    recipe
+        Of the training.
+    events
+        Wanted on either side, by line.
+    out
+        Folder of ``stand``, ``run`` and ``report``. Parts that are there from an
+        interrupted demonstration are kept, unless `force` makes all of them anew.
+    seed, device, force, monitor
+        As for `cpunet.jobs.train.train_run`.
+
+    Returns
+    -------
+    dict
+        The content of the report's ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the report exists, or a step fails.
+    """
+    stand, run, report = (out / part for part in PARTS)
+    if force:
+        for part in (report, run, stand):
+            shutil.rmtree(part, ignore_errors=True)
+    refuse_existing(report, force=force)
+    if out.exists() and not out.is_dir():
+        raise CpunetError(f"{out}: is no folder; give another --out")
+    if not stand.exists():
+        windows = tuple(energy_windows(",".join(events), recipe.peaks, _HALF_WINDOW_KEV))
+        make_stand(
+            electronics,
+            detector,
+            windows,
+            tuple(events.values()),
+            stand,
+            kind=kind,
+            seed=seed,
+            monitor=monitor,
+        )
+    sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
+    if not run.exists():
+        train_run(sim, data, run, recipe, seed=seed, device=device, monitor=monitor)
+    return validate_run(
+        run,
+        sim,
+        data,
+        report,
+        truth=stand / "truth.npz",
+        seed=seed,
+        device=device,
+        monitor=monitor,
+    )

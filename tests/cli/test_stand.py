@@ -1,0 +1,71 @@
+"""``cpunet stand``: a small stand, read by the package's own readers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.truth import load_truth
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes import load_recipe
+
+EVENTS = "FEP=40,DEP=20"
+
+
+@pytest.fixture
+def made(command, tmp_path: Path) -> Path:
+    out = tmp_path / "stand"
+    words = ("--preset", "ornl", "--events", EVENTS, "--kind", "shifted", "--out", out)
+    done = command("stand", *words)
+    assert done.code == 0, done.err
+    assert "sim.lh5" in done.out
+    return out
+
+
+def test_the_folder_is_read_and_prepared(made: Path):
+    recipe, quiet = load_recipe("small"), Monitor()
+    chosen = parse_selection("FEP,DEP", recipe.peaks)
+    sim = load_simulated(InputFile(made / "sim.lh5"), recipe, chosen, quiet)
+    data = load_measured(InputFile(made / "data.lh5"), recipe, chosen, quiet)
+    assert len(sim.prepared) > 20
+    assert len(data.prepared) > 10
+    truth = load_truth(made / "truth.npz", sim, recipe.preparation)
+    assert np.isfinite(truth).all()
+    # the mean edge of the truth is that of the data, within what the detector's shift makes
+    measured = data.prepared.pulses.waveforms.mean(axis=0)
+    assert np.abs(truth.mean(axis=0) - measured).max() < 0.1
+    made_by = json.loads((made / "stand.json").read_text())
+    assert made_by["shift"]["temperature_K"] == 2
+    assert made_by["data"]["detector"]["temperature_K"] == 92
+    flags = np.load(made / "data_labels.npz")
+    assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
+    assert set(flags["label"]) <= {0, 2, 3}
+
+
+def test_it_is_replaced_with_force_only(command, made: Path):
+    words = ("stand", "--preset", "ornl", "--events", "DEP=5", "--out", made)
+    assert "exists already" in command(*words).err
+    assert command(*words, "--force").code == 0
+    assert not list(made.glob("*.rows"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--preset", "ornl", "--events", "FEP=0"), "FEP=0: give at least 1 event"),
+        (("--preset", "ornl", "--events", "FEP"), "expected FEP=N"),
+        (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
+        (("--preset", "orln"), "legend200, ornl, ringing"),
+    ],
+)
+def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], said: str):
+    done = command("stand", *words, "--out", tmp_path / "stand")
+    assert done.code == 2
+    assert said in done.err
+    assert done.err.count("\n") == 1
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,131 @@
+"""Raw traces against what is known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.chain import Electronics, NoiseSpectrum
+from cpunet.electronics.noise import coloured_noise, cut_noise, noise_power, read_baselines
+from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.readout import RawTraces, read_out
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+
+N = 300
+
+
+def changed(name: str = "legend200", **values: object) -> Electronics:
+    return Electronics.model_validate(read_electronics(name).model_dump() | values)
+
+
+@pytest.fixture(scope="module")
+def pulses() -> Pulses:
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(900) / rng.uniform(40, 120, (N, 1)), 0, 1)
+    return Pulses.of(ramps, dt_ns=4, energy_kev=rng.uniform(500, 2614.5, N))
+
+
+@pytest.fixture(scope="module")
+def traces(pulses: Pulses) -> RawTraces:
+    return read_out(pulses, read_electronics("ornl"), seed=3)
+
+
+def test_noise_has_the_spectrum_asked_for():
+    line = {"frequency_MHz": 10, "power_fraction": 0.1}
+    spectrum = NoiseSpectrum(
+        corner_MHz=8.5, order=3, excess=10, excess_corner_kHz=30, lines=(line,)
+    )
+    noise = coloured_noise(spectrum, 2000, 8192, 16, np.random.default_rng(2))
+    assert noise.std() == pytest.approx(1, rel=0.01)
+    measured = (np.abs(np.fft.rfft(noise)) ** 2).mean(axis=0)
+    measured[1:-1] *= 2  # negative frequencies
+    expected = noise_power(spectrum, 16, 8192)
+    edges = np.unique(np.geomspace(1, 4096, 30).astype(int))
+    ratio = np.add.reduceat(measured / measured[1:].sum(), edges) / np.add.reduceat(
+        expected, edges
+    )
+    assert np.abs(ratio - 1).max() < 0.05
+
+
+def test_legend200_noise_falls_as_measured():
+    spectrum = read_electronics("legend200").noise.spectrum
+    frequency, power = np.fft.rfftfreq(8192, 0.016), noise_power(spectrum, 16, 8192)
+    flat = power[(frequency > 0.5) & (frequency < 2)].mean()
+    assert 20 < flat / power[(frequency > 25) & (frequency < 30)].mean() < 40
+
+
+def test_noise_cut_from_baselines_is_theirs(tmp_path):
+    path = tmp_path / "baselines.lh5"
+    white = 14000 + np.random.default_rng(4).normal(0, 7, (50, 2000))
+    write_pulses(path, Pulses.of(white, dt_ns=16, energy_kev=np.zeros(50)))
+    baselines = read_baselines(path, 1200, 16)
+    cut = cut_noise(baselines, 200, 1200, np.random.default_rng(5))
+    assert cut.std() == pytest.approx(1, rel=0.02)
+    kev = changed(noise={"rms_kev": 2.0, "baselines_file": path})
+    steps = Pulses.of(np.ones((20, 900)), dt_ns=4, energy_kev=np.full(20, 1000.0))
+    level = read_out(steps, kev, seed=1).waveforms[:, :400].std() / kev.gain_adc_per_kev
+    assert level > 1.9
+    with pytest.raises(CpunetError, match="shorter than the record"):
+        read_baselines(path, 2001, 16)
+
+
+def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
+    quiet = changed(
+        noise={"rms_kev": 0.0, "spectrum": read_electronics("ornl").noise.spectrum},
+        earlier_pulses={"fraction": 0.0, "largest_kev": 1, "longest_us": 1},
+        pile_up={"rate_kHz": 0.0, "largest_kev": 1},
+    )
+    traces = read_out(pulses, quiet, seed=3)
+    height = quiet.gain_adc_per_kev * traces.true_energy_kev[:, None]
+    expected = traces.baseline_adc[:, None] + height * traces.response
+    assert np.abs(traces.waveforms - expected).max() <= 0.51
+    assert not traces.flags.any()
+
+
+def test_noisy_traces_scatter_about_theirs_by_the_noise(traces: RawTraces):
+    chain = read_electronics("ornl")
+    height = chain.gain_adc_per_kev * traces.true_energy_kev[:, None]
+    rest = traces.waveforms - traces.baseline_adc[:, None] - height * traces.response
+    clean = rest[traces.flags == 0] / chain.gain_adc_per_kev
+    assert clean.std() == pytest.approx(chain.noise.rms_kev, rel=0.05)
+    assert np.abs(rest[(traces.flags & 3) > 0]).max() > 20 * chain.gain_adc_per_kev
+
+
+def test_shares_of_disturbed_traces(traces: RawTraces):
+    assert np.mean(traces.flags & 1 > 0) == pytest.approx(0.33, abs=0.1)
+    often = changed("ornl", pile_up={"rate_kHz": 36.1, "largest_kev": 1000})
+    steps = Pulses.of(np.ones((N, 900)), dt_ns=4, energy_kev=np.full(N, 1000.0))
+    piled = np.mean(read_out(steps, often, seed=1).flags & 2 > 0)
+    assert piled == pytest.approx(0.5, abs=0.1)  # 1 - exp(-36.1 kHz x 19.2 us)
+
+
+def test_saturation_is_flagged_and_clipped(pulses: Pulses):
+    traces = read_out(pulses, changed(gain_adc_per_kev=40), seed=1)
+    saturated = traces.flags & 4 > 0
+    assert (traces.waveforms.max(axis=1)[saturated] == 65535).all()
+    assert saturated.any()
+    assert not saturated[traces.true_energy_kev < 1000].all()
+
+
+def test_energies_have_the_resolution(pulses: Pulses):
+    line = Pulses.of(np.ones((4000, 1)), dt_ns=4, energy_kev=np.full(4000, 2614.5))
+    short = changed(length=40, n_pre=10)
+    assert 2.355 * read_out(line, short, seed=1).energy_kev.std() == pytest.approx(
+        2.6, rel=0.05
+    )
+
+
+def test_the_seed_decides(pulses: Pulses, traces: RawTraces):
+    chain = read_electronics("ornl")
+    again, other = read_out(pulses, chain, seed=3), read_out(pulses, chain, seed=4)
+    assert (again.waveforms == traces.waveforms).all()
+    assert (again.energy_kev == traces.energy_kev).all()
+    assert (other.waveforms != traces.waveforms).any()
+
+
+def test_pulses_without_energy_are_named():
+    steps = Pulses.of(np.ones((1, 9)), dt_ns=4, event_number=[71])
+    with pytest.raises(CpunetError, match="event 71"):
+        read_out(steps, read_electronics("ornl"), seed=1)
