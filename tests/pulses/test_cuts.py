@@ -140,5 +140,17 @@ def test_known_contamination(name: str, reference_data: Path) -> None:
     kept = np.isin(np.arange(len(raw)), cut.index)
     assert kept[flag == 0].mean() > 0.995
     assert (~kept[flag == 1]).mean() > 0.7  # decaying baselines
-    # A third of the pile-up is outside the window or within the charge collection.
-    assert (~kept[flag == 2]).mean() > 0.6
+    # A third of the pile-up is outside the window or within the charge collection, and
+    # what begins shortly before a pulse cannot be told from a slow one: 23 of 41 are found.
+    assert (~kept[flag == 2]).mean() > 0.5
+
+
+def test_slow_pulses_are_not_taken_for_sloping_baselines() -> None:
+    rng = np.random.default_rng(5)
+    rise = np.clip((np.arange(1200)[None] - 500) / rng.uniform(60, 260, 600)[:, None], 0, 1)
+    # slowest at first, as charge is that starts far from the contact: begins in the window's
+    # baseline part if it takes more than 200 samples
+    raw = 15_000 + 25_000 * rise**2 + rng.normal(0, 20, rise.shape)
+    prepared = prepared_of(raw)
+    kept = apply_cuts(prepared, fit_cuts(prepared, CUTS))
+    assert kept.rejections.get("baseline_slope", 0) <= 2

@@ -9,10 +9,11 @@ from typing import TypeVar
 import numpy as np
 
 from cpunet.analysis.style import NO_NOISE
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.finishing import finish
 from cpunet.electronics.rivals.base import Rival
-from cpunet.electronics.rivals.finish import finish, translate_like_data
-from cpunet.electronics.rivals.noise import BaselineNoise
 from cpunet.electronics.rivals.registry import RIVALS
+from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.electronics.rivals.finish import finish
+from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputSet
 from cpunet.pulses.container import FloatArray

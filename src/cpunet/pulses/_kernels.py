@@ -28,6 +28,9 @@ N_COLUMNS = 7
 # The alignment moves the baseline window and the baseline moves the 99.9 % threshold,
 # by a thousandth of its own change: two rounds settle all but exact ties.
 _ROUNDS = 4
+# Where a pulse has begun: above a hundredth of its height and clear of the noise, with room
+# for what lies below.
+_BEGUN_FRACTION, _BEGUN_RMS, _BEGUN_MARGIN = 0.01, 8.0, 16
 # Noise alone makes a maximum of three to four RMS in a thousand samples.
 _MIN_AMPLITUDE_RMS = 8.0
 # An earlier pulse disturbs one part of a baseline; the quietest part tells the noise.
@@ -241,6 +244,21 @@ def _quietest_rms(baseline):  # type: ignore[no-untyped-def]
     return quietest
 
 
+@_compiled
+def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-def]
+    """The `baseline_samples` of the record before the pulse begins; three at least.
+
+    The baseline part of a window holds the beginning of a slow pulse, whose slope would
+    make the quality cuts drop long drift times.  What begins in the first half of that
+    part is no slow pulse but a second one, and stays in for the cuts to see.
+    """
+    level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
+    begun = _crossing(trace, min(align, len(trace) - 1), level)
+    middle = align - s.samples_before + s.baseline_samples // 2
+    stop = min(max(begun - _BEGUN_MARGIN, middle, 3), len(trace))
+    return max(stop - s.baseline_samples, 0), stop
+
+
 @_compiled_finite
 def _residual_squares(tail, logs, mean, slope):  # type: ignore[no-untyped-def]
     """Squared residuals of the logarithm, each in units of one over the value."""
@@ -307,8 +325,11 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
     if s.simulated:
         scale = top - base
     else:
-        if top - mean < _MIN_AMPLITUDE_RMS * _quietest_rms(trace[first:last]):
+        quietest = _quietest_rms(trace[first:last])
+        if top - mean < _MIN_AMPLITUDE_RMS * quietest:
             return NO_AMPLITUDE
+        first, last = _before_pulse(trace, align, mean, top, quietest, s)
+        _, slope, rms = _line(trace[first:last])
         if start < -s.max_padding_before or stop > length + s.max_padding_after:
             return WINDOW_OUTSIDE_RECORD
         if start + s.baseline_samples <= 0:  # nothing to take the baseline from

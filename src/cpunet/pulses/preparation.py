@@ -72,7 +72,8 @@ class Prepared:
     align_sample
         Sample of the raw trace that became sample ``samples_before``.
     baseline_rms
-        RMS of the raw baseline window about a straight line, divided by `scale`.
+        RMS about a straight line of the last ``baseline_samples`` of the raw trace before
+        the pulse begins, divided by `scale`.
     baseline_slope
         Slope of that line divided by `scale`, in 1/ms.
     tail_slope

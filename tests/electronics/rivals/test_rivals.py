@@ -12,13 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.analysis.paired import paired_scores
-from cpunet.electronics.rivals.finish import finish, translate_like_data
+from cpunet.electronics.finishing import finish
 from cpunet.electronics.rivals.gauss_exp import GaussExp
 from cpunet.electronics.rivals.raw import Raw
 from cpunet.electronics.rivals.rc import RC
 from cpunet.electronics.rivals.registry import RIVALS
 from cpunet.electronics.rivals.superpulse import LEAD, Superpulse
 from cpunet.electronics.rivals.superpulses import crossing
+from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare

@@ -51,7 +51,7 @@ class Rival(Protocol):
         -------
         numpy.ndarray
             Records with room on both sides of the window, see `response`, neither
-            aligned nor normalised; `finish.finish` makes windows of them.
+            aligned nor normalised; `finishing.finish` makes windows of them.
         """
 
     def describe(self) -> Mapping[str, float]:

@@ -16,10 +16,10 @@ import scipy.optimize
 import scipy.signal
 
 from cpunet.analysis.parameters import current_amplitude
+from cpunet.electronics.finishing import blocks
 from cpunet.electronics.rivals.base import Values, check_sets, check_windows
 from cpunet.electronics.rivals.response import (
     ROOM_BEFORE,
-    blocks,
     currents,
     integrated,
     record_length,

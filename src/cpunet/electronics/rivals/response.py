@@ -8,13 +8,12 @@ cut out again around a later alignment.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 import scipy.signal
 
+from cpunet.electronics.finishing import blocks
 from cpunet.electronics.rivals.base import Values
 from cpunet.pulses.container import FloatArray
 
@@ -23,8 +22,6 @@ Spectrum = npt.NDArray[np.complex128]
 # Samples of room; a window of 800 becomes a record of 1400, a fast length of the FFT.
 ROOM_BEFORE = 200
 ROOM_AFTER = 400
-
-BLOCK = 512  # pulses at a time, to bound memory
 
 
 def record_length(window: int) -> int:
@@ -57,11 +54,6 @@ def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Value
     """Charge pulses of currents, each step decaying with the slope of its logarithm."""
     kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -kept], current, axis=1), float)
-
-
-def blocks(n: int) -> Iterator[slice]:
-    """Rows of all pulses, `BLOCK` at a time."""
-    return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
 
 
 def respond(

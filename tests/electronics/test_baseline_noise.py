@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from cpunet.electronics.rivals.finish import finish
-from cpunet.electronics.rivals.noise import BaselineNoise
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe

@@ -1,17 +1,24 @@
-"""From the response of a rival to windows made exactly as those of the data are."""
+"""From the response of the electronics to windows made exactly as those of the data are."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.rivals.base import Rival
-from cpunet.electronics.rivals.noise import BaselineNoise
-from cpunet.electronics.rivals.response import BLOCK, blocks
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
+
+BLOCK = 512  # pulses at a time, to bound memory
+
+
+def blocks(n: int) -> Iterator[slice]:
+    """Rows of all pulses, `BLOCK` at a time."""
+    return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
 
 
 def finish(
@@ -34,7 +41,7 @@ def finish(
     ----------
     records
         Noise-free pulses of any height with room around the window, shape
-        ``(n, samples)``, see `base.Rival.translate`.
+        ``(n, samples)``.
     config
         The preparation of the data.
     dt_ns
@@ -79,57 +86,6 @@ def finish(
         prepared = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
         windows[kept[prepared.index]] = prepared.pulses.waveforms
     return windows
-
-
-def translate_like_data(
-    rival: Rival,
-    pulses: Pulses,
-    config: PreparationConfig,
-    *,
-    noise: BaselineNoise | None = None,
-    seed: int | np.random.Generator = 0,
-) -> Pulses:
-    """Translate prepared simulated pulses and finish them like data.
-
-    Parameters
-    ----------
-    rival
-        A fitted method.
-    pulses
-        Prepared simulated pulses.
-    config
-        The preparation of the run.
-    noise, seed
-        As for `finish`; the energies are the pulses' own.
-
-    Returns
-    -------
-    Pulses
-        The same events; a row of NaN where a pulse cannot be prepared.
-
-    Raises
-    ------
-    CpunetError
-        If the pulses are sampled otherwise than those of the fit, or as `finish`.
-    """
-    if not np.isclose(pulses.dt_ns, rival.dt_ns):
-        raise CpunetError(
-            f"the pulses are sampled every {pulses.dt_ns:g} ns, {rival.name} was fitted to "
-            f"{rival.dt_ns:g} ns; resample the pulses"
-        )
-    rng = np.random.default_rng(seed)
-    windows = np.empty((len(pulses), config.length), np.float32)
-    for first in range(0, len(pulses), BLOCK):
-        part = pulses[first : first + BLOCK]
-        windows[first : first + BLOCK] = finish(
-            rival.translate(part.waveforms),
-            config,
-            dt_ns=pulses.dt_ns,
-            noise=noise,
-            energy_kev=part.energy_kev,
-            seed=rng,
-        )
-    return pulses.with_waveforms(windows)
 
 
 def _check_noise(

@@ -14,8 +14,9 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+import scipy.optimize
 
-from cpunet.electronics.rivals.base import Values
+from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -24,7 +25,12 @@ from cpunet.recipes.schema import PreparationConfig
 LEAST_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
 FEWEST = 30  # flat baselines
 SHORTEST_SHARE = 0.1  # of the baselines may be shorter than those used
-START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 16  # where the pulse begins, with room
+# Where a pulse is seen to begin, and the samples before that in which it may have crept up.
+START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
+# Below the third frequency of a baseline its mean and the window's leakage hide the
+# spectrum; there it follows from how the noise drifts apart over the baseline's length.
+FIRST_CLEAN_BIN, RECORD_SAMPLES = 3, 8192
+CORNERS, LAGS = 8, 40  # of the slow part's Lorentzians; at which the drift is compared
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and how often
 SIGMA_PER_MAD = 1.4826
 
@@ -39,7 +45,7 @@ class BaselineNoise:
         Mean square per sample and frequency bin, at the frequencies of a real FFT of
         `samples`: the expected square of a bin over `samples`, (prepared units x keV)^2.
     samples, dt_ns
-        Length of the baselines and their sampling period.
+        Length of that FFT and the sampling period.
     n_baselines
         How many flat baselines it was estimated from.
     """
@@ -73,14 +79,8 @@ class BaselineNoise:
                 f"only {len(flat)} flat baselines among {len(raw)} traces; give more traces "
                 f"(at least {FEWEST} with known energy)"
             )
-        samples = flat.shape[1]
-        window = np.hanning(samples + 1)[:-1]
-        centred = (flat - flat.mean(axis=1, keepdims=True)) * window
-        power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-        density = power.mean(axis=0) / (window @ window)
-        # What the mean took away leaks from 0 into the neighbouring bin.
-        density[:2] = density[2]
-        return cls(density, samples, raw.dt_ns, len(flat))
+        density = _with_slow_part(_periodogram(flat), _structure_function(flat))
+        return cls(density, 2 * (len(density) - 1), raw.dt_ns, len(flat))
 
     @property
     def rms(self) -> float:
@@ -119,7 +119,7 @@ class BaselineNoise:
                 "1/energy, so give the energies"
             )
         # Twice as long as needed, so that end and beginning know nothing of each other.
-        long = scipy.fft.next_fast_len(2 * length, real=True)
+        long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         density = self._density_for(long)[: long // 2 + 1]
         bins = rng.standard_normal((len(energy_kev), len(density), 2)).view(complex)[..., 0]
         noise = scipy.fft.irfft(bins * np.sqrt(0.5 * long * density), long, axis=1)
@@ -159,6 +159,66 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
     return np.asarray(
         (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
     )
+
+
+def _periodogram(baselines: Values) -> Values:
+    samples = baselines.shape[1]
+    window = np.hanning(samples + 1)[:-1]
+    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
+    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+    return np.asarray(power.mean(axis=0) / (window @ window), float)
+
+
+def _structure_function(baselines: Values) -> Values:
+    """Half the mean square difference of samples 0, 1, 2 ... apart.
+
+    Unlike a spectrum it needs no mean to be taken off, so that nothing is lost of noise
+    slower than the baseline.
+    """
+    n, samples = baselines.shape
+    padded = scipy.fft.next_fast_len(2 * samples, real=True)
+    centred = baselines - baselines.mean(axis=1, keepdims=True)
+    power = np.zeros(padded // 2 + 1)
+    for rows in range(0, n, 512):
+        power += (np.abs(scipy.fft.rfft(centred[rows : rows + 512], padded)) ** 2).sum(axis=0)
+    products = scipy.fft.irfft(power, padded)[:samples]
+    squares = np.cumsum((centred**2).sum(axis=0))
+    lag = np.arange(samples)
+    # the squares of the samples that have a partner later, and of those that have one earlier
+    left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
+    return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)
+
+
+def _with_slow_part(density: Values, drift: Values) -> Values:
+    """The spectrum down to the frequencies of `RECORD_SAMPLES`.
+
+    Parameters
+    ----------
+    density, drift
+        Periodogram and structure function of the baselines.
+
+    Returns
+    -------
+    array
+        Density at the frequencies of a real FFT of `RECORD_SAMPLES`: as measured from
+        `FIRST_CLEAN_BIN` on, and rising from there towards 0 by a sum of Lorentzians, none
+        of them negative, whose structure function comes closest to `drift`.
+    """
+    samples = len(drift)
+    frequency = np.arange(RECORD_SAMPLES // 2 + 1) / RECORD_SAMPLES
+    known = np.arange(len(density)) / samples
+    join = known[FIRST_CLEAN_BIN]
+    fast = np.interp(frequency, known[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
+    corners = np.geomspace(2 / RECORD_SAMPLES, join, CORNERS)[:, np.newaxis]
+    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
+    slow = np.maximum(slow, 0)
+    lags = np.unique(np.geomspace(4, 0.9 * samples, LAGS).astype(int))
+    # both signs of the frequency; a density of 1 is a mean square of 1
+    apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / RECORD_SAMPLES
+    weights = 1 / drift[lags]
+    rest = (drift[lags] - apart @ fast) * weights
+    heights, _ = scipy.optimize.nnls((apart @ slow.T) * weights[:, np.newaxis], rest)
+    return np.asarray(fast + heights @ slow, float)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:

@@ -1,0 +1,63 @@
+"""Simulated pulses through a rival, finished like data."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.finishing import blocks, finish
+from cpunet.electronics.rivals.base import Rival
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.recipes.schema import PreparationConfig
+
+
+def translate_like_data(
+    rival: Rival,
+    pulses: Pulses,
+    config: PreparationConfig,
+    *,
+    noise: BaselineNoise | None = None,
+    seed: int | np.random.Generator = 0,
+) -> Pulses:
+    """Translate prepared simulated pulses and finish them like data.
+
+    Parameters
+    ----------
+    rival
+        A fitted method.
+    pulses
+        Prepared simulated pulses.
+    config
+        The preparation of the run.
+    noise, seed
+        As for `finish`; the energies are the pulses' own.
+
+    Returns
+    -------
+    Pulses
+        The same events; a row of NaN where a pulse cannot be prepared.
+
+    Raises
+    ------
+    CpunetError
+        If the pulses are sampled otherwise than those of the fit, or as `finish`.
+    """
+    if not np.isclose(pulses.dt_ns, rival.dt_ns):
+        raise CpunetError(
+            f"the pulses are sampled every {pulses.dt_ns:g} ns, {rival.name} was fitted to "
+            f"{rival.dt_ns:g} ns; resample the pulses"
+        )
+    rng = np.random.default_rng(seed)
+    windows = np.empty((len(pulses), config.length), np.float32)
+    for rows in blocks(len(pulses)):
+        part = pulses[rows]
+        windows[rows] = finish(
+            rival.translate(part.waveforms),
+            config,
+            dt_ns=pulses.dt_ns,
+            noise=noise,
+            energy_kev=part.energy_kev,
+            seed=rng,
+        )
+    return pulses.with_waveforms(windows)
