@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside as aside_with_marker
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import refuse_existing, require_replaceable, written_aside
 
 
 def folder_written_aside(target, *, force=False):
@@ -172,6 +172,18 @@ def test_force_replaces_nothing_but_folders_of_its_kind(tmp_path):
         (aside / "run.json").touch()
     assert listing(target) == ["run.json"]
     assert listing(tmp_path) == ["home"]
+
+
+def test_require_replaceable(tmp_path):
+    target = tmp_path / "run"
+    require_replaceable(target, marker="run.json")
+    target.mkdir()
+    require_replaceable(target, marker="run.json")
+    (target / "thesis.tex").touch()
+    with pytest.raises(CpunetError, match=r"is no folder with a run\.json"):
+        require_replaceable(target, marker="run.json")
+    (target / "run.json").touch()
+    require_replaceable(target, marker="run.json")
 
 
 NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)

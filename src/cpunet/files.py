@@ -65,11 +65,7 @@ def folder_written_aside(target: Path, *, marker: str, force: bool = False) -> I
     """
     target = Path(target)
     refuse_existing(target, force=force)
-    if target.exists() and not _replaceable(target, marker):
-        raise CpunetError(
-            f"{target}: is no folder with a {marker}, so --force does not replace it; "
-            "choose another name"
-        )
+    require_replaceable(target, marker=marker)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -83,10 +79,6 @@ def folder_written_aside(target: Path, *, marker: str, force: bool = False) -> I
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
-
-
-def _replaceable(folder: Path, marker: str) -> bool:
-    return folder.is_dir() and ((folder / marker).is_file() or not any(folder.iterdir()))
 
 
 def _take_the_place(aside: Path, target: Path) -> None:
@@ -108,6 +100,21 @@ def refuse_existing(target: Path, *, force: bool = False) -> None:
     """Raise a `CpunetError` if `target` is there already and `force` is off."""
     if target.exists() and not force:
         raise CpunetError(f"{target}: exists already; choose another name or give --force")
+
+
+def require_replaceable(target: Path, *, marker: str) -> None:
+    """Raise a `CpunetError` if `target` is there, but no folder that may be replaced.
+
+    An empty folder may be, and one that holds the file `marker`.
+    """
+    if not target.exists():
+        return
+    made = target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))
+    if not made:
+        raise CpunetError(
+            f"{target}: is no folder with a {marker}, so --force does not replace it; "
+            "choose another name"
+        )
 
 
 def _umask() -> int:

@@ -12,9 +12,9 @@ from scipy.special import ndtr
 
 from cpunet.analysis import figures
 from cpunet.analysis.comparisons import compare, data_axis
-from cpunet.analysis.parameters import PARAMETERS
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
+from cpunet.pulses.parameters import PARAMETERS
 from cpunet.recipes.schema import ScoreConfig
 
 SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)

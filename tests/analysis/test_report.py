@@ -112,7 +112,7 @@ def test_page_shows_scores_counts_and_provenance(report):
     for text in (
         "SEP: 200 simulated, 200 measured pulses",
         '<th scope="col">IoU [%]</th>',
-        "<td>Ceiling</td>",
+        ">Ceiling</td>",
         "Drift time",
         "<td>REN translation</td><td>0.25</td><td>–</td>",
         "<td>data: saturated</td><td>3</td>",
@@ -121,6 +121,13 @@ def test_page_shows_scores_counts_and_provenance(report):
         "<td>device</td><td>cpu</td>",
     ):
         assert text in html
+
+
+def test_names_of_methods_are_aligned_as_words(report):
+    html = (report / "report.html").read_text()
+    left = re.findall(r'<t[hd][^>]*style="text-align: left">([^<]*)</t[hd]>', html)
+    filled, empty = ["Method", "Simulation", "REN translation", "Ceiling"], ["Method"]
+    assert left == [*filled, *empty]
 
 
 def test_a_report_of_nothing_can_be_written(tmp_path):

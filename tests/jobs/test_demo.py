@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,30 +15,55 @@ from cpunet.jobs.demo import demonstrate
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 
-RECIPE = load_recipe(
-    "small",
-    [
-        "generator.width=2",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
-        "training.iterations=2",
-        "training.decay_start=1",
-        "training.batch_size=2",
-        "training.statistics_batches=1",
-        "training.log_interval=1",
-    ],
+TINY = (
+    "generator.width=2",
+    "discriminator.embedding_dim=2",
+    "discriminator.hidden=2",
+    "training.iterations=2",
+    "training.decay_start=1",
+    "training.batch_size=2",
+    "training.statistics_batches=1",
+    "training.log_interval=1",
 )
+RECIPE = load_recipe("small", TINY)
 EVENTS = {"FEP": 240, "SEP": 60, "DEP": 60}
 RIVALS = ("rc", "gauss_exp", "superpulse")
 
 
+OPTIONS = {
+    "electronics": read_electronics("legend200"),
+    "detector": read_detector("ppc", ["grid_mm=0.2"]),
+    "recipe": RECIPE,
+    "events": EVENTS,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A demonstration and its scores; do not change it."""
+    out = tmp_path_factory.mktemp("whole") / "demo"
+    return out, demonstrate(**OPTIONS, out=out)
+
+
+@pytest.fixture
+def interrupted(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> Path:
+    """A copy that lacks its report."""
+    return Path(
+        shutil.copytree(whole[0], tmp_path / "demo", ignore=shutil.ignore_patterns("report"))
+    )
+
+
 def test_every_rival_and_the_truth_stand_beside_the_ren(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: tuple[Path, dict[str, Any]],
 ) -> None:
-    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path / "cache"))
-    electronics = read_electronics("legend200")
-    detector = read_detector("ppc", ["grid_mm=0.2"])
-    metrics = demonstrate(electronics, detector, RECIPE, EVENTS, tmp_path / "demo")
+    _, metrics = whole
     assert metrics["rivals"]["missing"] == {}
     assert set(metrics["rivals"]["fits"]) == set(RIVALS)
     for peak in EVENTS:
@@ -47,11 +75,110 @@ def test_every_rival_and_the_truth_stand_beside_the_ren(
         # a response fitted to the data comes nearer to the truth than none
         edges = {method: paired["edge_rmse"] for method, paired in scores["paired"].items()}
         assert max(edges[rival] for rival in RIVALS) < edges["raw"] / 3
-    stand = (tmp_path / "demo" / "stand" / "data.lh5").read_bytes()
-    with pytest.raises(CpunetError, match="exists"):
-        demonstrate(electronics, detector, RECIPE, EVENTS, tmp_path / "demo")
-    (tmp_path / "demo" / "report").rename(tmp_path / "first")
-    demonstrate(electronics, detector, RECIPE, EVENTS, tmp_path / "demo")
-    assert (tmp_path / "demo" / "stand" / "data.lh5").read_bytes() == stand
-    again = (tmp_path / "demo" / "report" / "metrics.json").read_bytes()
-    assert again == (tmp_path / "first" / "metrics.json").read_bytes()
+
+
+def test_finished_parts_are_kept_and_a_whole_one_is_refused(
+    whole: tuple[Path, dict[str, Any]], interrupted: Path
+) -> None:
+    first = whole[0] / "report" / "metrics.json"
+    made = [path.stat().st_mtime_ns for path in contents(interrupted)]
+    demonstrate(**OPTIONS, out=interrupted)
+    kept = [path for path in contents(interrupted) if "report" not in path.parts]
+    assert [path.stat().st_mtime_ns for path in kept] == made
+    assert (interrupted / "report" / "metrics.json").read_bytes() == first.read_bytes()
+    with pytest.raises(CpunetError, match="report: exists already"):
+        demonstrate(**OPTIONS, out=interrupted)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"seed": 1}, "stand: made with seed = 0, not 1"),
+        ({"kind": "shifted"}, 'stand: made with kind = "matched", not "shifted"'),
+        (
+            {"electronics": read_electronics("ornl")},
+            'stand: made with electronics.name = "legend200", not "ornl"',
+        ),
+        (
+            {"detector": read_detector("ppc", ["grid_mm=0.2", "bias_V=2600"])},
+            "stand: made with sim.detector.bias_V = 2500.0, not 2600.0",
+        ),
+        (
+            {"events": {**EVENTS, "SEP": 70}},
+            "stand: made with sim.hits.events.SEP = 60, not 70",
+        ),
+        (
+            {"events": {"FEP": 240, "DEP": 60}},
+            "stand: made with sim.hits.windows_kev.SEP = [2103.011, 2104.011], not none",
+        ),
+        (
+            {"recipe": load_recipe("small", [*TINY, "training.batch_size=3"])},
+            "run: made with recipe.training.batch_size = 2, not 3",
+        ),
+    ],
+)
+def test_parts_made_with_other_options_are_not_mixed(
+    interrupted: Path, changed: dict[str, Any], said: str
+) -> None:
+    before = contents(interrupted)
+    message = refused(interrupted, **changed)
+    assert message.startswith(f"{interrupted}/{said}; give --force")
+    assert message.endswith("or another --out")
+    assert contents(interrupted) == before
+
+
+def test_the_description_of_a_recipe_does_not_matter(
+    interrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cpunet.jobs.demo.validate_run", lambda *_, **__: {"kept": True})
+    other = RECIPE.model_copy(update={"description": "another text"})
+    assert demonstrate(**{**OPTIONS, "recipe": other}, out=interrupted) == {"kept": True}
+
+
+def test_a_run_without_its_stand_is_not_taken(interrupted: Path) -> None:
+    shutil.rmtree(interrupted / "stand")
+    assert "run: its stand is gone" in refused(interrupted)
+
+
+@pytest.mark.parametrize("text", [None, "{", "[1]", "{}"])
+def test_a_damaged_stand_is_told(interrupted: Path, text: str | None) -> None:
+    path = interrupted / "stand" / "stand.json"
+    path.unlink()
+    if text is not None:
+        path.write_text(text)
+    refused(interrupted)
+
+
+def test_force_removes_nothing_but_what_a_demonstration_made(interrupted: Path) -> None:
+    report = interrupted / "report"
+    report.mkdir()
+    (report / "thesis.tex").touch()
+    before = contents(interrupted)
+    assert "report: is no folder with a metrics.json" in refused(interrupted, force=True)
+    assert contents(interrupted) == before
+    # a slip in the options is found before anything is lost
+    (report / "thesis.tex").rename(report / "metrics.json")
+    before = contents(interrupted)
+    assert "give at least 1 event" in refused(interrupted, force=True, events={"FEP": 0})
+    assert contents(interrupted) == before
+
+
+def test_force_makes_all_anew(interrupted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cpunet.jobs.demo.validate_run", lambda *_, **__: {})
+    made = (interrupted / "stand" / "data.lh5").read_bytes()
+    (interrupted / "run" / "old").touch()
+    demonstrate(**OPTIONS, out=interrupted, seed=1, force=True)
+    assert (interrupted / "stand" / "data.lh5").read_bytes() != made
+    assert not (interrupted / "run" / "old").exists()
+
+
+def contents(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def refused(out: Path, **changed: Any) -> str:
+    with pytest.raises(CpunetError) as caught:
+        demonstrate(**{**OPTIONS, **changed}, out=out)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message

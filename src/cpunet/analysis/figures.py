@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import Comparison, histogram
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.parameters import PARAMETERS
 from cpunet.analysis.style import COLOURS, DATA_FILL, colours, label, styled
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import PARAMETERS
 
 Values = npt.NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.analysis.parameters import PARAMETERS
 from cpunet.analysis.style import label
+from cpunet.pulses.parameters import PARAMETERS
 
 METRICS = "metrics.json"
 DPI = 150
@@ -105,7 +105,7 @@ def _parameter_table(parameters: Mapping[str, Any]) -> str:
             title = ""
         ceiling = _percent(iou.get("ceiling"), error.get("ceiling"))
         rows.append([title, "Ceiling", ceiling, "", ""])
-    return _table(["Parameter", "Method", "IoU [%]", "W₁", "KS"], rows)
+    return _table(["Parameter", "Method", "IoU [%]", "W₁", "KS"], rows, names=2)
 
 
 def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
@@ -131,11 +131,19 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     return rows
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    body = "\n".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], names: int = 1) -> str:
+    """A table whose first columns, as many as `names`, hold words, the others numbers."""
+    # the page aligns numbers, and the first column already as words
+    styles = ["", *[' style="text-align: left"'] * (names - 1), *[""] * (len(head) - names)]
+
+    def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
+        return "".join(
+            f"<{tag}{attribute}{style}>{escape(cell)}</{tag}>"
+            for cell, style in zip(row, styles, strict=True)
+        )
+
+    top = cells("th", head, ' scope="col"')
+    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return (
         f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody>\n</table></div>"

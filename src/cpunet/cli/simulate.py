@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,15 +9,12 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.cli.values import parse_events, parse_numbers, parse_resolution
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from cpunet.jobs.hit_sources import HitSource, Window
-    from cpunet.jobs.simulate import Resolution
+    from cpunet.jobs.hit_sources import HitSource
     from cpunet.jobs.simulation_summary import Summary
-    from cpunet.recipes.schema import PeakConfig
 
 HITS, GAMMAS = "Hits from a file", "Hits from the built-in gamma Monte Carlo"
 PULSES, OUTPUT = "Pulses", "Output"
@@ -207,14 +203,14 @@ def simulate(
     source: HitSource
     if hits is not None:
         chosen = energy_windows(peak, peaks, window_kev) if peak else []
-        x, y, z = _numbers(origin or "0,0,0", 3, "--origin")
+        x, y, z = parse_numbers(origin or "0,0,0", 3, "--origin")
         transform = Transform((x, y, z), flip_z)
         source = HitFile(
             hits, hits_detector, transform, length_unit, energy_unit, tuple(chosen)
         )
     else:
-        chosen, numbers = _wanted(str(events), peak, peaks, window_kev)
-        source = GammaSource(tuple(chosen), numbers, source_height_mm, source_radius_mm, seed)
+        chosen, wanted = parse_events(str(events), peak, peaks, window_kev)
+        source = GammaSource(tuple(chosen), wanted, source_height_mm, source_radius_mm, seed)
     overrides = [*(set_values or ())]
     if temperature is not None:
         overrides.append(f"temperature_K={temperature}")
@@ -233,7 +229,7 @@ def simulate(
         windows=tuple(chosen or energy_windows(",".join(peaks), peaks, window_kev)),
         mode="auto" if exact is None else "exact" if exact else "library",
         cluster_mm=cluster_mm,
-        resolution=_resolution(resolution),
+        resolution=parse_resolution(resolution),
         seed=seed,
         force=force,
         monitor=monitor(),
@@ -261,45 +257,3 @@ def summary_lines(summary: Summary) -> list[str]:
     if summary.not_collected:
         told.insert(3, f"{summary.not_collected} hits not collected in full; lengthen --length")
     return told
-
-
-def _wanted(
-    events: str, peak: str | None, peaks: Mapping[str, PeakConfig], window_kev: float
-) -> tuple[list[Window], tuple[int, ...]]:
-    """Windows and the events wanted in each, of ``"1000"`` or ``"FEP=1000,DEP=300"``."""
-    from cpunet.jobs.hit_sources import energy_windows
-
-    if "=" not in events:
-        windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
-        return windows, (_count(events),) * len(windows)
-    if peak is not None:
-        raise CpunetError(f"--events {events} names its peaks; leave out --peak")
-    pairs = [part.partition("=") for part in events.split(",")]
-    windows = energy_windows(",".join(name for name, _, _ in pairs), peaks, window_kev)
-    return windows, tuple(_count(number) for _, _, number in pairs)
-
-
-def _count(text: str) -> int:
-    # underscores and signs, which int() takes, are more likely slips
-    if not text.strip().isdecimal():
-        raise CpunetError(f"--events: {text!r} is no number of events; give N or FEP=N,DEP=M")
-    return int(text)
-
-
-def _numbers(text: str, n: int, option: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise CpunetError(f"{option} {text}: expected {n} numbers separated by commas")
-    return numbers
-
-
-def _resolution(text: str | None) -> Resolution | None:
-    from cpunet.jobs.simulate import Resolution
-
-    if text is None:
-        return None
-    noise, fano = _numbers(text, 2, "--resolution")
-    return Resolution(noise, fano)

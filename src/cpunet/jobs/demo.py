@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing
+from cpunet.jobs.demo_parts import PARTS, remove_parts, require_same_parts
 from cpunet.jobs.hit_sources import energy_windows
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.stand import Kind, make_stand
+from cpunet.jobs.stand import write_stand
+from cpunet.jobs.stand_plan import Kind, StandPlan
 from cpunet.jobs.train import train_run
 from cpunet.jobs.validate import validate_run
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 
 QUIET = Monitor()
-PARTS = ("stand", "run", "report")
+_PEAK = "FEP"  # to train on
 _HALF_WINDOW_KEV = 0.5  # of deposited energy about each line
 
 
@@ -48,8 +49,10 @@ def demonstrate(
         Wanted on either side, by line.
     out
         Folder of ``stand``, ``run`` and ``report``. Parts that are there from an
-        interrupted demonstration are kept, unless `force` makes all of them anew.
-    seed, device, force, monitor
+        interrupted demonstration of the same options are kept.
+    force
+        Make all parts anew.
+    seed, device, monitor
         As for `cpunet.jobs.train.train_run`.
 
     Returns
@@ -60,30 +63,25 @@ def demonstrate(
     Raises
     ------
     CpunetError
-        If the report exists, or a step fails.
+        If the report exists, a part that is there was made with other options, a step
+        fails, or, with `force`, something else is in the place of a part.
     """
-    stand, run, report = (out / part for part in PARTS)
-    if force:
-        for part in (report, run, stand):
-            shutil.rmtree(part, ignore_errors=True)
-    refuse_existing(report, force=force)
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is no folder; give another --out")
+    stand, run, report = (out / part for part in PARTS)
+    refuse_existing(report, force=force)
+    windows = tuple(energy_windows(",".join(events), recipe.peaks, _HALF_WINDOW_KEV))
+    plan = StandPlan.of(
+        electronics, detector, windows, tuple(events.values()), kind=kind, seed=seed
+    )
+    if force:
+        remove_parts(out)
+    require_same_parts(out, plan, recipe, _PEAK)
     if not stand.exists():
-        windows = tuple(energy_windows(",".join(events), recipe.peaks, _HALF_WINDOW_KEV))
-        make_stand(
-            electronics,
-            detector,
-            windows,
-            tuple(events.values()),
-            stand,
-            kind=kind,
-            seed=seed,
-            monitor=monitor,
-        )
+        write_stand(plan, stand, monitor=monitor)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     if not run.exists():
-        train_run(sim, data, run, recipe, seed=seed, device=device, monitor=monitor)
+        train_run(sim, data, run, recipe, peak=_PEAK, seed=seed, device=device, monitor=monitor)
     return validate_run(
         run,
         sim,

@@ -15,7 +15,7 @@ from cpunet.analysis.figures import (
     mean_pulses,
     parameter_histograms,
 )
-from cpunet.analysis.parameters import Values
+from cpunet.pulses.parameters import Values
 from cpunet.training.loop import Record
 from cpunet.translation.translator import IREN, REN
 

@@ -17,7 +17,7 @@ from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
 
@@ -138,11 +138,8 @@ def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T |
 
 
 def _noise(data_file: InputFile, recipe: Recipe) -> BaselineNoise:
-    blocks: list[Pulses] = []
-    for block in data_file.open().blocks(NOISE_TRACES):
-        known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
-        blocks.append(block[known])
-        break
-    if not blocks:
+    block = next(iter(data_file.open().blocks(NOISE_TRACES)), None)
+    if block is None:
         raise CpunetError(f"{data_file.path}: holds no traces to measure the noise from")
-    return BaselineNoise.from_traces(blocks[0], recipe.preparation)
+    known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
+    return BaselineNoise.from_traces(block[known], recipe.preparation)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,36 +15,22 @@ import cpunet
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.electronics.response import respond
-from cpunet.electronics.shifted import Shift
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.growing_archive import GrowingArchive
-from cpunet.jobs.hit_sources import GammaSource, Window
+from cpunet.jobs.hit_sources import Window
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.simulate import merge_hits
+from cpunet.jobs.stand_plan import LABELS, OTHER, Kind, Labels, StandPlan
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import PulseWriter
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
-from cpunet.simulation.settings import SimulationSettings
 
 QUIET = Monitor()
 MARKER = "stand.json"
-Kind = Literal["matched", "shifted"]
-Labels = npt.NDArray[np.int64]
-
-LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
-OTHER = 3
-# Period of the simulated pulses that pass the chain; at 4 ns they are those of the library.
-_FINE_NS = 4.0
 # Events of a side from which on building a library of pulses (20 s on two cores) takes less
 # time than drifting their hits, some 20 each.
 _LIBRARY_FROM_EVENTS = 20_000
-# As `cpunet simulate` merges hits.
-_CLUSTER_MM = 0.05
 
 
 @dataclass
@@ -57,38 +42,6 @@ class StandSummary:
     sim_lines: Counter[str] = field(default_factory=Counter)
     data_lines: Counter[str] = field(default_factory=Counter)
     flags: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass(frozen=True)
-class Side:
-    """One side of a stand: its detector, how it is simulated, its events."""
-
-    detector: Detector
-    settings: SimulationSettings
-    source: GammaSource
-
-    def library(self, monitor: Monitor) -> Library:
-        """Pre-computed pulses."""
-        with monitor.stage(f"Library of pulses of {self.detector.name}"):
-            return build_library(compute_fields(self.detector), self.settings)
-
-    def blocks(
-        self, title: str, library: Library | None, monitor: Monitor
-    ) -> Iterator[tuple[Pulses, Labels]]:
-        """Its pulses, finely sampled, and their lines, block by block."""
-        with monitor.stage(f"Fields of {self.detector.name}"):
-            fields = compute_fields(self.detector)
-        mode: Literal["exact", "library"] = "exact" if library is None else "library"
-        opened = self.source.open(self.detector)
-        with monitor.stage(title, opened.n_events) as advance:
-            for hits in opened.blocks:
-                merged = merge_hits(hits, self.detector, _CLUSTER_MM)
-                pulses = simulate_events(
-                    fields, merged, self.settings, mode, library=library
-                ).pulses()
-                if len(pulses):
-                    yield pulses, labels_of(pulses.energy_kev, self.source.windows)
-                advance(len(hits))
 
 
 def make_stand(
@@ -140,67 +93,46 @@ def make_stand(
         If the folder exists, a window has no events, the chain cannot follow the pulses,
         or more than half of the traces saturate.
     """
-    for window, number in zip(windows, events, strict=True):
-        if number < 1:
-            raise CpunetError(f"--events {window.name}={number}: give at least 1 event")
-    many = sum(events) >= _LIBRARY_FROM_EVENTS
-    settings = SimulationSettings(dt_ns=_fine_ns(electronics))
-    shift = Shift.default() if kind == "shifted" else None
-    # seeds of the events of both sides and of the readout's blocks
-    sim_seed, data_seed, readout_seed = map(
-        int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+    plan = StandPlan.of(
+        electronics,
+        detector,
+        windows,
+        events,
+        kind=kind,
+        height_mm=height_mm,
+        radius_mm=radius_mm,
+        seed=seed,
     )
-    sources = (
-        GammaSource(windows, events, height_mm, radius_mm, s) for s in (sim_seed, data_seed)
-    )
-    sim = Side(detector, settings, next(sources))
-    data = Side(
-        detector if shift is None else shift.detector(detector),
-        settings if shift is None else shift.settings(settings),
-        next(sources),
-    )
+    return write_stand(plan, out, force=force, monitor=monitor)
+
+
+def write_stand(
+    plan: StandPlan, out: Path, *, force: bool = False, monitor: Monitor = QUIET
+) -> StandSummary:
+    """Make a planned stand; the rest is as for `make_stand`."""
+    many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
     summary = StandSummary()
     with folder_written_aside(out, marker=MARKER, force=force) as folder:
-        library = sim.library(monitor) if many else None
-        _write_sim(folder, sim, library, electronics, summary, monitor)
-        if many and shift is not None:
-            library = data.library(monitor)
-        _write_data(folder, data, library, electronics, readout_seed, summary, monitor)
-        made = _made(electronics, kind, shift, sim, data, seed, summary)
+        library = plan.sim.library(monitor) if many else None
+        _write_sim(folder, plan, library, summary, monitor)
+        if many and plan.shift is not None:
+            library = plan.data.library(monitor)
+        _write_data(folder, plan, library, summary, monitor)
+        made = {"cpunet": cpunet.__version__, **plan.provenance(), "counts": vars(summary)}
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
     return summary
 
 
-def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
-    """0 DEP, 1 SEP, 2 FEP, 3 other, by which window the collected energies (keV) are in."""
-    labels = np.full(len(energy_kev), OTHER)
-    for window in windows:
-        # deposits add up to a line only within rounding
-        inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
-        labels[inside] = LABELS.get(window.name, OTHER)
-    return labels
-
-
-def _fine_ns(electronics: Electronics) -> float:
-    ratio = electronics.dt_ns / _FINE_NS
-    if abs(ratio - round(ratio)) > 1e-9:
-        raise CpunetError(
-            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
-            f"{_FINE_NS:g}, the pulses' period; choose another"
-        )
-    return _FINE_NS
-
-
 def _write_sim(
     folder: Path,
-    side: Side,
+    plan: StandPlan,
     library: Library | None,
-    electronics: Electronics,
     summary: StandSummary,
     monitor: Monitor,
 ) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
+    electronics, side = plan.electronics, plan.sim
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
     writer = PulseWriter(folder / "sim.lh5", attrs=_made_by())
     with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
@@ -217,22 +149,23 @@ def _write_sim(
 
 def _write_data(
     folder: Path,
-    side: Side,
+    plan: StandPlan,
     library: Library | None,
-    electronics: Electronics,
-    seed: int,
     summary: StandSummary,
     monitor: Monitor,
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
+    electronics = plan.electronics
     labels: list[Labels] = []
     flags: list[npt.NDArray[np.uint8]] = []
     writer = PulseWriter(
         folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by()
     )
     with writer:
-        for fine, label in side.blocks("Measured events", library, monitor):
-            block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
+        for fine, label in plan.data.blocks("Measured events", library, monitor):
+            block_seed = np.random.SeedSequence(
+                (plan.readout_seed, writer.n_pulses)
+            ).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(_as_pulses(traces))
             labels.append(label)
@@ -282,32 +215,3 @@ def _by_line(labels: Labels) -> Counter[str]:
 
 def _made_by() -> dict[str, str | float]:
     return {"made_by": f"cpunet stand {cpunet.__version__}"}
-
-
-def _made(
-    electronics: Electronics,
-    kind: Kind,
-    shift: Shift | None,
-    sim: Side,
-    data: Side,
-    seed: int,
-    summary: StandSummary,
-) -> dict[str, Any]:
-    """How the stand was made."""
-    sides = {
-        name: {
-            "detector": side.detector.model_dump(mode="json"),
-            "settings": side.settings.model_dump(mode="json"),
-            "hits": side.source.provenance(),
-        }
-        for name, side in (("sim", sim), ("data", data))
-    }
-    return {
-        "cpunet": cpunet.__version__,
-        "kind": kind,
-        "shift": None if shift is None else shift.model_dump(mode="json"),
-        "seed": seed,
-        "electronics": electronics.model_dump(mode="json"),
-        **sides,
-        "counts": vars(summary),
-    }

@@ -11,7 +11,6 @@ import numpy as np
 
 from cpunet.analysis.comparisons import compare
 from cpunet.analysis.paired import paired_scores
-from cpunet.analysis.parameters import Values, pulse_parameters
 from cpunet.analysis.report import METRICS, write_report
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
@@ -28,6 +27,7 @@ from cpunet.jobs.rivals import RivalWindows, rival_windows
 from cpunet.jobs.train import resolve_device
 from cpunet.jobs.truth import read_response
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, read_losses

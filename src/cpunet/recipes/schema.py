@@ -6,9 +6,11 @@ in the recipe that needs it is an error, and so is one that nobody reads.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from cpunet.errors import CpunetError
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -89,6 +91,24 @@ class PunetConfig(Config):
     residual: bool
 
 
+class ResponseConfig(Config):
+    """A differentiable readout chain, see `cpunet.networks.response`.
+
+    ``poles_ns`` and ``decay_us`` are where free times start.  ``slow_ns`` and
+    ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
+    times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
+    ``ringing_ns`` are where the frequency and the damping of a ringing start; none if null.
+    """
+
+    name: Literal["response"]
+    poles_ns: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=4)]
+    slow_ns: tuple[Positive, ...]
+    decay_us: Positive
+    fast_decays_us: tuple[Positive, ...]
+    ringing_mhz: Positive | None
+    ringing_ns: Positive
+
+
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
@@ -145,6 +165,7 @@ class TrainingConfig(Config):
     them by that alone teaches nothing about the shape.
     """
 
+    method: Literal["cyclegan"]
     iterations: Count
     decay_start: Annotated[int, Field(ge=0)]
     batch_size: Annotated[int, Field(ge=2)]
@@ -161,6 +182,41 @@ class TrainingConfig(Config):
     losses: LossConfig
 
 
+class MatchingConfig(Config):
+    """A response matched to data by moments, see `cpunet.training.moments`.
+
+    Pulses are compared from ``before`` to ``after`` samples about their half maximum, once
+    the mean of ``baseline`` (samples before it, from and to) is 0 and that of the last
+    ``level_samples`` the level of the preparation.  ``segments`` are the edges, in samples
+    from the half maximum, of stretches whose means are compared; ``components`` the principal
+    components of the data that are, the first ``squares`` of them also in their squares;
+    ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
+    ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
+    ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
+    ``max_pulses`` bounds the sets, ``steps`` the iterations of the fit.
+    """
+
+    method: Literal["matching"]
+    before: Count
+    after: Count
+    baseline: tuple[Count, Count]
+    level_samples: Count
+    segments: tuple[int, ...]
+    components: Count
+    squares: Count
+    amplitude_bins: Count
+    amplitude_width: Positive
+    clip: Positive
+    ridge: Fraction
+    max_pulses: Annotated[int, Field(ge=100)]
+    steps: Count
+
+    @property
+    def iterations(self) -> int:
+        """The most steps of the training."""
+        return self.steps
+
+
 class ScoreConfig(Config):
     """Histograms and resampling of the comparison of two distributions."""
 
@@ -168,6 +224,21 @@ class ScoreConfig(Config):
     bootstraps: Annotated[int, Field(ge=2)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
     edge_samples: Count
+
+
+class CycleGanSettings(NamedTuple):
+    """The parts of a recipe that make a CycleGAN."""
+
+    generator: PunetConfig
+    discriminator: GruConfig
+    training: TrainingConfig
+
+
+class MatchingSettings(NamedTuple):
+    """The parts of a recipe that make a matched response."""
+
+    generator: ResponseConfig
+    training: MatchingConfig
 
 
 class Recipe(Config):
@@ -178,13 +249,59 @@ class Recipe(Config):
     peaks: dict[str, PeakConfig]
     preparation: PreparationConfig
     cuts: CutConfig
-    generator: PunetConfig
-    discriminator: GruConfig
-    training: TrainingConfig
+    generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
+    discriminator: GruConfig | None
+    training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
+
+    @property
+    def cyclegan(self) -> CycleGanSettings:
+        """The settings of a CycleGAN.
+
+        Raises
+        ------
+        CpunetError
+            If the recipe trains otherwise.
+        """
+        if not (
+            isinstance(self.generator, PunetConfig)
+            and isinstance(self.training, TrainingConfig)
+            and self.discriminator is not None
+        ):
+            raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
+        return CycleGanSettings(self.generator, self.discriminator, self.training)
+
+    @property
+    def matching(self) -> MatchingSettings:
+        """The settings of a response matched to data.
+
+        Raises
+        ------
+        CpunetError
+            If the recipe trains otherwise.
+        """
+        if not (
+            isinstance(self.generator, ResponseConfig)
+            and isinstance(self.training, MatchingConfig)
+        ):
+            raise CpunetError(f"recipe {self.name}: does not match a response")
+        return MatchingSettings(self.generator, self.training)
+
+    @model_validator(mode="after")
+    def _parts_belong_together(self) -> Recipe:
+        network = isinstance(self.generator, PunetConfig)
+        if network != isinstance(self.training, TrainingConfig):
+            raise ValueError(
+                "generator punet goes with training method cyclegan, response with matching"
+            )
+        if network != (self.discriminator is not None):
+            raise ValueError("a discriminator is needed for punet, and for it alone")
+        return self
 
     @model_validator(mode="after")
     def _windows_cover(self) -> Recipe:
+        if not isinstance(self.training, TrainingConfig):
+            return self
         losses = self.training.losses
         covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
         if covered != self.preparation.length:
@@ -196,6 +313,8 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _networks_fit(self) -> Recipe:
+        if self.discriminator is None:
+            return self
         length, step = self.preparation.length, self.discriminator.samples_per_step
         if length % 16 or length % step:
             raise ValueError(

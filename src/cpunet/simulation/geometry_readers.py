@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,15 @@ from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
+from cpunet.yaml_files import yaml_fields, yaml_names
 
+_FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
 
 
 def detector_names() -> list[str]:
     """Names of the detectors that come with the package."""
-    folder = files("cpunet.simulation") / "detectors"
-    return sorted(
-        f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml")
-    )
+    return yaml_names(_FOLDER)
 
 
 def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
@@ -52,8 +51,7 @@ def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
     """
     name = str(path)
     if name in detector_names():
-        text = (files("cpunet.simulation") / "detectors" / f"{name}.yaml").read_text()
-        values = _mapping(text, name)
+        values = _mapping((_FOLDER / f"{name}.yaml").read_text("utf-8"), name)
     else:
         values = _from_file(Path(path))
     for override in overrides:
@@ -86,14 +84,12 @@ def _from_file(path: Path) -> dict[str, Any]:
 
 
 def _mapping(text: str, name: str) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise CpunetError(f"detector {name}: no valid YAML or JSON ({reason})") from error
-    if not isinstance(values, Mapping):
-        raise CpunetError(f"detector {name}: holds no keys; see the examples in detectors/")
-    return dict(values)
+    return yaml_fields(
+        text,
+        f"detector {name}",
+        invalid="no valid YAML or JSON",
+        empty="holds no keys; see the examples in detectors/",
+    )
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -32,11 +32,11 @@ class CycleGan(nn.Module):
 
     def __init__(self, recipe: Recipe) -> None:
         super().__init__()
-        length = recipe.preparation.length
-        self.ren = PositionalUNet(recipe.generator, length)
-        self.iren = PositionalUNet(recipe.generator, length)
-        self.discriminator_data = GruDiscriminator(recipe.discriminator)
-        self.discriminator_sim = GruDiscriminator(recipe.discriminator)
+        length, (generator, discriminator, _) = recipe.preparation.length, recipe.cyclegan
+        self.ren = PositionalUNet(generator, length)
+        self.iren = PositionalUNet(generator, length)
+        self.discriminator_data = GruDiscriminator(discriminator)
+        self.discriminator_sim = GruDiscriminator(discriminator)
 
     def generator_parameters(self) -> list[nn.Parameter]:
         """Parameters of REN and IREN."""

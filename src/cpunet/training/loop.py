@@ -57,7 +57,7 @@ def train(
     for name, pulses in (("simulated", sim), ("measured", data)):
         if not len(pulses):
             raise CpunetError(f"no {name} pulses to train on")
-    config = recipe.training
+    config = recipe.cyclegan.training
     with _seeded(seed, device):
         model = CycleGan(recipe).to(device).train()
         decks = [
@@ -74,7 +74,7 @@ def train(
 def _iterate(
     model: CycleGan, decks: list[Deck], recipe: Recipe, listener: Listener | None
 ) -> None:
-    config = recipe.training
+    config = recipe.cyclegan.training
     step = Step(model, config)
     average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
     averages = [

@@ -6,11 +6,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
+from cpunet.yaml_files import yaml_fields, yaml_names
+
+_FOLDER = files("cpunet.electronics.presets")
 
 
 def electronics_names() -> list[str]:
@@ -21,10 +23,7 @@ def electronics_names() -> list[str]:
     >>> electronics_names()
     ['legend200', 'ornl', 'ringing']
     """
-    folder = files("cpunet.electronics.presets")
-    return sorted(
-        f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml")
-    )
+    return yaml_names(_FOLDER)
 
 
 def read_electronics(path: str | Path) -> Electronics:
@@ -47,16 +46,15 @@ def read_electronics(path: str | Path) -> Electronics:
     """
     name = str(path)
     if name in electronics_names():
-        text = (files("cpunet.electronics.presets") / f"{name}.yaml").read_text()
+        text = (_FOLDER / f"{name}.yaml").read_text("utf-8")
     else:
         text = _text(Path(path))
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise CpunetError(f"electronics {name}: not YAML ({reason})") from error
-    if not isinstance(values, dict):
-        raise CpunetError(f"electronics {name}: holds no fields; write lines such as dt_ns: 16")
+    values = yaml_fields(
+        text,
+        f"electronics {name}",
+        invalid="not YAML",
+        empty="holds no fields; write lines such as dt_ns: 16",
+    )
     try:
         return Electronics.model_validate(values)
     except ValidationError as error:

@@ -15,7 +15,6 @@ import numpy as np
 import scipy.optimize
 import scipy.signal
 
-from cpunet.analysis.parameters import current_amplitude
 from cpunet.electronics.finishing import blocks
 from cpunet.electronics.rivals.base import Values, check_sets, check_windows
 from cpunet.electronics.rivals.response import (
@@ -27,6 +26,7 @@ from cpunet.electronics.rivals.response import (
 from cpunet.electronics.rivals.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import current_amplitude
 
 LONGEST = 64  # samples of the largest tau that is tried
 MOST = 4000  # pulses that the match is made on

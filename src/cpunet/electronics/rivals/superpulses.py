@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from cpunet.analysis.parameters import tail_slope
 from cpunet.electronics.rivals.base import Values
 from cpunet.electronics.rivals.response import Spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import tail_slope
 
 Groups = list[npt.NDArray[np.int64]]
 

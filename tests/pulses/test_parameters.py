@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.analysis import parameters
-from cpunet.analysis.parameters import (
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import (
     PARAMETERS,
     current_amplitude,
     decay_constant_us,
@@ -17,8 +19,6 @@ from cpunet.analysis.parameters import (
     pulse_parameters,
     tail_slope,
 )
-from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 DT_NS = 16.0

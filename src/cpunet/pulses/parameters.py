@@ -83,6 +83,23 @@ def current_amplitude(waveforms: FloatArray) -> Values:
     return _by_blocks(_current_amplitude, waveforms, shortest)
 
 
+def current_amplitude_kernel() -> npt.NDArray[np.float32]:
+    """Weights with which the current's samples enter the amplitude's fine grid.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape ``(16, 2 * REACH + 1)``: for each step of a sample, the weights of the
+        current from `REACH` samples before to `REACH` after.
+    """
+    current = np.zeros((1, 4 * REACH + 2), np.float32)
+    current[0, 2 * REACH] = 1
+    grid = _averaged(current)[0].reshape(-1, UPSAMPLING)
+    around = grid[REACH : 3 * REACH + 1]
+    # a unit of current at 0 reaches sample j with the weight that j gives to sample -j
+    return np.ascontiguousarray(around[::-1].T)
+
+
 def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Values:
     """Time from a small fraction of the maximum to the maximum (paper, section 4.3.1).
 

@@ -1,0 +1,91 @@
+"""Options of ``cpunet simulate`` that hold several values in one word."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from cpunet.errors import CpunetError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from cpunet.jobs.hit_sources import Window
+    from cpunet.jobs.simulate import Resolution
+    from cpunet.recipes.schema import PeakConfig
+
+
+def parse_events(
+    events: str, peak: str | None, peaks: Mapping[str, PeakConfig], window_kev: float
+) -> tuple[list[Window], tuple[int, ...]]:
+    """Windows and the events wanted in each, of ``"1000"`` or ``"FEP=1000,DEP=300"``.
+
+    Parameters
+    ----------
+    events, peak
+        The words given; without names in `events`, `peak` names them (default: all).
+    peaks
+        The lines known.
+    window_kev
+        Half-width about a line.
+
+    Raises
+    ------
+    CpunetError
+        If a number or a line cannot be understood, or the lines are named twice.
+    """
+    from cpunet.jobs.hit_sources import energy_windows
+
+    if "=" not in events:
+        windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
+        return windows, (_count(events),) * len(windows)
+    if peak is not None:
+        raise CpunetError(f"--events {events} names its peaks; leave out --peak")
+    pairs = [part.partition("=") for part in events.split(",")]
+    windows = energy_windows(",".join(name for name, _, _ in pairs), peaks, window_kev)
+    return windows, tuple(_count(number) for _, _, number in pairs)
+
+
+def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:
+    """`n` finite numbers separated by commas.
+
+    Raises
+    ------
+    CpunetError
+        If `text` is anything else; it names the `option`.
+
+    Examples
+    --------
+    >>> parse_numbers("0,0,-12.5", 3, "--origin")
+    (0.0, 0.0, -12.5)
+    """
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise CpunetError(f"{option} {text}: expected {n} numbers separated by commas")
+    return numbers
+
+
+def parse_resolution(text: str | None) -> Resolution | None:
+    """The resolution of ``"0.5,0.0018"``; None if not given.
+
+    Raises
+    ------
+    CpunetError
+        If there are not two numbers from 0 up.
+    """
+    from cpunet.jobs.simulate import Resolution
+
+    if text is None:
+        return None
+    noise, fano = parse_numbers(text, 2, "--resolution")
+    return Resolution(noise, fano)
+
+
+def _count(text: str) -> int:
+    # underscores and signs, which int() takes, are more likely slips
+    if not text.strip().isdecimal():
+        raise CpunetError(f"--events: {text!r} is no number of events; give N or FEP=N,DEP=M")
+    return int(text)

@@ -1,0 +1,112 @@
+"""Parts of an earlier demonstration: kept only if they are what would be made now."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from cpunet.analysis.report import METRICS
+from cpunet.errors import CpunetError
+from cpunet.files import require_replaceable
+from cpunet.jobs.stand import MARKER
+from cpunet.jobs.stand_plan import StandPlan
+from cpunet.recipes.schema import Recipe
+from cpunet.training.run_folder import INFO, read_info, read_recipe
+
+# in the order they are made; and the file that each has when it is whole
+PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
+_WAY_OUT = "give --force to make all parts anew, or another --out"
+_NONE = "none"
+
+
+def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) -> None:
+    """Refuse what was made otherwise, so that no report mixes two sets of options.
+
+    Parameters
+    ----------
+    out
+        Folder of the parts, of which any may be missing.
+    plan
+        Of the stand.
+    recipe, peak
+        Of the training; its seed is the stand's.
+
+    Raises
+    ------
+    CpunetError
+        If a part was made otherwise (it names the first difference) or cannot be read,
+        or if the run's stand is gone.
+    """
+    stand, run, _ = (out / part for part in PARTS)
+    if stand.exists():
+        wanted = plan.provenance()
+        made = _read_stand(stand)
+        _require_same(stand, {key: made.get(key) for key in wanted}, wanted)
+    elif run.exists():
+        raise CpunetError(f"{run}: its stand is gone; {_WAY_OUT}")
+    if run.exists():
+        info = read_info(run)
+        _require_same(
+            run,
+            {"peak": info["peak"], "seed": info["seed"], "recipe": _content(read_recipe(run))},
+            {"peak": peak, "seed": plan.seed, "recipe": _content(recipe)},
+        )
+
+
+def remove_parts(out: Path) -> None:
+    """Remove all parts, or none if anything else is in the place of one.
+
+    Raises
+    ------
+    CpunetError
+        If a part's place holds something else, or a part cannot be removed.
+    """
+    for part, marker in PARTS.items():
+        require_replaceable(out / part, marker=marker)
+    # the stand last: interrupted, no run is left without its stand
+    for folder in (out / part for part in reversed(PARTS)):
+        try:
+            if folder.exists():
+                shutil.rmtree(folder)
+        except OSError as error:
+            reason = error.strerror or error
+            raise CpunetError(f"{folder}: cannot be removed ({reason})") from error
+
+
+def _read_stand(stand: Path) -> dict[str, Any]:
+    path = stand / MARKER
+    try:
+        made = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CpunetError(
+            f"{stand}: is no stand ({MARKER} cannot be read); give another --out"
+        ) from error
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); {_WAY_OUT}") from error
+    if not isinstance(made, dict):
+        raise CpunetError(f"{path}: damaged (no mapping); {_WAY_OUT}")
+    return made
+
+
+def _content(recipe: Recipe) -> dict[str, Any]:
+    return recipe.model_dump(mode="json")
+
+
+def _require_same(part: Path, made: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    then, now = dict(_leaves(made)), dict(_leaves(wanted))
+    for key in now | then:
+        before, after = then.get(key, _NONE), now.get(key, _NONE)
+        if before != after:
+            raise CpunetError(f"{part}: made with {key} = {before}, not {after}; {_WAY_OUT}")
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Names and values of a nest, as JSON writes them: ``noise.rms_kev``, ``2.5``."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        elif name != "description":  # which changes nothing
+            yield f"{prefix}{name}", json.dumps(value, ensure_ascii=False)

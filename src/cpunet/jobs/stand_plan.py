@@ -1,0 +1,172 @@
+"""What a test stand is to be: two sides of independent events, and what each is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.electronics.chain import Electronics
+from cpunet.electronics.shifted import Shift
+from cpunet.errors import CpunetError
+from cpunet.jobs.hit_sources import GammaSource, Window
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.simulate import merge_hits
+from cpunet.pulses.container import Pulses
+from cpunet.simulation.events import simulate_events
+from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.library import build_library
+from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.settings import SimulationSettings
+
+Kind = Literal["matched", "shifted"]
+Labels = npt.NDArray[np.int64]
+
+LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
+OTHER = 3
+# Period of the simulated pulses that pass the chain; at 4 ns they are those of the library.
+_FINE_NS = 4.0
+# As `cpunet simulate` merges hits.
+_CLUSTER_MM = 0.05
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a stand: its detector, how it is simulated, its events."""
+
+    detector: Detector
+    settings: SimulationSettings
+    source: GammaSource
+
+    def library(self, monitor: Monitor) -> Library:
+        """Pre-computed pulses."""
+        with monitor.stage(f"Library of pulses of {self.detector.name}"):
+            return build_library(compute_fields(self.detector), self.settings)
+
+    def blocks(
+        self, title: str, library: Library | None, monitor: Monitor
+    ) -> Iterator[tuple[Pulses, Labels]]:
+        """Its pulses, finely sampled, and their lines, block by block."""
+        with monitor.stage(f"Fields of {self.detector.name}"):
+            fields = compute_fields(self.detector)
+        mode: Literal["exact", "library"] = "exact" if library is None else "library"
+        opened = self.source.open(self.detector)
+        with monitor.stage(title, opened.n_events) as advance:
+            for hits in opened.blocks:
+                merged = merge_hits(hits, self.detector, _CLUSTER_MM)
+                pulses = simulate_events(
+                    fields, merged, self.settings, mode, library=library
+                ).pulses()
+                if len(pulses):
+                    yield pulses, labels_of(pulses.energy_kev, self.source.windows)
+                advance(len(hits))
+
+
+@dataclass(frozen=True)
+class StandPlan:
+    """Everything that a stand follows from.
+
+    Parameters
+    ----------
+    electronics
+        The chain of the data, and of the truth.
+    kind, shift
+        ``"shifted"``, and by what the data's detector differs, or ``"matched"`` and None.
+    sim, data
+        The two sides.
+    seed
+        Of everything random.
+    readout_seed
+        Of the noise and what else the readout adds, drawn from `seed`.
+    """
+
+    electronics: Electronics
+    kind: Kind
+    shift: Shift | None
+    sim: Side
+    data: Side
+    seed: int
+    readout_seed: int
+
+    @classmethod
+    def of(
+        cls,
+        electronics: Electronics,
+        detector: Detector,
+        windows: tuple[Window, ...],
+        events: tuple[int, ...],
+        *,
+        kind: Kind = "matched",
+        height_mm: float = 20.0,
+        radius_mm: float = 5.0,
+        seed: int = 0,
+    ) -> Self:
+        """Plan a stand, see `cpunet.jobs.stand.make_stand`.
+
+        Raises
+        ------
+        CpunetError
+            If a window has no events, the chain's period is no multiple of the pulses', or
+            there can be no detector shifted so.
+        """
+        for window, number in zip(windows, events, strict=True):
+            if number < 1:
+                raise CpunetError(f"--events {window.name}={number}: give at least 1 event")
+        settings = SimulationSettings(dt_ns=_fine_ns(electronics))
+        shift = Shift.default() if kind == "shifted" else None
+        # seeds of the events of both sides and of the readout's blocks
+        sim_seed, data_seed, readout_seed = map(
+            int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+        )
+        sim_hits, data_hits = (
+            GammaSource(windows, events, height_mm, radius_mm, s) for s in (sim_seed, data_seed)
+        )
+        sim = Side(detector, settings, sim_hits)
+        data = Side(
+            detector if shift is None else shift.detector(detector),
+            settings if shift is None else shift.settings(settings),
+            data_hits,
+        )
+        return cls(electronics, kind, shift, sim, data, seed, readout_seed)
+
+    def provenance(self) -> dict[str, Any]:
+        """What ``stand.json`` tells of how the stand was made."""
+        sides = {
+            name: {
+                "detector": side.detector.model_dump(mode="json"),
+                "settings": side.settings.model_dump(mode="json"),
+                "hits": side.source.provenance(),
+            }
+            for name, side in (("sim", self.sim), ("data", self.data))
+        }
+        return {
+            "kind": self.kind,
+            "shift": None if self.shift is None else self.shift.model_dump(mode="json"),
+            "seed": self.seed,
+            "electronics": self.electronics.model_dump(mode="json"),
+            **sides,
+        }
+
+
+def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
+    """0 DEP, 1 SEP, 2 FEP, 3 other, by which window the collected energies (keV) are in."""
+    labels = np.full(len(energy_kev), OTHER)
+    for window in windows:
+        # deposits add up to a line only within rounding
+        inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
+        labels[inside] = LABELS.get(window.name, OTHER)
+    return labels
+
+
+def _fine_ns(electronics: Electronics) -> float:
+    ratio = electronics.dt_ns / _FINE_NS
+    if abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
+            f"{_FINE_NS:g}, the pulses' period; choose another"
+        )
+    return _FINE_NS

@@ -1,0 +1,175 @@
+"""The response of a readout chain as a differentiable layer: a few physical parameters.
+
+Charge becomes signal through two bandwidth poles, a slow part, a transient that starts too
+high (or too low), two decays and a quadratic non-linearity.  All act on the current of a
+pulse in the frequency domain, so that a step of training costs two Fourier transforms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from cpunet.recipes.schema import ResponseConfig
+
+REFERENCE_KEV = 2614.5  # at which the quadratic part is given
+# Samples of room around a window: what the response delays stays in the record.
+ROOM_BEFORE, ROOM_AFTER = 200, 400
+# Windows are zero before them and constant after them, but a decay outlasts the record: its
+# kernel is cut there, and the transform is long enough for nothing to wrap around.
+_LEAST_FACTOR = 1.6
+IMAGES = 3  # on either side
+
+
+class ElectronicsResponse(nn.Module):
+    """Charge pulses → noise-free records of any height, by physical parameters.
+
+    Times are kept as logarithms, so that they stay positive and steps are relative.
+
+    Parameters
+    ----------
+    config
+        Number of poles and the values to start from.
+    dt_ns
+        Sampling period of the pulses in ns.
+    """
+
+    dt_ns: Tensor
+    slow_ns: Tensor
+    fast_decays_us: Tensor
+
+    def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
+        super().__init__()
+        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
+
+        def log(values: list[float]) -> nn.Parameter:
+            return nn.Parameter(torch.tensor(values, dtype=torch.float64).log())
+
+        def plain(value: float) -> nn.Parameter:
+            return nn.Parameter(torch.tensor(value, dtype=torch.float64))
+
+        self.log_poles_ns = log(list(config.poles_ns))
+        self.log_decay_us = log([config.decay_us])
+        self.slow_weights = nn.Parameter(torch.zeros(len(config.slow_ns), dtype=torch.float64))
+        self.decay_weights = nn.Parameter(
+            torch.zeros(len(config.fast_decays_us), dtype=torch.float64)
+        )
+        self.register_buffer("slow_ns", torch.tensor(config.slow_ns, dtype=torch.float64))
+        self.register_buffer(
+            "fast_decays_us", torch.tensor(config.fast_decays_us, dtype=torch.float64)
+        )
+        rings = [] if config.ringing_mhz is None else [config.ringing_mhz, config.ringing_ns]
+        # weights of sine and cosine; frequency in MHz and damping in ns
+        self.ringing = nn.Parameter(torch.zeros(len(rings), dtype=torch.float64))
+        self.log_ringing = log(rings)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Respond to prepared simulated pulses.
+
+        Parameters
+        ----------
+        windows
+            Shape (batch, samples), 0 … 1.
+
+        Returns
+        -------
+        Tensor
+            Shape (batch, ROOM_BEFORE + samples + ROOM_AFTER).
+        """
+        length = ROOM_BEFORE + windows.shape[1] + ROOM_AFTER
+        padded = fast_length(math.ceil(_LEAST_FACTOR * length))
+        current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
+        current = nn.functional.pad(current, (ROOM_BEFORE, 0))
+        spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
+        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
+        return signal
+
+    def transfer(self, padded: int) -> Tensor:
+        """Response to a step of charge at sample 0, as a spectrum of `padded` samples.
+
+        The samples of a pulse are means over the period, and so is the signal wanted.
+        Between them the charge collected so far is taken as a cubic spline, which puts
+        images of the spectrum beyond half the sampling rate; what the electronics let
+        through of these folds back.
+        """
+        dt_ns = self.dt_ns
+        frequency = torch.fft.rfftfreq(padded, d=1.0, dtype=torch.float64).to(dt_ns.device)
+        image = torch.arange(-IMAGES, IMAGES + 1, device=dt_ns.device)[:, None]
+        everywhere = frequency + image  # (images, frequencies), in units of 1/period
+        passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
+        fast = (_spline(everywhere) * passed).sum(dim=0)
+        time_us = torch.arange(padded, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
+        step = self.decay(time_us)
+        kept = time_us < (padded / _LEAST_FACTOR - ROOM_BEFORE) * dt_ns * 1e-3
+        return fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
+
+    def bandwidth(self, s: Tensor) -> Tensor:
+        """Transfer function of all but the decays and the free kernel at `s` in 1/ns."""
+        transfer = torch.ones_like(s)
+        for tau in self.log_poles_ns.exp():
+            transfer = transfer / (1 + s * tau)
+        slow = torch.ones_like(s)
+        for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True):
+            slow = slow + weight * (1 / (1 + s * tau) - 1)
+        if len(self.ringing):
+            frequency_mhz, damping = self.log_ringing.exp()
+            omega = 2e-3 * math.pi * frequency_mhz
+            damped = s + 1 / damping
+            wave = self.ringing[0] * omega + self.ringing[1] * damped
+            slow = slow * (1 + s * wave / (damped**2 + omega**2))
+        return transfer * slow
+
+    def decay(self, time_us: Tensor) -> Tensor:
+        """The decays alone: a step of 1 at time 0, at times of 0 and later in µs."""
+        main = torch.exp(-time_us / self.log_decay_us.exp())
+        step = main
+        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
+            step = step + weight * (torch.exp(-time_us / tau) - main)
+        return step
+
+    def step_response(self, times_ns: Tensor) -> Tensor:
+        """Noise-free answer to a unit step of charge at time 0, at multiples of the period."""
+        samples = len(times_ns)
+        padded = fast_length(4 * samples)
+        step = torch.fft.irfft(self.transfer(padded), padded)
+        return step[:samples]
+
+    @torch.no_grad()
+    def describe(self) -> dict[str, float]:
+        """Learned numbers by name, the unit at the end of the name."""
+        poles = sorted(self.log_poles_ns.exp().tolist(), reverse=True)
+        return (
+            {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
+            | {
+                f"slow_{tau:g}_ns": float(weight)
+                for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True)
+            }
+            | {"decay_us": float(self.log_decay_us.exp())}
+            | {
+                f"decay_{tau:g}_us": float(weight)
+                for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True)
+            }
+        )
+
+
+def _spline(frequency: Tensor) -> Tensor:
+    """Spectrum of the cardinal cubic spline at frequencies in units of the sampling rate.
+
+    Unser, Aldroubi and Eden, IEEE Trans. Signal Process. 41 (1993) 821.
+    """
+    return torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
+
+
+def fast_length(least: int) -> int:
+    """The least even number of `least` or more whose prime factors are 2, 3 and 5."""
+    length = least + least % 2
+    while True:
+        rest = length
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return length
+        length += 2

@@ -1,0 +1,129 @@
+"""Stands follow from their seed, and pulses of a library are those drifted one by one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from cpunet.electronics.presets import read_electronics
+from cpunet.jobs import stand_plan
+from cpunet.jobs.hit_sources import Window
+from cpunet.jobs.stand import make_stand
+from cpunet.simulation.field_lookup import Maps
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.library import build_library
+from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.settings import SimulationSettings
+
+# a small crystal: its library is built in a second
+DETECTOR = read_detector(
+    "ppc",
+    [
+        "name=small",
+        "crystal_length=14",
+        "crystal_radius=10",
+        "bottom_taper_length=2",
+        "bias_V=600",
+        "grid_mm=0.25",
+    ],
+)
+WINDOWS = (Window("FEP", 2614.0, 2615.0), Window("1000-2000", 1000.0, 2000.0))
+EVENTS = (10, 30)
+FILES = ("data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture
+def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Let every stand use libraries; the temperatures (K) of those built."""
+    built: list[float] = []
+
+    def build(maps: Maps, settings: SimulationSettings) -> Library:
+        built.append(maps.temperature_K)
+        # few halvings: more places are left to the drift, the others are as good
+        return build_library(maps, settings.model_copy(update={"library_halvings": 3}))
+
+    monkeypatch.setattr(stand_plan, "build_library", build)
+    monkeypatch.setattr("cpunet.jobs.stand._LIBRARY_FROM_EVENTS", sum(EVENTS))
+    return built
+
+
+def made(out: Path, seed: int = 0, kind: str = "matched") -> dict[str, npt.NDArray[Any]]:
+    """Everything in the files of a stand but where and when it was made."""
+    make_stand(read_electronics("ornl"), DETECTOR, WINDOWS, EVENTS, out, kind=kind, seed=seed)
+    assert tuple(sorted(path.name for path in out.iterdir())) == FILES
+    content: dict[str, npt.NDArray[Any]] = {}
+    for name in ("sim.lh5", "data.lh5"):
+        with h5py.File(out / name) as file:
+
+            def keep(path: str, item: Any, name: str = name) -> None:
+                if isinstance(item, h5py.Dataset):
+                    content[f"{name}/{path}"] = item[()]
+
+            file.visititems(keep)
+    for name in ("truth.npz", "data_labels.npz"):
+        with np.load(out / name) as arrays:
+            content |= {f"{name}/{key}": arrays[key] for key in arrays.files}
+    return content
+
+
+@pytest.mark.parametrize("kind", ["matched", "shifted"])
+def test_the_same_seed_gives_the_same_stand_and_another_another(
+    tmp_path: Path, kind: str
+) -> None:
+    first, again = made(tmp_path / "a", 5, kind), made(tmp_path / "b", 5, kind)
+    assert first.keys() == again.keys()
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, again[name], err_msg=name)
+    told = [(tmp_path / name / "stand.json").read_text() for name in "ab"]
+    assert told[0] == told[1]
+    other = made(tmp_path / "c", 6, kind)
+    for name in ("truth.npz/response", "sim.lh5/geds/sim/energy", "data.lh5/geds/raw/energy"):
+        assert not np.array_equal(first[name], other[name])
+
+
+def test_the_sides_are_events_of_their_own(tmp_path: Path) -> None:
+    stand = made(tmp_path / "a")
+    sim, data = stand["sim.lh5/geds/sim/energy"], stand["data.lh5/geds/raw/energy"]
+    # of the continuum: the lines are at the same energies on both sides
+    nearest = np.abs(sim[:, None] - data).min(axis=1)[(sim > 1000) & (sim < 2000)]
+    assert np.median(nearest) > 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "temperatures"), [("matched", [85.0]), ("shifted", [85.0, 87.0])]
+)
+def test_pulses_of_a_library_are_those_drifted_one_by_one(
+    libraries: list[float], tmp_path: Path, kind: str, temperatures: list[float]
+) -> None:
+    by_library = made(tmp_path / "library", kind=kind)
+    assert libraries == temperatures
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cpunet.jobs.stand._LIBRARY_FROM_EVENTS", sum(EVENTS) + 1)
+        drifted = made(tmp_path / "drifted", kind=kind)
+    assert len(libraries) == len(temperatures)
+    values = "waveform/values"
+    for name in ("truth.npz/response", f"sim.lh5/geds/sim/{values}"):
+        error = np.abs(by_library[name] - drifted[name]).max(axis=1)
+        assert 0 < error.max() < 0.005
+    # the noise is the same: only the pulses and their rounding differ, while pulses of the
+    # other side's library are wrong by many counts
+    gain = read_electronics("ornl").gain_adc_per_kev
+    name = f"data.lh5/geds/raw/{values}"
+    error = np.abs(by_library[name].astype(float) - drifted[name]).max(axis=1)
+    assert np.all(error < 1 + 0.005 * gain * drifted["data.lh5/geds/raw/energy"])
+    told = json.loads((tmp_path / "library" / "stand.json").read_text())
+    assert told == json.loads((tmp_path / "drifted" / "stand.json").read_text())
