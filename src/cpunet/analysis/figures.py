@@ -25,6 +25,7 @@ from cpunet.pulses.parameters import PARAMETERS
 Values = npt.NDArray[np.float64]
 
 # Panels of the loss figure: which losses, under which name, in which colour.
+CHI_SQUARE = "chi_square"  # the only loss of a matched response
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Cycle and identity": {
         "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
@@ -61,6 +62,8 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
     """
     if not records:
         raise CpunetError("the training log is empty: there are no losses to draw; train first")
+    if CHI_SQUARE in records[0]["losses"]:
+        return _chi_square_curve(records)
     iteration = np.array([record["iteration"] for record in records], dtype=float)
     figure = Figure(figsize=(10.5, 3.4))
     panels = figure.subplots(1, len(LOSS_PANELS))
@@ -77,6 +80,22 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
             axes.legend()
     panels[0].set(ylabel="Loss", yscale="log")
     figure.supxlabel(f"Lines: mean of {window} records", fontsize=8, x=0.99, ha="right")
+    return figure
+
+
+def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Chi-square of a matched response after each step of its fit."""
+    figure = Figure(figsize=(4.6, 3.4))
+    axes = figure.subplots()
+    axes.plot(
+        [record["iteration"] for record in records],
+        [record["losses"][CHI_SQUARE] for record in records],
+        color="black",
+        marker="o",
+        markersize=3,
+    )
+    axes.set(xlabel="Step", ylabel=r"$\chi^2$ of the moments", yscale="log")
+    axes.set_title("Response matched to data")
     return figure
 
 

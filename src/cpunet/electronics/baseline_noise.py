@@ -31,6 +31,7 @@ START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
 # spectrum; there it follows from how the noise drifts apart over the baseline's length.
 FIRST_CLEAN_BIN, RECORD_SAMPLES = 3, 8192
 CORNERS, LAGS = 8, 40  # of the slow part's Lorentzians; at which the drift is compared
+TRACES = 64  # drawn at a time, to bound memory
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and how often
 SIGMA_PER_MAD = 1.4826
 
@@ -72,25 +73,57 @@ class BaselineNoise:
             If too few traces have a known energy and a flat baseline, or the
             baselines are shorter than 400 samples.
         """
-        baselines = _baselines(raw, config)
-        flat = baselines[_flat(baselines)]
+        return cls._of_baselines(_baselines(raw, config), len(raw), raw.dt_ns)
+
+    @classmethod
+    def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
+        flat = baselines[_flat(baselines)] if len(baselines) else baselines
         if len(flat) < FEWEST:
             raise CpunetError(
-                f"only {len(flat)} flat baselines among {len(raw)} traces; give more traces "
+                f"only {len(flat)} flat baselines among {n} traces; give more traces "
                 f"(at least {FEWEST} with known energy)"
             )
         density = _with_slow_part(_periodogram(flat), _structure_function(flat))
-        return cls(density, 2 * (len(density) - 1), raw.dt_ns, len(flat))
+        return cls(density, 2 * (len(density) - 1), dt_ns, len(flat))
+
+    @classmethod
+    def from_windows(cls, windows: Pulses, samples: int) -> Self:
+        """Estimate the spectrum from the beginnings of prepared windows.
+
+        For data that come prepared, without their raw traces.  Such baselines are short:
+        noise slower than their length is guessed from its drift over them.
+
+        Parameters
+        ----------
+        windows
+            Prepared measured pulses with their energies.
+        samples
+            How many of each begin the window before any pulse does.
+
+        Raises
+        ------
+        CpunetError
+            If too few have a known energy and a flat baseline.
+        """
+        known = np.isfinite(windows.energy_kev) & (windows.energy_kev > 0)
+        chosen = windows[known]
+        baselines = chosen.waveforms[:, :samples] * chosen.energy_kev[:, np.newaxis]
+        return cls._of_baselines(np.asarray(baselines, float), len(windows), windows.dt_ns)
 
     @property
     def rms(self) -> float:
         """Root mean square in prepared units times keV."""
-        return float(np.sqrt(self._density_for(self.samples).mean()))
+        # all frequencies but the first and the last stand for two signs
+        both = 2 * self.density.sum() - self.density[0] - self.density[-1]
+        return float(np.sqrt(both / self.samples))
 
     def draw(
         self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
     ) -> FloatArray:
         """Draw Gaussian noise for pulses of these energies.
+
+        Several pulses take parts of one long trace: noise slower than a record is then much
+        the same in neighbouring pulses, and moves their baselines alike.
 
         Parameters
         ----------
@@ -118,18 +151,27 @@ class BaselineNoise:
                 f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
                 "1/energy, so give the energies"
             )
+        n = len(energy_kev)
         # Twice as long as needed, so that end and beginning know nothing of each other.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
-        density = self._density_for(long)[: long // 2 + 1]
-        bins = rng.standard_normal((len(energy_kev), len(density), 2)).view(complex)[..., 0]
-        noise = scipy.fft.irfft(bins * np.sqrt(0.5 * long * density), long, axis=1)
-        return np.asarray(noise[:, :length] / energy_kev[:, np.newaxis], np.float32)
+        each = max(1, (long - length) // length)  # parts of a trace; a gap stays at its end
+        size = np.sqrt(0.5 * long * self.density_of(long)).astype(np.float32)
+        noise = np.empty((n, length), np.float32)
+        for first in range(0, n, each * TRACES):
+            rows = noise[first : first + each * TRACES]
+            shape = (-(-len(rows) // each), 2 * len(size))
+            bins = rng.standard_normal(shape, np.float32).view(np.complex64) * size
+            traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
+            rows[:] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
+        noise /= energy_kev[:, np.newaxis]
+        return noise
 
-    def _density_for(self, length: int) -> Values:
-        """Density at all frequencies, of both signs, of a complex FFT of `length`."""
+    def density_of(self, length: int) -> Values:
+        """Density at the frequencies of a real FFT of `length` samples."""
         known = np.arange(len(self.density)) / self.samples
-        wanted = np.abs(scipy.fft.fftfreq(length))
-        return np.asarray(np.interp(wanted, known, self.density), float)
+        return np.asarray(
+            np.interp(np.arange(length // 2 + 1) / length, known, self.density), float
+        )
 
 
 def _baselines(raw: Pulses, config: PreparationConfig) -> Values:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 BLOCK = 512  # pulses at a time, to bound memory
@@ -64,6 +64,22 @@ def finish(
     CpunetError
         If shapes, sampling or energies do not fit.
     """
+    windows, _ = finish_with_codes(
+        records, config, dt_ns=dt_ns, noise=noise, energy_kev=energy_kev, seed=seed
+    )
+    return windows
+
+
+def finish_with_codes(
+    records: FloatArray,
+    config: PreparationConfig,
+    *,
+    dt_ns: float,
+    noise: BaselineNoise | None = None,
+    energy_kev: npt.NDArray[np.float64] | None = None,
+    seed: int | np.random.Generator = 0,
+) -> tuple[FloatArray, Codes]:
+    """As `finish`, with a `cpunet.pulses.preparation.Rejection` for each record."""
     if records.ndim != 2:
         raise CpunetError(
             f"translated waveforms have shape {records.shape}; expected (pulses, samples)"
@@ -74,18 +90,21 @@ def finish(
     config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
     rng = np.random.default_rng(seed)
     windows = np.full((len(records), config.length), np.nan, np.float32)
+    codes = np.zeros(len(records), np.uint8)
     for rows in blocks(len(records)):
         block, kept = records[rows], np.arange(len(records))[rows]
         if noise is not None and energy_kev is not None:
             clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
+            codes[kept] = clean.codes
             kept = kept[clean.index]
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
             block = np.asarray(level + drawn, np.float32)
         prepared = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
+        codes[kept] = prepared.codes
         windows[kept[prepared.index]] = prepared.pulses.waveforms
-    return windows
+    return windows, codes
 
 
 def _check_noise(

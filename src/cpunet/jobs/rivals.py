@@ -6,10 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import numpy as np
-
 from cpunet.analysis.style import NO_NOISE
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.rivals.base import Rival
 from cpunet.electronics.rivals.registry import RIVALS
@@ -17,13 +14,12 @@ from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.noise import noise_of_traces
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
 
 T = TypeVar("T")
-
-NOISE_TRACES = 4096  # raw traces from whose baselines the noise is measured
 
 
 @dataclass(eq=False)
@@ -92,7 +88,7 @@ def rival_windows(
     simulated = sim.prepared.pulses
     # all rivals here; the untranslated simulation stands in the scores anyway
     kinds = {name: kind for name, kind in RIVALS.items() if name != "raw"}
-    noise = _or_reason(result.missing, "noise", lambda: _noise(data_file, recipe))
+    noise = _or_reason(result.missing, "noise", lambda: noise_of_traces(data_file, config))
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
@@ -135,11 +131,3 @@ def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T |
     except CpunetError as error:
         missing[name] = str(error)
         return None
-
-
-def _noise(data_file: InputFile, recipe: Recipe) -> BaselineNoise:
-    block = next(iter(data_file.open().blocks(NOISE_TRACES)), None)
-    if block is None:
-        raise CpunetError(f"{data_file.path}: holds no traces to measure the noise from")
-    known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
-    return BaselineNoise.from_traces(block[known], recipe.preparation)

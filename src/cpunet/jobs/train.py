@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.inputs import InputFile, load_measured, load_simulated, require_same_sampling
+from cpunet.jobs.matching import Sides, match
 from cpunet.jobs.monitor import Monitor
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import MatchingConfig, Recipe
 from cpunet.training.loop import Record, train
 from cpunet.training.run_folder import INFO, append_losses, versions, write_run
 from cpunet.training.tensorboard import LossBoard
@@ -77,7 +80,10 @@ def train_run(
         started = datetime.now(UTC)
         clock = time.perf_counter()
         board = LossBoard(folder) if tensorboard else None
-        with monitor.stage("Training", recipe.training.iterations) as advance:
+        sides = Sides(sim_set.prepared.pulses, data_set.prepared.pulses, data)
+        matched = isinstance(recipe.training, MatchingConfig)
+        stage = "Matching" if matched else "Training"
+        with monitor.stage(stage, recipe.training.iterations) as advance:
 
             def listen(records: list[Record]) -> None:
                 append_losses(folder, records)
@@ -85,14 +91,10 @@ def train_run(
                     board.add(records)
                 advance(len(records))
 
-            model = train(
-                sim_set.prepared.pulses.waveforms,
-                data_set.prepared.pulses.waveforms,
-                recipe,
-                seed=seed,
-                device=device,
-                listener=listen,
-            )
+            if matched:
+                model, more = match(sides, recipe, seed, listen, monitor)
+            else:
+                model, more = _train_networks(sides, recipe, seed, device, listen)
         if board is not None:
             board.close()
         info = {
@@ -107,9 +109,27 @@ def train_run(
             "versions": versions(),
             "sim": sim_set.provenance(),
             "data": data_set.provenance(),
-        }
+        } | more
         write_run(folder, model, recipe, info)
     return info
+
+
+def _train_networks(
+    sides: Sides,
+    recipe: Recipe,
+    seed: int,
+    device: str,
+    listen: Callable[[list[Record]], None],
+) -> tuple[nn.Module, dict[str, Any]]:
+    model = train(
+        sides.sim.waveforms,
+        sides.data.waveforms,
+        recipe,
+        seed=seed,
+        device=device,
+        listener=listen,
+    )
+    return model, {}
 
 
 def resolve_device(device: str) -> str:

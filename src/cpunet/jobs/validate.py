@@ -132,7 +132,12 @@ def validate_run(
         )
         windows = sim_set.prepared.pulses.waveforms
         with monitor.stage("Translating", 2 * len(windows)) as advance:
-            noisy = ren.apply(windows, generator=ren.seeded(seed), progress=advance)
+            noisy = ren.apply(
+                windows,
+                energy_kev=sim_set.prepared.pulses.energy_kev,
+                generator=ren.seeded(seed),
+                progress=advance,
+            )
             clean = ren.apply(windows, noise=False, progress=advance)
         sets = [
             _peak_sets(name, recipe, sim_set, data_set, noisy, clean, rivals) for name in names
@@ -180,7 +185,7 @@ def _peak_sets(
     return PeakSets(
         name=name,
         raw=raw,
-        ren=raw.with_waveforms(noisy[chosen]),
+        ren=Pulses.of(_prepared(noisy[chosen]), dt_ns=raw.dt_ns),
         data=data[selection.select(data.energy_kev)],
         clean={"raw": raw.waveforms}
         | {name: windows[chosen] for name, windows in rivals.clean.items() if name != "truth"}

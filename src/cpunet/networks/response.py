@@ -103,7 +103,8 @@ class ElectronicsResponse(nn.Module):
         time_us = torch.arange(padded, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
         step = self.decay(time_us)
         kept = time_us < (padded / _LEAST_FACTOR - ROOM_BEFORE) * dt_ns * 1e-3
-        return fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
+        whole: Tensor = fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
+        return whole
 
     def bandwidth(self, s: Tensor) -> Tensor:
         """Transfer function of all but the decays and the free kernel at `s` in 1/ns."""
@@ -133,7 +134,7 @@ class ElectronicsResponse(nn.Module):
         """Noise-free answer to a unit step of charge at time 0, at multiples of the period."""
         samples = len(times_ns)
         padded = fast_length(4 * samples)
-        step = torch.fft.irfft(self.transfer(padded), padded)
+        step: Tensor = torch.fft.irfft(self.transfer(padded), padded)
         return step[:samples]
 
     @torch.no_grad()
@@ -159,7 +160,8 @@ def _spline(frequency: Tensor) -> Tensor:
 
     Unser, Aldroubi and Eden, IEEE Trans. Signal Process. 41 (1993) 821.
     """
-    return torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
+    spline: Tensor = torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
+    return spline
 
 
 def fast_length(least: int) -> int:

@@ -8,7 +8,7 @@ left as it is), so raw simulated pulses of any length can be given.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self, TypeVar
 
@@ -17,15 +17,24 @@ import numpy.typing as npt
 import torch
 
 from cpunet.errors import CpunetError
+from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import PunetConfig, Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
+from cpunet.translation.backends import (
+    Backend,
+    Energies,
+    InverseBackend,
+    NetworkBackend,
+    ResponseBackend,
+)
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
-BATCH = 256  # pulses at a time: bounds the memory, hardly touches the speed
+BATCH = 512  # pulses at a time: bounds the memory, hardly touches the speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +67,8 @@ class Translator:
     part: ClassVar[str]
     takes: ClassVar[Kind]
 
-    def __init__(self, network: PositionalUNet, recipe: Recipe, dt_ns: float) -> None:
-        self.network = network.eval()
+    def __init__(self, backend: Backend, recipe: Recipe, dt_ns: float) -> None:
+        self.backend = backend
         self.recipe = recipe
         self.dt_ns = dt_ns
 
@@ -74,12 +83,31 @@ class Translator:
         """
         run = Path(run)
         info, recipe = read_info(run), read_recipe(run)
-        network = PositionalUNet(recipe.generator, recipe.preparation.length)
-        load_network(run, cls.part, network, device)
-        return cls(network, recipe, float(info["dt_ns"]))
+        dt_ns = float(info["dt_ns"])
+        return cls(cls._backend(run, recipe, dt_ns, device), recipe, dt_ns)
+
+    @classmethod
+    def _backend(cls, run: Path, recipe: Recipe, dt_ns: float, device: str) -> Backend:
+        generator, length = recipe.generator, recipe.preparation.length
+        if isinstance(generator, PunetConfig):
+            network = PositionalUNet(generator, length)
+            load_network(run, cls.part, network, device)
+            return NetworkBackend(network)
+        if cls.part == REN.part:
+            response = ResponseGenerator(generator, dt_ns)
+            load_network(run, cls.part, response, device)
+            return ResponseBackend(response, recipe.preparation)
+        inverse = LinearInverse(length)
+        load_network(run, cls.part, inverse, device)
+        return InverseBackend(inverse, recipe.preparation, dt_ns)
 
     def translate(
-        self, waveforms: Waveforms, *, noise: bool = True, seed: int | None = None
+        self,
+        waveforms: Waveforms,
+        *,
+        energy_kev: npt.ArrayLike | None = None,
+        noise: bool = True,
+        seed: int | None = None,
     ) -> Waveforms:
         """Translate waveforms, given as a NumPy array or a torch tensor.
 
@@ -88,10 +116,13 @@ class Translator:
         waveforms
             Shape (n, samples), or (samples,) for a single pulse, sampled as in the
             training.
+        energy_kev
+            Energy of each pulse, for electronic noise, which goes as 1/energy; a network's
+            latent noise needs none.
         noise
-            Draw the latent noise; off, its mean is taken, the same every time.
+            Add noise; off, the same pulses come out every time.
         seed
-            Of the latent noise; None for a fresh draw.
+            Of the noise; None for a fresh draw.
 
         Returns
         -------
@@ -101,13 +132,15 @@ class Translator:
         Raises
         ------
         CpunetError
-            If a pulse cannot be prepared: names the first and the reason.
+            If energies are needed and not given, or a pulse cannot be prepared: names the
+            first and the reason.
             `translate_pulses` gives rows of NaN instead.
         """
         if isinstance(waveforms, torch.Tensor):
-            result = self._translate_array(waveforms.detach().cpu().numpy(), noise, seed)
+            array = waveforms.detach().cpu().numpy()
+            result = self._translate_array(array, energy_kev, noise, seed)
             return torch.from_numpy(result).to(waveforms.device)
-        return self._translate_array(np.asarray(waveforms), noise, seed)
+        return self._translate_array(np.asarray(waveforms), energy_kev, noise, seed)
 
     def translate_pulses(
         self,
@@ -124,7 +157,8 @@ class Translator:
         pulses
             Raw or prepared pulses of the side that this translator takes.
         noise
-            Draw the latent noise, or take its mean.
+            Add noise; electronic noise is scaled by the pulses' own energies, and those
+            without one are rejected.
         generator
             Source of the noise.
         progress
@@ -142,35 +176,72 @@ class Translator:
             )
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
         length = self.recipe.preparation.length
+        codes = prepared.codes.copy()
+        if noise and self.needs_energies:
+            unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
+            codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
+        rows = codes[prepared.index] == Rejection.ACCEPTED
         waveforms = np.full((len(pulses), length), np.nan, np.float32)
-        waveforms[prepared.index] = self.apply(
-            prepared.pulses.waveforms, noise=noise, generator=generator, progress=progress
+        index = prepared.index[rows]
+        waveforms[index], codes[index] = self.apply_with_codes(
+            prepared.pulses.waveforms[rows],
+            energy_kev=pulses.energy_kev[index],
+            noise=noise,
+            generator=generator,
+            progress=progress,
         )
-        return Translated(pulses.with_waveforms(waveforms), prepared.codes)
+        return Translated(pulses.with_waveforms(waveforms), codes)
+
+    @property
+    def needs_energies(self) -> bool:
+        """Whether the noise goes by the energies."""
+        return isinstance(self.backend, ResponseBackend)
 
     def apply(
         self,
         windows: FloatArray,
         *,
+        energy_kev: Energies | None = None,
         noise: bool = True,
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> FloatArray:
-        """Run the network on prepared windows, shape (n, window), in batches."""
-        device = next(self.network.parameters()).device
-        result = np.empty_like(windows)
-        with torch.inference_mode():
-            for first in range(0, len(windows), BATCH):
-                batch = torch.from_numpy(windows[first : first + BATCH]).to(device)
-                out = self.network(batch[:, None], generator=generator, mean=not noise)
-                result[first : first + BATCH] = out[:, 0].cpu().numpy()
-                if progress is not None:
-                    progress(len(batch))
+        """Translate prepared windows, shape (n, window); NaN where it cannot be done."""
+        result, _ = self.apply_with_codes(
+            windows,
+            energy_kev=energy_kev,
+            noise=noise,
+            generator=generator,
+            progress=progress,
+        )
         return result
 
+    def apply_with_codes(
+        self,
+        windows: FloatArray,
+        *,
+        energy_kev: Energies | None = None,
+        noise: bool = True,
+        generator: torch.Generator | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> tuple[FloatArray, Codes]:
+        """As `apply`, with a `Rejection` for each row."""
+        result = np.empty_like(windows)
+        codes = np.zeros(len(windows), np.uint8)
+        with torch.inference_mode():
+            for first in range(0, len(windows), BATCH):
+                rows = slice(first, first + BATCH)
+                energies = None if energy_kev is None else energy_kev[rows]
+                result[rows], codes[rows] = self.backend(
+                    windows[rows], energies, noise, generator
+                )
+                if progress is not None:
+                    progress(len(windows[rows]))
+        return result, codes
+
     def seeded(self, seed: int | None) -> torch.Generator:
-        """Return a source of latent noise; fresh if the seed is None."""
-        generator = torch.Generator(device=next(self.network.parameters()).device)
+        """Return a source of noise; fresh if the seed is None."""
+        generator = torch.Generator(device=self.backend.device)
         if seed is None:
             generator.seed()
         else:
@@ -178,10 +249,21 @@ class Translator:
         return generator
 
     def _translate_array(
-        self, waveforms: npt.NDArray[np.floating], noise: bool, seed: int | None
+        self,
+        waveforms: npt.NDArray[np.floating],
+        energy_kev: npt.ArrayLike | None,
+        noise: bool,
+        seed: int | None,
     ) -> FloatArray:
         single = waveforms.ndim == 1
+        if noise and self.needs_energies and energy_kev is None:
+            raise CpunetError(
+                "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+            )
         pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
+        if energy_kev is not None:
+            each = np.broadcast_to(np.asarray(energy_kev, float), (len(pulses),))
+            pulses = replace(pulses, energy_kev=each)
         done = self.translate_pulses(pulses, noise=noise, generator=self.seeded(seed))
         if not done.valid.all():
             first = int(np.flatnonzero(~done.valid)[0])

@@ -1,0 +1,411 @@
+"""What the training of a readout chain has learned, in terms of physics, and how true it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from scipy.ndimage import uniform_filter1d
+
+import cpunet
+from cpunet.analysis.response_figure import Chain, response_figure
+from cpunet.electronics.chain import Electronics
+from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
+from cpunet.electronics.noise import noise_power
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside, refuse_existing
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.recipes.schema import PreparationConfig, ResponseConfig
+from cpunet.training.run_folder import load_network, read_info, read_recipe
+
+MARKER = "response.json"
+Numbers = dict[str, float]
+
+_DPI = 150
+_GRID_NS, _SHORTEST_NS = 0.5, 10_000.0  # of the step responses from which numbers are taken
+_RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
+_LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
+_FOREVER_US = 1e9  # instead of a decay
+# Where a spectrum is flat, in units of half the sampling rate, and bins to smooth it over.
+_PLATEAU, _SMOOTHED = (0.03, 0.1), 41
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """A run: its chain, its parameters with their errors, and where it comes from."""
+
+    path: Path
+    info: Mapping[str, Any]
+    preparation: PreparationConfig
+    chain: Chain
+    parameters: Numbers
+    errors: Numbers
+
+    @property
+    def dt_ns(self) -> float:
+        return float(self.info["dt_ns"])
+
+    @property
+    def fit(self) -> Mapping[str, Any]:
+        fit = self.info.get("fit")
+        return fit if isinstance(fit, Mapping) else {}
+
+
+def describe_responses(
+    runs: Sequence[Path],
+    *,
+    truth: Electronics | None = None,
+    out: Path | None = None,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Say in terms of physics which readout chains trainings have learned.
+
+    Parameters
+    ----------
+    runs
+        Folders of trainings of a response, all of the same sampling and preparation.
+    truth
+        The chain of the data, if it is known (`stand_electronics`).
+    out
+        Folder to make, with ``response.json`` and ``response.png``; None for none.
+    force
+        Replace an existing folder.
+
+    Returns
+    -------
+    dict
+        The content of ``response.json``.  ``runs``: for each its ``values`` by name, the unit
+        at the end (shares of the full charge have none), and ``errors`` of those that are
+        parameters of the fit; all ``parameters`` and their ``parameter_errors``.  ``mean`` and
+        ``spread`` (standard deviation) of several runs.  ``truth``: the same ``values`` of
+        the true chain, ``difference`` from it of the run or the mean of the runs, and
+        ``sigma``: that in units of the error or the spread, whichever is larger.
+
+    Raises
+    ------
+    CpunetError
+        If a run holds no response, or runs or truth do not fit each other.
+    """
+    if out is not None:
+        refuse_existing(out, force=force)
+    learned = [_read_run(Path(run)) for run in runs]
+    if not learned:
+        raise CpunetError("no run was given; give the folder of one")
+    first = learned[0]
+    _require_alike(learned, truth)
+    told: dict[str, Any] = {
+        "cpunet": cpunet.__version__,
+        "dt_ns": first.dt_ns,
+        "runs": [_told(run) for run in learned],
+    }
+    true_chain = None if truth is None else true_chain_of(truth)
+    told |= _summary(told["runs"])
+    if truth is not None and true_chain is not None:
+        values = _true_parameters(truth) | chain_numbers(
+            true_chain, first.preparation, first.dt_ns
+        )
+        told["truth"] = {"name": truth.name} | _compared(told, values)
+    if out is not None:
+        window = first.preparation.samples_after * first.dt_ns
+        figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
+        with folder_written_aside(out, marker=MARKER, force=force) as folder:
+            text = json.dumps(told, indent=1, ensure_ascii=False)
+            (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+            figure.savefig(folder / "response.png", dpi=_DPI)
+    return told
+
+
+def stand_electronics(stand: Path) -> Electronics:
+    """The true electronics of a test stand, from its ``stand.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the folder is no stand.
+    """
+    path = Path(stand) / "stand.json"
+    try:
+        return Electronics.model_validate(json.loads(path.read_text("utf-8"))["electronics"])
+    except OSError as error:
+        raise CpunetError(
+            f"{stand}: no test stand (stand.json cannot be read); make one with `cpunet stand`"
+        ) from error
+    except (ValueError, KeyError, TypeError, ValidationError) as error:
+        raise CpunetError(f"{path}: holds no electronics; make the stand again") from error
+
+
+def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
+    """The closed form of a learned response: a sum of exponentials, as a true chain is."""
+    poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
+    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    fast = dict(
+        zip(response.fast_decays_us.tolist(), response.decay_weights.tolist(), strict=True)
+    )
+    taus = moved_apart([*poles, *slow, 1e3 * main, *(1e3 * tau for tau in fast)])
+    n, n_slow = len(poles), len(slow)
+    undecayed = Exponentials.of_real(
+        1 - sum(slow.values()),
+        taus[n : n + n_slow],
+        [weight / tau for weight, tau in zip(slow.values(), taus[n:], strict=False)],
+    )
+    for tau in taus[:n]:
+        undecayed = undecayed * Exponentials.low_pass(tau)
+    if len(response.ringing):
+        undecayed = undecayed * _ringing(response)
+    shares = [1 - sum(fast.values()), *fast.values()]
+    whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
+    return Chain(name, whole, undecayed)
+
+
+def true_chain_of(electronics: Electronics) -> Chain:
+    """A true chain in the same terms; its non-linearity is left out."""
+    endless = electronics.model_dump() | {"decays": [{"fraction": 1, "tau_us": _FOREVER_US}]}
+    frequency = density = None
+    spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
+    if spectrum is not None:
+        samples = 2 * (NOISE_BINS - 1)
+        power = noise_power(spectrum, dt_ns, samples)
+        frequency = np.fft.rfftfreq(samples, dt_ns * 1e-3)
+        density = electronics.noise.rms_kev**2 * power / frequency[1]
+    return Chain(
+        f"true response ({electronics.name})",
+        electronics.transfer,
+        # made anew, since a copy would keep the transfer function that was cached
+        Electronics.model_validate(endless).transfer,
+        frequency,
+        density,
+    )
+
+
+def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
+    """Numbers that need no parameters, so that learned and true chains can be compared.
+
+    Parameters
+    ----------
+    chain
+        Learned or true.
+    preparation, dt_ns
+        The window of prepared pulses, in which the decay is seen.
+
+    Returns
+    -------
+    dict
+        By name, the unit at the end.  ``rise_…_ns`` between fractions of the maximum of a
+        step; ``missing_…_ns``: share of the charge that has not arrived, ``overshoot``: of
+        the step without decays; ``effective_decay_us``: from the slope of the logarithm over
+        the fitted tail; ``droop_…_us``: share that has decayed; ``noise_rms_kev`` and
+        ``noise_corner_mhz``, where the power falls to half.
+    """
+    align_ns = _align_ns(chain, preparation)
+    end_ns = align_ns + preparation.samples_after * dt_ns
+    time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _GRID_NS)
+    step, undecayed = chain.whole.step(time_ns), chain.undecayed.step(time_ns)
+    numbers = {
+        name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
+        for name, low in _RISES.items()
+    }
+    for time in (500, 1000):
+        numbers[f"missing_{time}_ns"] = float(1 - chain.undecayed.step(time))
+    numbers["overshoot"] = max(0.0, float(undecayed.max()) - 1)
+    tail_ns = np.arange(end_ns - preparation.decay_fit_samples * dt_ns, end_ns, dt_ns)
+    slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]
+    if slope < 0:
+        numbers["effective_decay_us"] = float(-1e-3 / slope)
+    for time_us in (1, 5):
+        left = chain.whole.step(1e3 * time_us) / chain.undecayed.step(1e3 * time_us)
+        numbers[f"droop_{time_us}_us"] = float(1 - left)
+    return numbers | _noise_numbers(chain)
+
+
+def _read_run(path: Path) -> _Learned:
+    info, recipe = read_info(path), read_recipe(path)
+    if not isinstance(recipe.generator, ResponseConfig):
+        raise CpunetError(
+            f"{path}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
+            "response in closed form; give a run of the recipe fast, or score this one with "
+            "`cpunet validate`"
+        )
+    network = ResponseGenerator(recipe.generator, float(info["dt_ns"]))
+    load_network(path, "ren", network)
+    response, preparation = network.response, recipe.preparation
+    chain = learned_chain(response, path.name)
+    if int(network.n_baselines):
+        chain = _with_noise(chain, network, preparation)
+    parameters = response.describe()
+    errors = (info.get("fit") or {}).get("errors", {})
+    return _Learned(
+        path, info, preparation, chain, parameters, _errors_by_name(response, errors)
+    )
+
+
+def _with_noise(
+    chain: Chain, network: ResponseGenerator, preparation: PreparationConfig
+) -> Chain:
+    """Add the noise, from the units of prepared pulses to keV."""
+    noise = network.noise
+    # a full charge has this height where its tail has the level of prepared pulses
+    tail = preparation.samples_after - 0.5 * preparation.tail_samples
+    tail_ns = _align_ns(chain, preparation) + tail * noise.dt_ns
+    height = preparation.tail_level / float(chain.whole.step(tail_ns))
+    dt_us = 1e-3 * noise.dt_ns
+    return Chain(
+        chain.name,
+        chain.whole,
+        chain.undecayed,
+        np.fft.rfftfreq(noise.samples, dt_us),
+        # both signs of a frequency
+        2 * dt_us * noise.density / height**2,
+    )
+
+
+def _ringing(response: ElectronicsResponse) -> Exponentials:
+    """Step response ``1 + exp(-t/damping) (a sin + b cos)``."""
+    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+    sine, cosine = response.ringing.tolist()
+    pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
+    residue = 0.5 * complex(cosine, -sine) * pole
+    poles = np.array([pole, pole.conjugate()])
+    return Exponentials(1 + cosine, poles, np.array([residue, residue.conjugate()]))
+
+
+def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
+    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
+    poles, decay = response.log_poles_ns.exp(), float(response.log_decay_us.exp())
+    order = poles.argsort(descending=True).tolist()
+    sources = {
+        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
+        for i, k in enumerate(order)
+    }
+    sources["decay_us"] = ("log_decay_us.1", decay)
+    for i, tau in enumerate(response.slow_ns.tolist()):
+        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
+    for i, tau in enumerate(response.fast_decays_us.tolist()):
+        sources[f"decay_{tau:g}_us"] = (f"decay_weights.{i + 1}", 1.0)
+    return {
+        name: scale * float(errors[source])
+        for name, (source, scale) in sources.items()
+        if source in errors
+    }
+
+
+def _slow(shares: Mapping[float, float]) -> Numbers:
+    """Total share of what arrives late, and its mean time, of shares by time in ns."""
+    total = sum(shares.values())
+    numbers = {"slow_share": total}
+    if abs(total) >= _LEAST_SLOW:
+        numbers["slow_time_ns"] = sum(tau * w for tau, w in shares.items()) / total
+    return numbers
+
+
+def _told(run: _Learned) -> dict[str, Any]:
+    slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
+    values = {n: v for n, v in run.parameters.items() if n not in slow}
+    values |= _slow({float(n.split("_")[1]): w for n, w in slow.items()})
+    values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
+    if run.fit.get("moments"):
+        values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+    return {
+        "path": str(run.path),
+        "recipe": run.info["recipe"],
+        "peak": run.info["peak"],
+        "seed": run.info["seed"],
+        "values": values,
+        "errors": {name: e for name, e in run.errors.items() if name in values},
+        "parameters": run.parameters,
+        "parameter_errors": run.errors,
+    }
+
+
+def _true_parameters(electronics: Electronics) -> Numbers:
+    poles = sorted(electronics.bandwidth_poles_ns, reverse=True)
+    numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
+    # an overshoot is a slow part that takes away
+    parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
+    numbers |= _slow({part.tau_ns: sign * part.fraction for part, sign in parts if part})
+    *fast, main = sorted(electronics.decays, key=lambda part: part.tau_us)
+    numbers["decay_us"] = main.tau_us
+    return numbers | {f"decay_{part.tau_us:g}_us": part.fraction for part in fast}
+
+
+def _noise_numbers(chain: Chain) -> Numbers:
+    frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
+    if frequency is None or density is None:
+        return {}
+    # frequency 0 is the baseline; the last one stands for half a step
+    numbers = {
+        "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
+    }
+    low, high = (part * frequency[-1] for part in _PLATEAU)
+    plateau = np.median(density[(frequency >= low) & (frequency <= high)])
+    smooth = uniform_filter1d(density, _SMOOTHED)
+    fallen = (smooth < 0.5 * plateau) & (frequency > high)
+    if fallen.any():
+        numbers["noise_corner_mhz"] = float(frequency[fallen.argmax()])
+    return numbers
+
+
+def _align_ns(chain: Chain, preparation: PreparationConfig) -> float:
+    """When a step is where prepared pulses are aligned."""
+    step = chain.whole.step(np.arange(0, _SHORTEST_NS, _GRID_NS))
+    return _reaches_ns(step, preparation.align_fraction)
+
+
+def _reaches_ns(step: FloatArray, fraction: float) -> float:
+    """When a step response on the grid first reaches a fraction of its maximum."""
+    level = fraction * step.max()
+    after = max(1, int((step >= level).argmax()))
+    low, high = step[after - 1], step[after]
+    return _GRID_NS * (after - 1 + float((level - low) / (high - low)))
+
+
+def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
+    """Mean and spread of several runs."""
+    if len(runs) < 2:
+        return {}
+    names = [name for name in runs[0]["values"] if all(name in r["values"] for r in runs)]
+    columns = {name: [run["values"][name] for run in runs] for name in names}
+    return {
+        "mean": {name: float(np.mean(column)) for name, column in columns.items()},
+        "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
+    }
+
+
+def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
+    """Truth, and how far the run or the mean of the runs is from it."""
+    runs = told["runs"]
+    found: Numbers = told.get("mean", runs[0]["values"])
+    spread: Numbers = told.get("spread", {})
+    difference = {n: found[n] - true for n, true in values.items() if n in found}
+    sigma = {}
+    for name, apart in difference.items():
+        errors = [run["errors"].get(name, 0.0) for run in runs]
+        width = max(spread.get(name, 0.0), float(np.mean(errors)))
+        if width > 0:
+            sigma[name] = apart / width
+    return {"values": values, "difference": difference, "sigma": sigma}
+
+
+def _require_alike(runs: Sequence[_Learned], truth: Electronics | None) -> None:
+    first = runs[0]
+    for run in runs[1:]:
+        if not np.isclose(run.dt_ns, first.dt_ns):
+            raise CpunetError(
+                f"{run.path}: trained on pulses sampled every {run.dt_ns:g} ns, {first.path} "
+                f"every {first.dt_ns:g} ns; describe them one by one"
+            )
+        if run.preparation != first.preparation:
+            raise CpunetError(
+                f"{run.path}: trained with another preparation than {first.path}; describe "
+                "them one by one"
+            )
+    if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
+        raise CpunetError(
+            f"{first.path}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
+            f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
+        )

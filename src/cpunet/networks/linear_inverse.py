@@ -1,0 +1,145 @@
+"""The inverse of a readout chain as one linear map about the half maximum.
+
+Of all linear functions of a measured pulse it is the one that comes closest to the charge
+pulse on average (the Wiener filter of these pulses in this noise).  Each window is taken in
+whole samples from its half maximum: shifts by fractions of a sample would smooth the steep
+part, and make the map worse.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from cpunet.recipes.schema import MatchingConfig
+
+AFTER = 170  # samples from the half maximum: charge and slow response have come by then
+LEAST_LEVEL = 1e-3  # what is below is no pulse
+
+
+class Sizes(NamedTuple):
+    """Stretches of a window that a `LinearInverse` uses.
+
+    Parameters
+    ----------
+    length
+        Samples of a window.
+    before, after
+        Samples on either side of the half maximum that are translated.
+    baseline, level
+        First sample and stop, from the half maximum, of what is made 0 and 1.
+    """
+
+    length: int
+    before: int
+    after: int
+    baseline: tuple[int, int]
+    level: tuple[int, int]
+
+    @classmethod
+    def of(cls, length: int, config: MatchingConfig) -> Self:
+        """Sizes that go with the comparison by which a response was matched."""
+        first, stop = config.baseline
+        return cls(
+            length=length,
+            before=first,
+            after=min(AFTER, config.after),
+            baseline=(-first, -stop),
+            level=(config.after - config.level_samples, config.after),
+        )
+
+
+class LinearInverse(nn.Module):
+    """Prepared measured windows → simulation-like, almost noise-free pulses.
+
+    A new one holds zeros: load weights, or let `cpunet.training.inverse` fit them.
+
+    Parameters
+    ----------
+    sizes
+        What of a window is used.
+    """
+
+    half_height: Tensor
+    mean_in: Tensor
+    mean_out: Tensor
+    weights: Tensor
+
+    def __init__(self, sizes: Sizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        n = sizes.before + sizes.after
+
+        def buffer(name: str, *shape: int) -> None:
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+
+        buffer("half_height")  # of the maximum, the same number for all windows
+        buffer("mean_in", n)
+        buffer("mean_out", n)
+        buffer("weights", n, n)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Translate.
+
+        Parameters
+        ----------
+        windows
+            Prepared measured pulses, shape (n, length).
+
+        Returns
+        -------
+        Tensor
+            Float32, shape (n, length): pulses of about 0 … 1 where the measured ones were,
+            to be aligned and normalised as simulated ones.  NaN where a window has one.
+        """
+        sample = self.half_sample(windows)
+        inside = self.region(windows, sample) - self.mean_in
+        pulses = self.mean_out + inside @ self.weights.T
+        # 0 before the region and 1 after it: one sample on either side stands for the rest
+        pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
+        pulses = nn.functional.pad(pulses, (0, 1), value=1.0)
+        start = 1 + self.sizes.before - sample
+        return stretch(pulses, start, 0, self.sizes.length).float()
+
+    def half_sample(self, windows: Tensor) -> Tensor:
+        """Last sample below half of the maximum before the maximum, shape (n,)."""
+        index = torch.arange(windows.shape[1], device=windows.device)
+        highest = windows.argmax(dim=1, keepdim=True)
+        below = (windows < self.half_height) & (index < highest)
+        return ((below * (index + 1)).amax(dim=1) - 1).clamp_min(0)
+
+    def region(self, windows: Tensor, sample: Tensor) -> Tensor:
+        """The translated stretch of each window, with baseline 0 and level 1, float64.
+
+        Parameters
+        ----------
+        windows
+            Shape (n, length).
+        sample
+            Of the half maximum of each.
+        """
+        base, level = self.base_and_level(windows, sample)
+        inside = stretch(windows, sample, -self.sizes.before, self.sizes.after)
+        return (inside - base[:, None]) / level.clamp_min(LEAST_LEVEL)[:, None]
+
+    def base_and_level(self, windows: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean before each pulse, and how far above it the mean of its tail is."""
+        base = stretch(windows, sample, *self.sizes.baseline).double().mean(dim=1)
+        tail = stretch(windows, sample, *self.sizes.level).double().mean(dim=1)
+        return base, tail - base
+
+
+def stretch(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
+    """Samples `first` to `stop` from each pulse's own; edge values beyond its ends.
+
+    Parameters
+    ----------
+    pulses
+        Shape (n, samples).
+    sample
+        Shape (n,), from which is counted.
+    """
+    index = sample[:, None] + torch.arange(first, stop, device=pulses.device)
+    return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))

@@ -1,0 +1,142 @@
+"""What stands behind a translator: a network, a readout chain, or its inverse."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from cpunet.electronics.finishing import finish_with_codes
+from cpunet.errors import CpunetError
+from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Codes, prepare
+from cpunet.recipes.schema import PreparationConfig
+
+Energies = npt.NDArray[np.float64]
+
+
+class Backend(Protocol):
+    """Translates a batch of prepared windows."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Return windows, rows of NaN where there is none, and a `Rejection` for each."""
+
+
+class NetworkBackend:
+    """A network from window to window; its noise is the latent one."""
+
+    def __init__(self, network: PositionalUNet) -> None:
+        self.network = network.eval()
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return _device(self.network)
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Run the network; its output is a prepared window as it is."""
+        del energy_kev
+        batch = torch.from_numpy(windows).to(self.device)
+        out = self.network(batch[:, None], generator=generator, mean=not noise)
+        result: FloatArray = out[:, 0].cpu().numpy()
+        return result, np.zeros(len(windows), np.uint8)
+
+
+class ResponseBackend:
+    """A readout chain, electronic noise, and the preparation of measured traces."""
+
+    def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
+        self.network = generator.eval()
+        self.config = config
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return _device(self.network)
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Respond, add noise in proportion to 1/energy, and prepare like data.
+
+        Raises
+        ------
+        CpunetError
+            If noise is wanted and an energy is not known.
+        """
+        records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
+        if noise and energy_kev is None:
+            raise CpunetError(
+                "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+            )
+        drawn = self.network.noise if noise else None
+        device = self.device if generator is None else generator.device
+        seed = torch.randint(2**62, (), generator=generator, device=device)
+        return finish_with_codes(
+            records,
+            self.config,
+            dt_ns=float(self.network.response.dt_ns),
+            noise=drawn,
+            energy_kev=energy_kev if noise else None,
+            seed=int(seed),
+        )
+
+
+class InverseBackend:
+    """A linear inverse, and the preparation of simulated pulses."""
+
+    def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
+        self.network = inverse.eval()
+        self.config = config
+        self.dt_ns = dt_ns
+
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        weights: torch.Tensor = next(self.network.buffers())
+        return weights.device
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Undo the response and the noise; nothing is drawn."""
+        del energy_kev, noise, generator
+        pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
+        prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
+        result = np.full_like(windows, np.nan)
+        result[prepared.index] = prepared.pulses.waveforms
+        return result, prepared.codes
+
+
+def _device(network: nn.Module) -> torch.device:
+    return next(network.parameters()).device
