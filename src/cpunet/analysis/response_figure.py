@@ -1,23 +1,30 @@
-"""Readout chains side by side in one picture: step, impulse, tail and noise."""
+"""Readout chains in numbers and in one picture: step, impulse, tail and noise."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.analysis.style import COLOURS, SPARE_COLOURS, styled
 from cpunet.electronics.exponentials import Exponentials, FloatArray
+from cpunet.recipes.schema import PreparationConfig
+
+Numbers = dict[str, float]
 
 STEP_NS, IMPULSE_NS, GRID_NS = 2000.0, 600.0, 1.0
+_FINE_NS, _SHORTEST_NS = 0.5, 10_000.0  # of the step responses from which numbers are taken
+_RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
+# Where a spectrum is flat, in units of half the sampling rate, and bins to smooth it over.
+_PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 _LAYOUT = (("step", "impulse"), ("residual", "impulse"), ("tail", "noise"))
 _POINTS = 400  # of the tail, evenly on its logarithmic axis
-_SMOOTHED = 15  # bins of the spectra of noise, which are those of a long trace
+_BINS = 150  # of the spectra of noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +46,51 @@ class Chain:
     undecayed: Exponentials
     frequency_mhz: FloatArray | None = None
     noise_kev2_per_mhz: FloatArray | None = None
+
+
+def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
+    """Numbers that need no parameters, so that learned and true chains can be compared.
+
+    Parameters
+    ----------
+    chain
+        Learned or true.
+    preparation, dt_ns
+        The window of prepared pulses, in which the decay is seen.
+
+    Returns
+    -------
+    dict
+        By name, the unit at the end.  ``rise_…_ns`` between fractions of the maximum of a
+        step; ``missing_…_ns``: share of the charge that has not arrived, ``overshoot``: of
+        the step without decays; ``effective_decay_us``: from the slope of the logarithm over
+        the fitted tail; ``droop_…_us``: share that has decayed; ``noise_rms_kev`` and
+        ``noise_corner_mhz``, where the power falls to half.
+    """
+    end_ns = align_ns(chain, preparation) + preparation.samples_after * dt_ns
+    time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _FINE_NS)
+    step, undecayed = chain.whole.step(time_ns), chain.undecayed.step(time_ns)
+    numbers = {
+        name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
+        for name, low in _RISES.items()
+    }
+    for time in (500, 1000):
+        numbers[f"missing_{time}_ns"] = float(1 - chain.undecayed.step(time))
+    numbers["overshoot"] = max(0.0, float(undecayed.max()) - 1)
+    tail_ns = np.arange(end_ns - preparation.decay_fit_samples * dt_ns, end_ns, dt_ns)
+    slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]
+    if slope < 0:
+        numbers["effective_decay_us"] = float(-1e-3 / slope)
+    for time_us in (1, 5):
+        left = chain.whole.step(1e3 * time_us) / chain.undecayed.step(1e3 * time_us)
+        numbers[f"droop_{time_us}_us"] = float(1 - left)
+    return numbers | _noise_numbers(chain)
+
+
+def align_ns(chain: Chain, preparation: PreparationConfig) -> float:
+    """When a step is where prepared pulses are aligned."""
+    step = chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS))
+    return _reaches_ns(step, preparation.align_fraction)
 
 
 def half_height_ns(chain: Chain) -> float:
@@ -93,7 +145,7 @@ def _responses(
     long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
     short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
     tail = np.geomspace(100.0, tail_ns, _POINTS)
-    look = {"color": colour, "linewidth": width}
+    look: dict[str, Any] = {"color": colour, "linewidth": width}
     panels["step"].plot(long_ns, chain.whole.step(long_ns + half_ns), label=chain.name, **look)
     panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
     panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
@@ -110,7 +162,7 @@ def _residuals(
         reference, name = np.mean(steps, axis=0), "mean"
     else:
         axes.text(0.5, 0.5, "no truth given", ha="center", transform=axes.transAxes)
-        axes.set(ylabel="Residual")
+        axes.set(ylabel="Residual", yticks=[])
         return
     for i, step in enumerate(steps):
         axes.plot(time_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
@@ -121,12 +173,14 @@ def _residuals(
 def _noise(axes: Axes, chain: Chain, colour: str, width: float) -> None:
     if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
         return
-    density: npt.NDArray[np.float64] = uniform_filter1d(chain.noise_kev2_per_mhz, _SMOOTHED)
-    # low frequencies are not smoothed: there the spectrum is steep, and estimated as a curve
-    density[:_SMOOTHED] = chain.noise_kev2_per_mhz[:_SMOOTHED]
-    # the last bins reach beyond half the sampling rate
-    shown = slice(1, -_SMOOTHED)
-    axes.loglog(chain.frequency_mhz[shown], density[shown], color=colour, linewidth=width)
+    # evenly on the logarithmic axis: lower frequencies one by one, higher ones averaged
+    stop = len(chain.frequency_mhz) - 1
+    edges = np.unique(np.geomspace(1, stop, _BINS).astype(int))
+    frequency, density = (
+        np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
+        for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
+    )
+    axes.loglog(frequency, density, color=colour, linewidth=width)
 
 
 def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
@@ -155,3 +209,28 @@ def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
         panels["noise"].xaxis.set_major_formatter("{x:g}")
     else:
         panels["noise"].set_axis_off()
+
+
+def _noise_numbers(chain: Chain) -> Numbers:
+    frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
+    if frequency is None or density is None:
+        return {}
+    # frequency 0 is the baseline; the last one stands for half a step
+    numbers = {
+        "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
+    }
+    low, high = (part * frequency[-1] for part in _PLATEAU)
+    plateau = np.median(density[(frequency >= low) & (frequency <= high)])
+    smooth = uniform_filter1d(density, _SMOOTHED)
+    fallen = (smooth < 0.5 * plateau) & (frequency > high)
+    if fallen.any():
+        numbers["noise_corner_mhz"] = float(frequency[fallen.argmax()])
+    return numbers
+
+
+def _reaches_ns(step: FloatArray, fraction: float) -> float:
+    """When a step response on the grid first reaches a fraction of its maximum."""
+    level = fraction * step.max()
+    after = max(1, int((step >= level).argmax()))
+    low, high = step[after - 1], step[after]
+    return _FINE_NS * (after - 1 + float((level - low) / (high - low)))

@@ -17,9 +17,12 @@ Preset = Annotated[
     str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
 ]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="small, paper, or a YAML file of your own.")
+    str, typer.Option("--recipe", help="fast, small, paper, or a YAML file of your own.")
 ]
-Iterations = Annotated[int, typer.Option(min=2, help="Training iterations.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a value: --set training.steps=30 (repeatable)."),
+]
 
 
 def demo(
@@ -28,8 +31,8 @@ def demo(
     detector: DetectorFile = "icpc",
     events: Events = "FEP=2500,SEP=1000,DEP=1000",
     kind: KindOption = Kind.matched,
-    recipe: RecipeName = "small",
-    iterations: Iterations = 120,
+    recipe: RecipeName = "fast",
+    set_values: Set = None,
     seed: options.Seed = 0,
     device: options.Device = "auto",
     force: options.Force = False,
@@ -38,22 +41,18 @@ def demo(
 
     Example: cpunet demo --out demo
 
-    Example: cpunet demo --preset ringing --kind shifted --iterations 400 --out demo2
+    Example: cpunet demo --preset ornl --kind shifted --out demo2
     """
     from cpunet.electronics.presets import read_electronics
     from cpunet.jobs.demo import demonstrate
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
 
-    shorter = [
-        f"training.iterations={iterations}",
-        f"training.decay_start={iterations // 2}",
-    ]
     names, numbers = wanted_events(events)
     metrics = demonstrate(
         read_electronics(preset),
         read_detector(detector),
-        load_recipe(recipe, shorter),
+        load_recipe(recipe, set_values or ()),
         dict(zip(names, numbers, strict=True)),
         out_folder,
         kind=kind.value,

@@ -13,6 +13,7 @@ from cpunet.cli.demo import demo
 from cpunet.cli.fields import fields
 from cpunet.cli.info import info
 from cpunet.cli.messages import fail
+from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
 from cpunet.cli.train import train
@@ -26,7 +27,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for command in (demo, simulate, fields, stand, train, translate, validate, info):
+for command in (demo, simulate, fields, stand, train, translate, validate, response, info):
     app.command()(command)
 
 

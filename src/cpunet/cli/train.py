@@ -12,7 +12,7 @@ from cpunet.cli.messages import monitor, out
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="small, paper, or a YAML file of your own.")
+    str, typer.Option("--recipe", help="fast, small, paper, or a YAML file of your own.")
 ]
 Peak = Annotated[
     str, typer.Option(help="Energies to train on: FEP, SEP, DEP or a range in keV, as 300-.")
@@ -29,7 +29,7 @@ def train(
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
-    recipe: RecipeName = "small",
+    recipe: RecipeName = "fast",
     peak: Peak = "FEP",
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,

@@ -14,7 +14,7 @@ Source = Annotated[Path, typer.Argument(help="File of pulses to translate.", met
 Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
 Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulation-like.")]
 Noise = Annotated[
-    bool, typer.Option("--noise/--no-noise", help="Draw the latent noise, or take its mean.")
+    bool, typer.Option("--noise/--no-noise", help="Add noise as the data have it, or none.")
 ]
 Table = Annotated[str | None, typer.Option(help="Table to read, if the file has several.")]
 OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or geds/iren.")]

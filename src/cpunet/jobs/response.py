@@ -10,12 +10,17 @@ from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.ndimage import uniform_filter1d
 
 import cpunet
-from cpunet.analysis.response_figure import Chain, response_figure
+from cpunet.analysis.response_figure import (
+    Chain,
+    Numbers,
+    align_ns,
+    chain_numbers,
+    response_figure,
+)
 from cpunet.electronics.chain import Electronics
-from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
+from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.noise import noise_power
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside, refuse_existing
@@ -25,15 +30,10 @@ from cpunet.recipes.schema import PreparationConfig, ResponseConfig
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 
 MARKER = "response.json"
-Numbers = dict[str, float]
 
 _DPI = 150
-_GRID_NS, _SHORTEST_NS = 0.5, 10_000.0  # of the step responses from which numbers are taken
-_RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 _LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
 _FOREVER_US = 1e9  # instead of a decay
-# Where a spectrum is flat, in units of half the sampling rate, and bins to smooth it over.
-_PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,7 @@ class _Learned:
 
     path: Path
     info: Mapping[str, Any]
+    fit: Mapping[str, Any]
     preparation: PreparationConfig
     chain: Chain
     parameters: Numbers
@@ -50,11 +51,6 @@ class _Learned:
     @property
     def dt_ns(self) -> float:
         return float(self.info["dt_ns"])
-
-    @property
-    def fit(self) -> Mapping[str, Any]:
-        fit = self.info.get("fit")
-        return fit if isinstance(fit, Mapping) else {}
 
 
 def describe_responses(
@@ -171,7 +167,7 @@ def true_chain_of(electronics: Electronics) -> Chain:
     if spectrum is not None:
         samples = 2 * (NOISE_BINS - 1)
         power = noise_power(spectrum, dt_ns, samples)
-        frequency = np.fft.rfftfreq(samples, dt_ns * 1e-3)
+        frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
         density = electronics.noise.rms_kev**2 * power / frequency[1]
     return Chain(
         f"true response ({electronics.name})",
@@ -181,46 +177,6 @@ def true_chain_of(electronics: Electronics) -> Chain:
         frequency,
         density,
     )
-
-
-def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
-    """Numbers that need no parameters, so that learned and true chains can be compared.
-
-    Parameters
-    ----------
-    chain
-        Learned or true.
-    preparation, dt_ns
-        The window of prepared pulses, in which the decay is seen.
-
-    Returns
-    -------
-    dict
-        By name, the unit at the end.  ``rise_…_ns`` between fractions of the maximum of a
-        step; ``missing_…_ns``: share of the charge that has not arrived, ``overshoot``: of
-        the step without decays; ``effective_decay_us``: from the slope of the logarithm over
-        the fitted tail; ``droop_…_us``: share that has decayed; ``noise_rms_kev`` and
-        ``noise_corner_mhz``, where the power falls to half.
-    """
-    align_ns = _align_ns(chain, preparation)
-    end_ns = align_ns + preparation.samples_after * dt_ns
-    time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _GRID_NS)
-    step, undecayed = chain.whole.step(time_ns), chain.undecayed.step(time_ns)
-    numbers = {
-        name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
-        for name, low in _RISES.items()
-    }
-    for time in (500, 1000):
-        numbers[f"missing_{time}_ns"] = float(1 - chain.undecayed.step(time))
-    numbers["overshoot"] = max(0.0, float(undecayed.max()) - 1)
-    tail_ns = np.arange(end_ns - preparation.decay_fit_samples * dt_ns, end_ns, dt_ns)
-    slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]
-    if slope < 0:
-        numbers["effective_decay_us"] = float(-1e-3 / slope)
-    for time_us in (1, 5):
-        left = chain.whole.step(1e3 * time_us) / chain.undecayed.step(1e3 * time_us)
-        numbers[f"droop_{time_us}_us"] = float(1 - left)
-    return numbers | _noise_numbers(chain)
 
 
 def _read_run(path: Path) -> _Learned:
@@ -237,11 +193,11 @@ def _read_run(path: Path) -> _Learned:
     chain = learned_chain(response, path.name)
     if int(network.n_baselines):
         chain = _with_noise(chain, network, preparation)
-    parameters = response.describe()
-    errors = (info.get("fit") or {}).get("errors", {})
-    return _Learned(
-        path, info, preparation, chain, parameters, _errors_by_name(response, errors)
-    )
+    parameters = response.describe() | _ringing_numbers(response)
+    fit = info.get("fit")
+    fit = fit if isinstance(fit, Mapping) else {}
+    errors = _errors_by_name(response, fit.get("errors") or {})
+    return _Learned(path, info, fit, preparation, chain, parameters, errors)
 
 
 def _with_noise(
@@ -251,14 +207,14 @@ def _with_noise(
     noise = network.noise
     # a full charge has this height where its tail has the level of prepared pulses
     tail = preparation.samples_after - 0.5 * preparation.tail_samples
-    tail_ns = _align_ns(chain, preparation) + tail * noise.dt_ns
+    tail_ns = align_ns(chain, preparation) + tail * noise.dt_ns
     height = preparation.tail_level / float(chain.whole.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
     return Chain(
         chain.name,
         chain.whole,
         chain.undecayed,
-        np.fft.rfftfreq(noise.samples, dt_us),
+        np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float),
         # both signs of a frequency
         2 * dt_us * noise.density / height**2,
     )
@@ -274,15 +230,28 @@ def _ringing(response: ElectronicsResponse) -> Exponentials:
     return Exponentials(1 + cosine, poles, np.array([residue, residue.conjugate()]))
 
 
+def _ringing_numbers(response: ElectronicsResponse) -> Numbers:
+    if not len(response.ringing):
+        return {}
+    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+    return {
+        "ringing": response.ringing.norm().item(),
+        "ringing_mhz": frequency_mhz,
+        "ringing_damping_ns": damping_ns,
+    }
+
+
 def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
     """Errors of the fit under the names of `ElectronicsResponse.describe`."""
-    poles, decay = response.log_poles_ns.exp(), float(response.log_decay_us.exp())
+    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
     order = poles.argsort(descending=True).tolist()
     sources = {
         f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
         for i, k in enumerate(order)
     }
     sources["decay_us"] = ("log_decay_us.1", decay)
+    for i, (name, value) in enumerate(list(_ringing_numbers(response).items())[1:]):
+        sources[name] = (f"log_ringing.{i + 1}", value)
     for i, tau in enumerate(response.slow_ns.tolist()):
         sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
     for i, tau in enumerate(response.fast_decays_us.tolist()):
@@ -328,40 +297,13 @@ def _true_parameters(electronics: Electronics) -> Numbers:
     # an overshoot is a slow part that takes away
     parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
     numbers |= _slow({part.tau_ns: sign * part.fraction for part, sign in parts if part})
+    if ring := electronics.ringing:
+        numbers["ringing"] = ring.fraction
+        numbers["ringing_mhz"] = ring.frequency_MHz
+        numbers["ringing_damping_ns"] = ring.damping_ns
     *fast, main = sorted(electronics.decays, key=lambda part: part.tau_us)
     numbers["decay_us"] = main.tau_us
     return numbers | {f"decay_{part.tau_us:g}_us": part.fraction for part in fast}
-
-
-def _noise_numbers(chain: Chain) -> Numbers:
-    frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
-    if frequency is None or density is None:
-        return {}
-    # frequency 0 is the baseline; the last one stands for half a step
-    numbers = {
-        "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
-    }
-    low, high = (part * frequency[-1] for part in _PLATEAU)
-    plateau = np.median(density[(frequency >= low) & (frequency <= high)])
-    smooth = uniform_filter1d(density, _SMOOTHED)
-    fallen = (smooth < 0.5 * plateau) & (frequency > high)
-    if fallen.any():
-        numbers["noise_corner_mhz"] = float(frequency[fallen.argmax()])
-    return numbers
-
-
-def _align_ns(chain: Chain, preparation: PreparationConfig) -> float:
-    """When a step is where prepared pulses are aligned."""
-    step = chain.whole.step(np.arange(0, _SHORTEST_NS, _GRID_NS))
-    return _reaches_ns(step, preparation.align_fraction)
-
-
-def _reaches_ns(step: FloatArray, fraction: float) -> float:
-    """When a step response on the grid first reaches a fraction of its maximum."""
-    level = fraction * step.max()
-    after = max(1, int((step >= level).argmax()))
-    low, high = step[after - 1], step[after]
-    return _GRID_NS * (after - 1 + float((level - low) / (high - low)))
 
 
 def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:

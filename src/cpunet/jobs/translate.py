@@ -49,7 +49,7 @@ def translate_file(
     inverse
         Apply IREN (data → simulation-like) instead of REN.
     noise, seed
-        Draw the latent noise with this seed, or take its mean.
+        Add noise, drawn with this seed, or none.
     table
         Where in the LH5 file to put the pulses; ``geds/ren`` or ``geds/iren`` if None.
     device, force, monitor

@@ -90,7 +90,7 @@ def validate_run(
     truth
         ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
     seed
-        Of latent noise and bootstraps.
+        Of noise and bootstraps.
     device, force, monitor
         As for `cpunet.jobs.train.train_run`.
 

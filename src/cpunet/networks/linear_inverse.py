@@ -91,12 +91,13 @@ class LinearInverse(nn.Module):
         Returns
         -------
         Tensor
-            Float32, shape (n, length): pulses of about 0 … 1 where the measured ones were,
-            to be aligned and normalised as simulated ones.  NaN where a window has one.
+            Float32, shape (n, length): pulses within 0 … 1 where the measured ones were, to
+            be aligned and normalised as simulated ones.  NaN where a window has one.
         """
         sample = self.half_sample(windows)
         inside = self.region(windows, sample) - self.mean_in
-        pulses = self.mean_out + inside @ self.weights.T
+        # charge is within 0 … 1; a ripple beyond would be taken for it when pulses are scaled
+        pulses = (self.mean_out + inside @ self.weights.T).clamp(0, 1)
         # 0 before the region and 1 after it: one sample on either side stands for the rest
         pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
         pulses = nn.functional.pad(pulses, (0, 1), value=1.0)

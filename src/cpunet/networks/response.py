@@ -1,8 +1,8 @@
 """The response of a readout chain as a differentiable layer: a few physical parameters.
 
-Charge becomes signal through two bandwidth poles, a slow part, a transient that starts too
-high (or too low), two decays and a quadratic non-linearity.  All act on the current of a
-pulse in the frequency domain, so that a step of training costs two Fourier transforms.
+Charge becomes signal through bandwidth poles, slow parts (or overshoot, their negative), a
+ringing if wanted, and decays.  All act on the current of a pulse in the frequency domain, so
+that a set of pulses costs two Fourier transforms.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from cpunet.recipes.schema import ResponseConfig
 
-REFERENCE_KEV = 2614.5  # at which the quadratic part is given
 # Samples of room around a window: what the response delays stays in the record.
 ROOM_BEFORE, ROOM_AFTER = 200, 400
 # Windows are zero before them and constant after them, but a decay outlasts the record: its
@@ -31,7 +30,7 @@ class ElectronicsResponse(nn.Module):
     Parameters
     ----------
     config
-        Number of poles and the values to start from.
+        Number of poles, the times whose weights are free, and what to start from.
     dt_ns
         Sampling period of the pulses in ns.
     """
@@ -107,7 +106,7 @@ class ElectronicsResponse(nn.Module):
         return whole
 
     def bandwidth(self, s: Tensor) -> Tensor:
-        """Transfer function of all but the decays and the free kernel at `s` in 1/ns."""
+        """Transfer function of all but the decays at `s` in 1/ns."""
         transfer = torch.ones_like(s)
         for tau in self.log_poles_ns.exp():
             transfer = transfer / (1 + s * tau)
@@ -130,13 +129,6 @@ class ElectronicsResponse(nn.Module):
             step = step + weight * (torch.exp(-time_us / tau) - main)
         return step
 
-    def step_response(self, times_ns: Tensor) -> Tensor:
-        """Noise-free answer to a unit step of charge at time 0, at multiples of the period."""
-        samples = len(times_ns)
-        padded = fast_length(4 * samples)
-        step: Tensor = torch.fft.irfft(self.transfer(padded), padded)
-        return step[:samples]
-
     @torch.no_grad()
     def describe(self) -> dict[str, float]:
         """Learned numbers by name, the unit at the end of the name."""
@@ -152,7 +144,19 @@ class ElectronicsResponse(nn.Module):
                 f"decay_{tau:g}_us": float(weight)
                 for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True)
             }
+            | self._ringing()
         )
+
+    def _ringing(self) -> dict[str, float]:
+        if not len(self.ringing):
+            return {}
+        frequency_mhz, damping_ns = self.log_ringing.exp().tolist()
+        return {
+            "ringing_mhz": frequency_mhz,
+            "ringing_damping_ns": damping_ns,
+            "ringing_sine": float(self.ringing[0]),
+            "ringing_cosine": float(self.ringing[1]),
+        }
 
 
 def _spline(frequency: Tensor) -> Tensor:

@@ -193,7 +193,9 @@ class MatchingConfig(Config):
     ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
     ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
     ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
-    ``max_pulses`` bounds the sets, ``steps`` the iterations of the fit.
+    ``max_pulses`` bounds the sets, ``steps`` the iterations of a fit.  A fit that ends in the
+    wrong valley is begun again with the response's poles times the next of
+    ``start_factors``; the best of all is kept.
     """
 
     method: Literal["matching"]
@@ -210,6 +212,7 @@ class MatchingConfig(Config):
     ridge: Fraction
     max_pulses: Annotated[int, Field(ge=100)]
     steps: Count
+    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
     @property
     def iterations(self) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cpunet.networks.linear_inverse import stretch
 from cpunet.recipes.schema import MatchingConfig
 
 
@@ -63,18 +64,12 @@ def at_half_maximum(
     whole = torch.full((len(records),), last, device=records.device)
     _, sample = crossing(records, level, whole)
     first, stop = config.baseline
-    base = _stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
+    base = stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
     records = records - base
-    tail = _stretch(records, sample, config.after - config.level_samples, config.after)
+    tail = stretch(records, sample, config.after - config.level_samples, config.after)
     records = records * (tail_level / tail.mean(dim=1, keepdim=True))
     time, _ = crossing(records, level, sample + 20)
     start = time.floor()
     fraction = (time - start)[:, None]
-    window = _stretch(records, start.long(), -config.before, config.after + 1)
+    window = stretch(records, start.long(), -config.before, config.after + 1)
     return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction, records
-
-
-def _stretch(records: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
-    """Samples `first` to `stop` from each pulse's own; edge values beyond the record."""
-    index = sample[:, None] + torch.arange(first, stop, device=records.device)
-    return records.gather(1, index.clamp(0, records.shape[1] - 1))

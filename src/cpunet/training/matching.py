@@ -21,7 +21,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE, ElectronicsResponse
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import Recipe, ResponseConfig
 from cpunet.training.moments import FEWEST, Moments
 
 Listener = Callable[[int, float], None]
@@ -34,6 +34,9 @@ TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.05
 TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # of the finite differences
 # Far from the data all deviations would be clipped alike, so that first rounds clip later.
 FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
+# Chi-square per moment at which a fit has found its valley; the data's own outliers and the
+# ridge keep it from 1.
+GOOD_FIT = 1.6
 CONVERGED = 0.05  # fall of chi-square
 DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
 BLOCK = 512  # pulses at a time, to bound memory
@@ -106,21 +109,35 @@ def fit_response(
         for side in (sim, data)
     )
     moments = Moments.of_data(data[data_rows], training, recipe.preparation)
-    response = ElectronicsResponse(config, noise.dt_ns)
-    slope = float(moments.centres[-1])  # per sample
-    if slope < 0:
-        decay_us = -noise.dt_ns * 1e-3 / slope
-        response.log_decay_us.data.fill_(math.log(decay_us))
     length = ROOM_BEFORE + sim.shape[1] + ROOM_AFTER
     drawn = noise.draw(energy_kev[sim_rows], length, rng)
-    problem = _Problem(
-        response,
-        moments,
-        torch.from_numpy(sim[sim_rows]),
-        torch.from_numpy(drawn),
-        last=ROOM_BEFORE + recipe.preparation.samples_before + DELAY,
-    )
-    return response, _levenberg_marquardt(problem, training.steps, listener)
+    best: tuple[ElectronicsResponse, Fit] | None = None
+    for factor in training.start_factors:
+        problem = _Problem(
+            _start(config, noise.dt_ns, factor, float(moments.slope)),
+            moments,
+            torch.from_numpy(sim[sim_rows]),
+            torch.from_numpy(drawn),
+            last=ROOM_BEFORE + recipe.preparation.samples_before + DELAY,
+        )
+        fit = _levenberg_marquardt(problem, training.steps, listener)
+        if best is None or fit.chi_square < best[1].chi_square:
+            best = problem.response, fit
+        if fit.chi_square < GOOD_FIT * fit.moments:
+            break  # no other valley is to be looked for
+    assert best is not None  # the recipe has one start at least
+    return best
+
+
+def _start(
+    config: ResponseConfig, dt_ns: float, factor: float, slope: float
+) -> ElectronicsResponse:
+    """A response with the recipe's poles times a factor, and the data's own decay."""
+    response = ElectronicsResponse(config, dt_ns)
+    response.log_poles_ns.data.add_(math.log(factor))
+    if slope < 0:
+        response.log_decay_us.data.fill_(math.log(-dt_ns * 1e-3 / slope))
+    return response
 
 
 class _Problem:

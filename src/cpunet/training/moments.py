@@ -143,6 +143,11 @@ class Moments:
         aligned, records = at_half_maximum(records, self.level, last, self.config, tail_level)
         return self._of_aligned(aligned, self._slopes_of(records, last), clip)
 
+    @property
+    def slope(self) -> Tensor:
+        """Median slope per sample of the logarithm of the data's tails."""
+        return self.centres[-1]
+
     def _slopes_of(self, records: Tensor, first: int) -> Tensor:
         """Tail slopes where the preparation would align each record."""
         before = self.preparation.samples_before

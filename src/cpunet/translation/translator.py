@@ -17,7 +17,7 @@ import numpy.typing as npt
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
@@ -97,7 +97,7 @@ class Translator:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
             return ResponseBackend(response, recipe.preparation)
-        inverse = LinearInverse(length)
+        inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
         load_network(run, cls.part, inverse, device)
         return InverseBackend(inverse, recipe.preparation, dt_ns)
 

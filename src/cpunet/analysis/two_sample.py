@@ -1,0 +1,297 @@
+"""Can a classifier tell measured pulses from simulated ones?
+
+The classifier two-sample test (Lopez-Paz & Oquab, ICLR 2017): train a classifier on
+part of both sets, and see on the rest how well it sorts them.  An area under the ROC
+curve (AUC) of 0.5 means that it found no difference; 1 that it is never wrong.
+
+The classifier is a ridge regression on ±1 labels with an expanded set of features: the
+shape as it is, and products and waves of its main components.  On made-up pulses with
+small differences of width, noise or ripple it saw as much as a network of two layers
+of 32 or more, in a fifth of the time; where only the spread of a width differed, it
+saw less (AUC 0.70, 0.75).  It has no random start, and as one factorisation serves any
+number of labels, the same test on shuffled labels costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Parameters = Mapping[str, Values]
+
+FEWEST = 40  # pulses a side: 8 in each fold's test
+LARGEST = 2000  # pulses a side: resolves an AUC to 0.01
+FOLDS = 5
+SHUFFLES = 40  # give the spread of the null to a ninth of itself
+
+COMPONENTS = 30  # that enter as they are
+LEADING = 12  # that enter with their products and waves, too: all 30 would dilute them
+WAVES = (1.5, 2.5)  # radians per standard deviation: features between a slope and a bin
+OUTLIER = 5.0  # standard deviations to which features are clipped
+SMALLEST = 1e-6  # pulse heights: below it there is rounding, not shape
+PENALTIES = np.geomspace(1e-4, 1e2, 13)  # per pulse, of features of variance 1 or less
+
+
+@dataclass(frozen=True)
+class TwoSample:
+    """Outcome of `classifier_auc`.
+
+    Attributes
+    ----------
+    auc, auc_std
+        Mean over the folds of the AUC of pulses that the classifier was not trained
+        on, and its standard error.  That is DeLong's, widened as much as the AUCs of
+        shuffled labels scatter more than he has it (about 1.4 times): the folds have
+        their training pulses in common.  It is 0 if no pulse is taken for another.
+    null_mean, null_std
+        Mean and standard deviation of the same number for shuffled labels: what two
+        samples of one distribution would give.  `null_std` is the scale on which
+        ``auc - null_mean`` is significant.
+    n_data, n_sim
+        Pulses used.  They are equal: the larger side is thinned out.
+    missing_data, missing_sim
+        Pulses left out because a value is not finite.
+    """
+
+    auc: float
+    auc_std: float
+    null_mean: float
+    null_std: float
+    n_data: int
+    n_sim: int
+    missing_data: int
+    missing_sim: int
+
+
+def classifier_auc(
+    data: FloatArray,
+    others: FloatArray,
+    *,
+    seed: int | np.random.Generator,
+    features: tuple[Parameters, Parameters] | None = None,
+    largest: int = LARGEST,
+) -> TwoSample:
+    """Test whether two sets of pulses can be told apart.
+
+    The windows are taken as they are, so both sets must be prepared alike.  They
+    enter as principal components of both sets together, with the size and the
+    roughness of what these leave over; a classifier sees noise that is missing.
+
+    Parameters
+    ----------
+    data, others
+        Prepared windows in pulse heights, measured and simulated or translated ones
+        of the same peak, of shape ``(n, length)``.
+    seed
+        Of the choice of pulses, the folds and the shuffles.
+    features
+        More values per pulse, of the data and of the others, by name; for instance
+        `parameters.pulse_parameters` of both.
+    largest
+        The most pulses of a side that are used, drawn at random.
+
+    Returns
+    -------
+    TwoSample
+        The AUC in five-fold cross-validation, and what to compare it with.
+
+    Raises
+    ------
+    CpunetError
+        If the shapes or the names of the features of both sides do not fit together,
+        or a side has fewer than 40 pulses whose values are all finite.
+    """
+    sides = (data, others)
+    extras = _extras(sides, features)
+    rng = np.random.default_rng(seed)
+    usable = [
+        np.flatnonzero(np.isfinite(windows).all(axis=1) & np.isfinite(extra).all(axis=1))
+        for windows, extra in zip(sides, extras, strict=True)
+    ]
+    size = min(largest, *map(len, usable))
+    if size < FEWEST:
+        raise CpunetError(
+            f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable, "
+            f"and {size} of each would be compared; a two-sample test needs {FEWEST} of each"
+        )
+    rows = [np.sort(rng.choice(found, size, replace=False)) for found in usable]
+    windows = np.concatenate([s[r] for s, r in zip(sides, rows, strict=True)]).astype(float)
+    extra = np.concatenate([e[r] for e, r in zip(extras, rows, strict=True)])
+
+    aucs, stds = _cross_validated(_expanded(windows, extra), rng)
+    null_std, delong = aucs[1:].std(ddof=1), np.sqrt((stds[1:] ** 2).mean())
+    widened = max(1.0, null_std / delong) if delong > 0 else 1.0
+    return TwoSample(
+        auc=float(aucs[0]),
+        auc_std=float(widened * stds[0]),
+        null_mean=float(aucs[1:].mean()),
+        null_std=float(null_std),
+        n_data=size,
+        n_sim=size,
+        missing_data=len(data) - len(usable[0]),
+        missing_sim=len(others) - len(usable[1]),
+    )
+
+
+def auc_and_variance(negatives: Values, positives: Values) -> tuple[float, float]:
+    """Area under the ROC curve of two sets of scores, and its variance after DeLong.
+
+    Parameters
+    ----------
+    negatives, positives
+        Scores, two or more of each; ties count as half.
+
+    Returns
+    -------
+    tuple of float
+        Probability that a positive's score exceeds a negative's, and the variance of
+        this estimate.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> auc_and_variance(np.array([0.0, 1.0]), np.array([0.5, 2.0]))
+    (0.75, 0.125)
+    """
+    from scipy.stats import rankdata
+
+    n, m = len(negatives), len(positives)
+    ranks = rankdata(np.concatenate([negatives, positives]))
+    # fraction of the other set that each score has on its right side
+    above = (ranks[n:] - rankdata(positives)) / n
+    below = 1 - (ranks[:n] - rankdata(negatives)) / m
+    variance = above.var(ddof=1) / m + below.var(ddof=1) / n
+    return float(above.mean()), float(variance)
+
+
+def _extras(
+    sides: tuple[FloatArray, FloatArray], features: tuple[Parameters, Parameters] | None
+) -> list[Values]:
+    """The additional features as one array of shape ``(n, features)`` per side."""
+    shapes = [windows.shape for windows in sides]
+    if any(len(shape) != 2 for shape in shapes) or shapes[0][1] != shapes[1][1]:
+        raise CpunetError(
+            f"windows have shapes {shapes[0]} and {shapes[1]}; "
+            "expected (pulses, samples) with equally many samples"
+        )
+    first, second = features if features is not None else ({}, {})
+    if odd := first.keys() ^ second.keys():
+        raise CpunetError(f"feature {min(odd)} is given for one side only; give it for both")
+    for (n, _), values in zip(shapes, (first, second), strict=True):
+        for name, value in values.items():
+            if value.shape != (n,):
+                raise CpunetError(f"feature {name} has shape {value.shape}; expected ({n},)")
+    return [
+        np.column_stack([np.empty((n, 0)), *(values[name] for name in first)])
+        for (n, _), values in zip(shapes, (first, second), strict=True)
+    ]
+
+
+def _expanded(windows: Values, extra: Values) -> Values:
+    """Features of all pulses, blind to which side they are from.
+
+    Every block has about the same variance in sum, so that the many products do not
+    drown the shape itself.
+    """
+    components, rest = _components(windows)
+    plain = np.column_stack(
+        [_standard(components, SMALLEST), _standard(rest), _standard(extra)]
+    )
+    n_components = components.shape[1]
+    main = np.delete(plain, np.s_[LEADING:n_components], axis=1)
+
+    i, j = np.triu_indices(main.shape[1])
+    products = main[:, i] * main[:, j]
+    waves = np.column_stack(
+        [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
+    )
+    blocks = [plain]
+    for block in (products, waves):
+        centred = block - block.mean(axis=0)
+        spread = centred.std(axis=0)
+        weight = np.sqrt(2 * main.shape[1] / block.shape[1])
+        blocks.append(weight * centred / np.where(spread > 0, spread, 1))
+    return np.concatenate(blocks, axis=1)
+
+
+def _components(windows: Values) -> tuple[Values, Values]:
+    """Leading principal components, and logarithms of what is left and of its steps."""
+    from scipy.linalg import eigh
+
+    centred = windows - np.median(windows, axis=0)
+    norms = np.linalg.norm(centred, axis=1, keepdims=True)
+    # a few spoiled pulses must not choose the directions in which all are looked at
+    limit = 3 * np.median(norms)
+    weighted = centred * (limit / np.maximum(norms, limit) if limit > 0 else 1)
+    length = windows.shape[1]
+    first = max(0, length - COMPONENTS)
+    _, vectors = eigh(weighted.T @ weighted, subset_by_index=[first, length - 1])
+    vectors = vectors[:, ::-1]
+    components = centred @ vectors
+    rest = centred - components @ vectors.T
+    sizes = [np.sqrt(np.mean(r**2, axis=1)) for r in (rest, np.diff(rest, axis=1))]
+    return components, np.log(np.maximum(np.column_stack(sizes), SMALLEST))
+
+
+def _standard(values: Values, smallest: float = 0.0) -> Values:
+    """Columns with median 0 and the quartiles of a standard normal distribution, clipped."""
+    lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+    spread = np.where(upper > lower, (upper - lower) / 1.349, values.std(axis=0))
+    # a column without a spread becomes 0: its rounding must not grow to a feature
+    scale = np.where(spread > smallest, spread, np.inf)
+    return np.asarray(np.clip((values - middle) / scale, -OUTLIER, OUTLIER))
+
+
+def _cross_validated(features: Values, rng: np.random.Generator) -> tuple[Values, Values]:
+    """AUC of the true labels and of each shuffle, and their errors for independent folds.
+
+    The first half of the rows is one side.  Each fold has equally many of both sides,
+    and labels are shuffled within it: unequal ones would pull the AUC below 0.5, as
+    a side that is rare in the training is frequent in the test.
+    """
+    size = len(features) // 2
+    fold = np.concatenate([rng.permutation(np.arange(size) % FOLDS) for _ in range(2)])
+    labels = np.repeat(np.repeat([-1.0, 1.0], size)[:, np.newaxis], 1 + SHUFFLES, axis=1)
+    for k in range(FOLDS):
+        rows = np.flatnonzero(fold == k)
+        labels[rows, 1:] = rng.permuted(labels[rows, 1:], axis=0)
+
+    aucs, variances = np.empty((2, FOLDS, 1 + SHUFFLES))
+    for k in range(FOLDS):
+        test = fold == k
+        scores = features[test] @ _ridge(features[~test], labels[~test])
+        for column, (score, label) in enumerate(zip(scores.T, labels[test].T, strict=True)):
+            aucs[k, column], variances[k, column] = auc_and_variance(
+                score[label < 0], score[label > 0]
+            )
+    return aucs.mean(axis=0), np.sqrt(variances.sum(axis=0)) / FOLDS
+
+
+def _ridge(features: Values, labels: Values) -> Values:
+    """Coefficients of a ridge regression on each column of `labels`.
+
+    The penalty of each is the one with the least leave-one-out error.  The intercept
+    is left out: it does not change the order of the scores.
+    """
+    n = len(features)
+    centred = features - features.mean(axis=0)
+    targets = labels - labels.mean(axis=0)
+    eigenvalues, vectors = np.linalg.eigh(centred.T @ centred)
+    rotated = centred @ vectors
+    shrink = 1 / (np.maximum(eigenvalues, 0)[:, np.newaxis] + PENALTIES * n)
+    leverage = rotated**2 @ shrink + 1 / n
+    projected = rotated.T @ targets
+    errors = []
+    for shrunk, h in zip(shrink.T[..., np.newaxis], leverage.T[..., np.newaxis], strict=True):
+        left_out = (targets - rotated @ (shrunk * projected)) / (1 - h)
+        errors.append((left_out**2).sum(axis=0))
+    best = np.argmin(errors, axis=0)
+    return np.asarray(vectors @ (shrink[:, best] * projected))

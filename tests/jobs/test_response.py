@@ -1,0 +1,336 @@
+"""Learned responses in numbers: chains whose numbers are known by hand, and by the stand."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from torch import nn
+
+from cpunet.analysis.response_figure import response_figure
+from cpunet.cli.main import main
+from cpunet.electronics.chain import Electronics
+from cpunet.electronics.presets import read_electronics
+from cpunet.errors import CpunetError
+from cpunet.jobs.response import (
+    describe_responses,
+    learned_chain,
+    stand_electronics,
+    true_chain_of,
+)
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import write_run
+
+DT_NS = 16.0
+INFO = {"recipe": "fast", "peak": "FEP", "seed": 1, "seconds": 1.5, "device": "cpu"}
+# of the run's parameters: log_poles_ns are in the order of the recipe
+ERRORS = {
+    "log_poles_ns.1": 0.02,
+    "log_poles_ns.2": 0.05,
+    "log_decay_us.1": 0.01,
+    "slow_weights.3": 0.004,
+    "decay_weights.1": 0.002,
+}
+FIT = {"chi_square": 120.0, "moments": 80, "steps": 9, "errors": ERRORS, "pulls": {}}
+
+
+def write_response(
+    folder: Path,
+    *overrides: str,
+    slow: dict[int, float] | None = None,
+    fast: dict[int, float] | None = None,
+    noise_density: np.ndarray | None = None,
+    dt_ns: float = DT_NS,
+    **info: Any,
+) -> Path:
+    """A run folder; weights by index into the recipe's times (100 … 1600 ns; 4, 16 µs)."""
+    recipe = load_recipe("fast", overrides)
+    generator = ResponseGenerator(recipe.generator, dt_ns)
+    with torch.no_grad():
+        for weights, given in (
+            (generator.response.slow_weights, slow),
+            (generator.response.decay_weights, fast),
+        ):
+            for index, value in (given or {}).items():
+                weights[index] = value
+        if noise_density is not None:
+            generator.noise_density.copy_(torch.from_numpy(noise_density))
+            generator.n_baselines.fill_(1000)
+    folder.mkdir(parents=True)
+    model = nn.ModuleDict({"ren": generator})
+    write_run(folder, model, recipe, INFO | {"dt_ns": dt_ns} | info)
+    return folder
+
+
+def electronics(**fields: Any) -> Electronics:
+    changed = {
+        "name": "known",
+        "bandwidth_poles_ns": [55, 35],
+        "slow": {"fraction": 0.065, "tau_ns": 400},
+        "decays": [{"fraction": 0.96, "tau_us": 80}, {"fraction": 0.04, "tau_us": 4}],
+    }
+    return Electronics.model_validate(
+        read_electronics("legend200").model_dump() | changed | fields
+    )
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run that has learned `electronics()` exactly."""
+    return write_response(
+        tmp_path / "run",
+        "generator.poles_ns=[35, 55]",
+        "generator.decay_us=80",
+        slow={2: 0.065},
+        fast={0: 0.04},
+        fit=FIT,
+    )
+
+
+def values(*runs: Path) -> dict[str, float]:
+    return describe_responses(runs)["runs"][0]["values"]
+
+
+def test_a_single_pole_and_a_single_decay(tmp_path):
+    numbers = values(
+        write_response(tmp_path / "a", "generator.poles_ns=[50]", "generator.decay_us=1e6")
+    )
+    assert numbers["pole_1_ns"] == pytest.approx(50)
+    assert numbers["rise_10_90_ns"] == pytest.approx(50 * np.log(9), rel=1e-3)
+    assert numbers["rise_1_99_ns"] == pytest.approx(50 * np.log(99), rel=1e-3)
+    assert numbers["missing_500_ns"] == pytest.approx(np.exp(-10), rel=1e-6)
+    assert numbers["overshoot"] == 0
+    assert numbers["slow_share"] == 0
+    assert "slow_time_ns" not in numbers
+    assert "noise_rms_kev" not in numbers
+    decaying = values(write_response(tmp_path / "b", "generator.decay_us=54.6"))
+    assert decaying["effective_decay_us"] == pytest.approx(54.6, rel=1e-4)
+    # the charge that a pole delays decays later: by 100 ns of 54.6 µs
+    assert decaying["droop_5_us"] == pytest.approx(1 - np.exp(-5 / 54.6), rel=0.03)
+
+
+def test_an_overshoot_is_found_without_the_decays(tmp_path):
+    numbers = values(
+        write_response(
+            tmp_path / "a", "generator.poles_ns=[1]", "generator.decay_us=20", slow={4: -0.1}
+        )
+    )
+    assert numbers["overshoot"] == pytest.approx(0.1, abs=2e-3)
+    assert numbers["slow_share"] == pytest.approx(-0.1)
+    assert numbers["slow_time_ns"] == pytest.approx(1600)
+
+
+def test_noise_is_told_in_kev(tmp_path):
+    """A full charge is 0.8 e^(t/tau) high in prepared pulses; power falls by half at 8 MHz."""
+    frequency_mhz = np.linspace(0, 500 / DT_NS, NOISE_BINS)
+    shape = 1 / (1 + (frequency_mhz / 8) ** 4)
+    mean = (2 * shape.sum() - shape[0] - shape[-1]) / (2 * (NOISE_BINS - 1))
+    height = 0.8 * np.exp((397.5 * DT_NS + 500) / 54_600)  # aligned some 500 ns after the step
+    density = (1.7 * height) ** 2 * shape / mean
+    numbers = values(
+        write_response(tmp_path / "a", "generator.decay_us=54.6", noise_density=density)
+    )
+    assert numbers["noise_rms_kev"] == pytest.approx(1.7, rel=5e-3)
+    assert numbers["noise_corner_mhz"] == pytest.approx(8, rel=0.01)
+
+
+def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
+    told = describe_responses([run], truth=electronics())
+    truth = told["truth"]
+    assert truth["name"] == "known"
+    assert truth["values"].keys() - truth["difference"].keys() == {
+        "noise_rms_kev",
+        "noise_corner_mhz",
+    }
+    for name, difference in truth["difference"].items():
+        assert difference == pytest.approx(0, abs=1e-6 * abs(truth["values"][name]) + 1e-7), (
+            name
+        )
+    assert truth["values"]["rise_10_90_ns"] == pytest.approx(165, abs=10)
+    assert truth["values"]["noise_rms_kev"] == pytest.approx(1.95, rel=1e-3)
+    assert truth["values"]["noise_corner_mhz"] == pytest.approx(8.5, rel=0.02)
+
+
+def test_errors_go_with_the_poles_they_belong_to(run):
+    (told,) = describe_responses([run])["runs"]
+    assert told["values"]["pole_1_ns"] == pytest.approx(55)
+    assert told["errors"] == pytest.approx(
+        {
+            "pole_1_ns": 0.05 * 55,
+            "pole_2_ns": 0.02 * 35,
+            "decay_us": 0.8,
+            "decay_4_us": 0.002,
+        }
+    )
+    assert told["parameter_errors"]["slow_400_ns"] == 0.004
+    assert told["parameters"]["slow_400_ns"] == pytest.approx(0.065)
+    assert told["values"]["chi_square_per_moment"] == 1.5
+
+
+def test_differences_in_units_of_the_error(run):
+    truth = describe_responses([run], truth=electronics(bandwidth_poles_ns=[50, 35]))["truth"]
+    assert truth["difference"]["pole_1_ns"] == pytest.approx(5)
+    assert truth["sigma"]["pole_1_ns"] == pytest.approx(5 / 2.75)
+
+
+def test_mean_and_spread_of_several_runs(tmp_path):
+    runs = [
+        write_response(
+            tmp_path / f"run{tau}", f"generator.poles_ns=[{tau}]", "generator.decay_us=80"
+        )
+        for tau in (48, 50, 55)
+    ]
+    told = describe_responses(runs, truth=electronics(bandwidth_poles_ns=[50]))
+    assert told["mean"]["pole_1_ns"] == pytest.approx(51)
+    assert told["spread"]["pole_1_ns"] == pytest.approx(np.std([48, 50, 55], ddof=1))
+    assert told["truth"]["sigma"]["pole_1_ns"] == pytest.approx(1 / told["spread"]["pole_1_ns"])
+
+
+def test_the_closed_form_is_the_chain_of_the_stand():
+    config = load_recipe(
+        "fast",
+        [
+            "generator.poles_ns=[55, 35]",
+            "generator.decay_us=80",
+            "generator.ringing_mhz=5",
+            "generator.ringing_ns=160",
+        ],
+    ).matching.generator
+    response = ResponseGenerator(config, DT_NS).response
+    with torch.no_grad():
+        response.slow_weights[2], response.decay_weights[0] = 0.065, 0.04
+        response.ringing[0] = 0.1
+    ringing = {"frequency_MHz": 5, "fraction": 0.1, "damping_ns": 160}
+    chain, truth = learned_chain(response, "run"), electronics(ringing=ringing)
+    time_ns = np.arange(-20.0, 20_000.0, 8.0)
+    np.testing.assert_allclose(
+        chain.whole.step(time_ns), truth.step_response(time_ns), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        chain.whole.impulse(time_ns), truth.impulse_response(time_ns), atol=1e-14
+    )
+    undecayed = true_chain_of(truth).undecayed.step(time_ns)
+    np.testing.assert_allclose(chain.undecayed.step(time_ns), undecayed, atol=1e-6)
+    # beyond the first samples, where the layer's spline cannot follow a step
+    layer = response.step_response(torch.arange(600) * DT_NS).detach().numpy()
+    middle_ns = (np.arange(600) + 0.5) * DT_NS
+    np.testing.assert_allclose(layer[20:], chain.whole.step(middle_ns)[20:], atol=1e-3)
+
+
+def test_a_folder_with_numbers_and_figure(run, tmp_path):
+    out = tmp_path / "out"
+    told = describe_responses([run], truth=electronics(), out=out)
+    assert {file.name for file in out.iterdir()} == {"response.json", "response.png"}
+    assert json.loads((out / "response.json").read_text()) == told
+    assert (out / "response.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(CpunetError, match="exists already"):
+        describe_responses([run], out=out)
+    describe_responses([run], out=out, force=True)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out", "run"]
+
+
+def test_the_figure_shows_every_chain_beside_the_truth():
+    truth = true_chain_of(electronics())
+    others = [true_chain_of(electronics(bandwidth_poles_ns=[40 + i])) for i in range(2)]
+    for chains, reference, residuals in (
+        (others, truth, 2),
+        (others, None, 2),
+        (others[:1], None, 0),
+    ):
+        step, residual, *rest = _panels(response_figure(chains, reference, tail_ns=6400))
+        assert len(step.lines) == len(chains) + (reference is not None)
+        assert len(residual.lines) == residuals + (residuals > 0)  # and the line at 0
+        assert all(len(axes.lines) == len(step.lines) for axes in rest)
+    # half height is at 0, and a residual that of the chains at half height
+    figure = response_figure(others[:1], others[0], tail_ns=6400)
+    step, residual, *_ = _panels(figure)
+    time, height = step.lines[0].get_data()
+    assert np.interp(0, time, height) == pytest.approx(0.5 * height.max(), rel=1e-3)
+    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-9
+
+
+def _panels(figure):
+    titles = {axes.get_title(): axes for axes in figure.axes}
+    residual = titles.pop("")
+    return [titles.pop("Step response"), residual, *titles.values()]
+
+
+def test_the_truth_of_a_stand(run, tmp_path):
+    stand = tmp_path / "stand"
+    stand.mkdir()
+    content = {"electronics": electronics().model_dump(mode="json")}
+    (stand / "stand.json").write_text(json.dumps(content))
+    assert stand_electronics(stand) == electronics()
+    for text in ("", "[]", "{}", '{"electronics": {"name": "x"}}', '{"electronics": 1'):
+        (stand / "stand.json").write_text(text)
+        one_line(lambda: stand_electronics(stand), "stand.json: holds no electronics")
+    (stand / "stand.json").unlink()
+    one_line(lambda: stand_electronics(stand), f"{stand}: no test stand")
+
+
+def one_line(call: Any, *parts: str) -> None:
+    with pytest.raises(CpunetError) as error:
+        call()
+    text = str(error.value)
+    assert "\n" not in text
+    for part in parts:
+        assert part in text
+
+
+def test_runs_that_cannot_be_described(run, tmp_path):
+    out = tmp_path / "out"
+
+    def refused(*runs: Path, parts: tuple[str, ...], truth: Electronics | None = None) -> None:
+        one_line(lambda: describe_responses(runs, truth=truth, out=out), *parts)
+        assert not out.exists()
+
+    refused(tmp_path / "none", parts=("none: no finished run", "cpunet train"))
+    refused(run, tmp_path / "none", parts=("none: no finished run",))
+    refused(parts=("no run was given",))
+    coarse = write_response(tmp_path / "coarse", dt_ns=10.0)
+    refused(run, coarse, parts=(f"{coarse}: trained on pulses sampled every 10 ns", str(run)))
+    other = write_response(tmp_path / "other", "preparation.samples_after=500")
+    refused(run, other, parts=(f"{other}: trained with another preparation",))
+    refused(coarse, truth=electronics(), parts=(f"{coarse}: ", "electronics known samples"))
+    (other / "weights.safetensors").write_bytes(b"")
+    refused(other, parts=("weights.safetensors: no readable weights",))
+
+
+def test_a_network_has_no_closed_form(tmp_path):
+    write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), INFO | {"dt_ns": DT_NS})
+    one_line(
+        lambda: describe_responses([tmp_path]),
+        f"{tmp_path}: recipe paper trains a punet",
+        "cpunet validate",
+    )
+
+
+def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, capsys):
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(yaml.safe_dump(electronics().model_dump(mode="json")))
+    runs = [run.rename(tmp_path / "a run of a long name [1]")]
+    runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
+    words = ["cpunet", "response", *map(str, runs), "--electronics", str(chain)]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as stop:
+        main()
+    printed = capsys.readouterr().out
+    assert stop.value.code == 0
+    for text in ("a run of a long name [1]", "another run, 3", "mean ± spread", "known", "σ"):
+        assert text in printed
+    line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
+    assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]
+    assert "slow share of the charge [%]" in printed
+    assert "…" not in printed
+    monkeypatch.setattr(sys, "argv", [*words, "--stand", str(tmp_path)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "give one of them" in capsys.readouterr().err

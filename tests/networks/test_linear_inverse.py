@@ -1,0 +1,89 @@
+"""A linear inverse with weights whose effect is known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
+from cpunet.recipes import load_recipe
+
+SIZES = Sizes(length=60, before=12, after=8, baseline=(-12, -8), level=(12, 20))
+
+
+def edges(*starts: int) -> torch.Tensor:
+    """Ramps of four samples from 0 to 1."""
+    time = torch.arange(60.0)
+    return torch.stack([((time - start) / 4).clamp(0, 1) for start in starts])
+
+
+@pytest.fixture
+def identity() -> LinearInverse:
+    """Gives back what it gets in the region about the half maximum."""
+    network = LinearInverse(SIZES)
+    network.half_height.fill_(0.5)
+    network.weights.copy_(torch.eye(20))
+    return network
+
+
+def test_each_pulse_stays_where_it_is(identity):
+    pulses = edges(25, 30, 33)
+    result = identity(pulses)
+    assert result.dtype == torch.float32
+    torch.testing.assert_close(result, pulses)
+
+
+def test_offset_and_height_of_a_window_do_not_matter(identity):
+    identity.half_height.fill_(0.6)
+    pulses = edges(25, 30)
+    torch.testing.assert_close(identity(0.9 * pulses + 0.05), pulses)
+
+
+def test_beyond_the_region_it_is_0_and_1(identity):
+    pulses = edges(30)
+    pulses[:, :10] += 0.2
+    pulses[:, 55:] -= 0.3
+    torch.testing.assert_close(identity(pulses), edges(30))
+
+
+def test_the_mean_is_put_in_place_of_what_has_no_weight(identity):
+    identity.weights.zero_()
+    identity.mean_out.copy_(torch.linspace(0, 1, 20))
+    result = identity(edges(30))
+    # the half maximum lies after sample 31, where the region has its twelfth sample
+    torch.testing.assert_close(result[0, 19:39], torch.linspace(0, 1, 20))
+
+
+def test_an_edge_before_a_second_one_is_not_lost(identity):
+    pulses = edges(30)
+    pulses[:, 52:] += 0.5
+    torch.testing.assert_close(identity(pulses), edges(30))
+
+
+def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
+    pulses = edges(25, 30, 33)
+    pulses[1] = float("nan")
+    result = identity(pulses)
+    assert result[1].isnan().any()
+    torch.testing.assert_close(result[[0, 2]], edges(25, 33))
+
+
+def test_weights_go_through_a_file(identity, tmp_path):
+    torch.save(identity.state_dict(), tmp_path / "iren.pt")
+    loaded = LinearInverse(SIZES)
+    loaded.load_state_dict(torch.load(tmp_path / "iren.pt"))
+    pulses = edges(25, 30)
+    torch.testing.assert_close(loaded(pulses), identity(pulses))
+    assert not list(loaded.parameters())
+
+
+def test_sizes_of_a_recipe_fit_its_windows():
+    recipe = load_recipe("fast")
+    sizes = Sizes.of(recipe.preparation.length, recipe.matching.training)
+    assert sizes == Sizes(800, 230, 170, (-230, -130), (300, 400))
+
+
+def test_a_stretch_goes_on_with_the_edge_values():
+    pulses = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    result = stretch(pulses, torch.tensor([0, 2]), -2, 2)
+    assert result.tolist() == [[1, 1, 1, 2], [4, 5, 6, 6]]

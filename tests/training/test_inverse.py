@@ -1,0 +1,241 @@
+"""The inverse of a known readout on synthetic pulses, against the charge that went in."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.finishing import finish
+from cpunet.errors import CpunetError
+from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import current_amplitude
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.inverse import fit_inverse
+
+RECIPE = load_recipe("fast", ["generator.poles_ns=[50, 50]", "generator.decay_us=60"])
+DT_NS = 16.0
+FEP_KEV, DEP_KEV = 2614.5, 1592.5
+NOISE_KEV = 3.0
+
+
+def charge(n: int, seed: int) -> FloatArray:
+    """Prepared pulses of one or two sites: slow at first, then a steep end."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(400)[np.newaxis]
+
+    def site() -> np.ndarray:
+        drift, steep = rng.uniform(10, 100, (n, 1)), rng.uniform(5, 9, (n, 1))
+        since = time - 100 - rng.uniform(0, 1, (n, 1))
+        slow = np.clip(since / drift, 0, 1) ** 2
+        return 0.3 * slow + 0.7 * np.clip((since - drift) / steep + 1, 0, 1)
+
+    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
+    pulses = Pulses.of(share * site() + (1 - share) * site(), dt_ns=DT_NS)
+    return as_simulated(pulses.waveforms)
+
+
+def as_simulated(windows: FloatArray) -> FloatArray:
+    pulses = Pulses.of(windows, dt_ns=DT_NS)
+    prepared = prepare(pulses, RECIPE.preparation, "simulated")
+    assert len(prepared) == len(windows)
+    return prepared.pulses.waveforms
+
+
+def readout(noise_kev: float) -> ResponseGenerator:
+    generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
+    density = np.full(NOISE_BINS, noise_kev**2)
+    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+    return generator
+
+
+def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> FloatArray:
+    """Windows as the data's, with the noise of an energy or none."""
+    with torch.no_grad():
+        records = generator(torch.from_numpy(sim)).numpy()
+    noise = None if kev is None else generator.noise
+    energy = None if kev is None else np.full(len(sim), kev)
+    windows = finish(
+        records, RECIPE.preparation, dt_ns=DT_NS, noise=noise, energy_kev=energy, seed=5
+    )
+    assert np.isfinite(windows).all()
+    return windows
+
+
+def half_time(windows: FloatArray) -> np.ndarray:
+    """Last interpolated crossing of half the height before the maximum."""
+    times = []
+    for window in windows:
+        level = 0.5 * window.max()
+        before = np.flatnonzero(window[: window.argmax()] < level)[-1]
+        low, high = window[before : before + 2]
+        times.append(before + (level - low) / (high - low))
+    return np.array(times)
+
+
+def at_half(windows: FloatArray) -> np.ndarray:
+    """From 200 samples before the half maximum to 150 after it."""
+    samples = np.arange(windows.shape[1])
+    around = half_time(windows)[:, np.newaxis] + np.arange(-200, 150)
+    return np.array([np.interp(t, samples, w) for t, w in zip(around, windows, strict=True)])
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """RMS of each pulse; a second site at half the height may move one's alignment."""
+    return np.sqrt(((found - truth) ** 2).mean(axis=1))
+
+
+class Case(NamedTuple):
+    generator: ResponseGenerator
+    inverse: LinearInverse
+
+    def iren(self, windows: FloatArray) -> FloatArray:
+        return as_simulated(self.inverse(torch.from_numpy(windows)).numpy())
+
+
+def fitted(noise_kev: float, energy_kev: float = FEP_KEV) -> Case:
+    generator, sim = readout(noise_kev), charge(1200, seed=1)
+    energies = np.full(len(sim), energy_kev)
+    return Case(generator, fit_inverse(generator, sim, energies, RECIPE, seed=0))
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Case:
+    return fitted(0.0)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Case:
+    return fitted(NOISE_KEV)
+
+
+@pytest.fixture(scope="module")
+def held_out() -> FloatArray:
+    return charge(300, seed=2)
+
+
+def test_without_noise_the_charge_comes_back(quiet, held_out):
+    windows = ren(quiet.generator, held_out, None)
+    truth = at_half(held_out)
+    found, measured = error(at_half(quiet.iren(windows)), truth), error(at_half(windows), truth)
+    assert np.median(found) < 1e-4
+    assert np.quantile(found, 0.99) < 0.005
+    assert measured.min() > 0.02
+
+
+def test_a_pulse_keeps_its_place(quiet, held_out):
+    with torch.no_grad():
+        records = quiet.generator(torch.from_numpy(held_out)).numpy()
+    windows = ren(quiet.generator, held_out, None)
+    with torch.no_grad():
+        found = quiet.inverse(torch.from_numpy(windows)).numpy()
+    delay = half_time(records) - ROOM_BEFORE - half_time(held_out)
+    assert np.quantile(np.abs(half_time(windows) - half_time(found) - delay), 0.95) < 0.02
+    later = np.concatenate([windows[:, :1], windows[:, :-1]], axis=1)
+    with torch.no_grad():
+        moved = quiet.inverse(torch.from_numpy(later)).numpy()
+    np.testing.assert_allclose(moved[:, 1:], found[:, :-1], atol=1e-3)
+
+
+@pytest.mark.parametrize("kev", [FEP_KEV, DEP_KEV])
+def test_noise_is_taken_away_and_the_edge_is_restored(noisy, held_out, kev):
+    windows = ren(noisy.generator, held_out, kev)
+    found, truth = at_half(noisy.iren(windows)), at_half(held_out)
+    measured = at_half(windows)
+    # no charge has moved 150 samples before any half maximum of these
+    assert truth[:, :50].max() == 0
+    assert rms(measured[:, :50]) == pytest.approx(NOISE_KEV / kev, rel=0.3)
+    assert rms(found[:, :50]) < 0.3 * rms(measured[:, :50])
+    # all charge has come 120 samples after it
+    assert rms(found[:, 320:] - 1) < 0.3 * NOISE_KEV / kev
+    # right before the edge, where charge could have moved, less of it goes
+    quiet = (truth == 0) & (np.arange(350) > 100)
+    assert rms(found[quiet]) < 0.75 * rms(measured[quiet])
+    unit = measured / measured.max(axis=1, keepdims=True)
+    assert np.median(error(found, truth)) < 0.15 * np.median(error(unit, truth))
+
+
+def test_current_amplitudes_come_back(noisy, held_out):
+    windows = ren(noisy.generator, held_out, FEP_KEV)
+    truth = current_amplitude(held_out)
+    ratio = current_amplitude(noisy.iren(windows)) / truth
+    assert np.median(ratio) == pytest.approx(1, abs=0.02)
+    measured = current_amplitude(windows) / truth
+    assert ratio.std() < 0.5 * (measured / np.median(measured)).std()
+
+
+def test_there_and_back_is_the_identity_on_average(noisy, held_out):
+    data = ren(noisy.generator, held_out, FEP_KEV)
+    back = noisy.iren(data)
+    mean_error = at_half(back).mean(axis=0) - at_half(held_out).mean(axis=0)
+    assert np.abs(mean_error).max() < 0.01
+    assert rms(mean_error) < 0.001
+    again = at_half(ren(noisy.generator, back, None)).mean(axis=0)
+    assert np.abs(again - at_half(data).mean(axis=0)).max() < 0.003
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_noise_of_another_size_would_do_worse(noisy, held_out, factor):
+    windows = torch.from_numpy(ren(noisy.generator, held_out, FEP_KEV))
+    truth = at_half(held_out)
+    right, wrong = (
+        rms(at_half(inverse(windows).numpy()) - truth)
+        for inverse in (noisy.inverse, fitted(NOISE_KEV, FEP_KEV / factor).inverse)
+    )
+    assert right < 0.98 * wrong
+
+
+def test_coloured_noise_is_known_for_what_it_is(held_out):
+    generator = readout(0.0)
+    frequency = np.linspace(0, 0.5, NOISE_BINS)
+    density = 400 / (1 + (frequency / 0.004) ** 2)  # slower than the edge
+    generator.noise_density.copy_(torch.from_numpy(density))
+    sim = charge(1200, seed=1)
+    inverse = fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
+    windows = ren(generator, held_out, FEP_KEV)
+    found = inverse(torch.from_numpy(windows)).numpy()
+    white = readout(generator.noise.rms)
+    other = fit_inverse(white, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
+    mistaken = other(torch.from_numpy(windows)).numpy()
+    truth = at_half(held_out)
+    assert rms(at_half(found) - truth) < 0.9 * rms(at_half(mistaken) - truth)
+
+
+def test_many_pulses_are_thinned_out_by_the_seed():
+    recipe = load_recipe("fast", ["training.max_pulses=250", "generator.poles_ns=[50, 50]"])
+    sim, generator = charge(400, seed=1), readout(NOISE_KEV)
+    energy = np.full(len(sim), FEP_KEV)
+    first, same, other = (
+        fit_inverse(generator, sim, energy, recipe, seed=seed).weights for seed in (1, 1, 2)
+    )
+    torch.testing.assert_close(first, same)
+    assert not torch.allclose(first, other)
+
+
+@pytest.mark.parametrize(
+    ("n", "kev", "message"),
+    [
+        (30, FEP_KEV, "30 simulated pulses for the inverse"),
+        (250, float("nan"), "pulse 0 has an energy of nan keV"),
+        (250, 0.0, "pulse 0 has an energy of 0.0 keV"),
+    ],
+)
+def test_sets_that_cannot_be_used_are_refused(n, kev, message):
+    with pytest.raises(CpunetError, match=message):
+        fit_inverse(readout(1.0), charge(n, 1), np.full(n, kev), RECIPE, seed=0)
+
+
+def test_one_energy_for_each_pulse():
+    with pytest.raises(CpunetError, match="250 energies"):
+        fit_inverse(readout(1.0), charge(250, 1), np.ones(1), RECIPE, seed=0)
