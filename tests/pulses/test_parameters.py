@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from cpunet.analysis import parameters
 from cpunet.errors import CpunetError
+from cpunet.pulses import parameters
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import (
     PARAMETERS,

@@ -29,7 +29,7 @@ def batches(sets) -> tuple[Tensor, Tensor]:
 
 
 def make_step(recipe) -> Step:
-    return Step(CycleGan(recipe).train(), recipe.training)
+    return Step(CycleGan(recipe).train(), recipe.cyclegan.training)
 
 
 def deterministic(step: Step) -> Step:

@@ -64,6 +64,7 @@ def write_report(
     html = page.substitute(
         notes="\n".join(f"<p>{escape(note)}</p>" for note in notes),
         scores="\n".join(_peak_html(n, p) for n, p in metrics.get("peaks", {}).items()),
+        survival=_survival_html(metrics.get("ae_survival", {})),
         figures="\n".join(drawn),
         rejections=_pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=_pairs_table(metrics.get("training", {}), ("Setting", "Value")),
@@ -80,6 +81,8 @@ def _peak_html(peak: str, scores: Mapping[str, Any]) -> str:
         if "missing" in scores
         else _parameter_table(scores.get("parameters", {})),
     ]
+    if scores.get("two_sample"):
+        parts.append(_two_sample_table(scores["two_sample"]))
     if scores.get("paired"):
         parts.append(_paired_table(scores["paired"]))
     return "\n".join(parts)
@@ -106,6 +109,41 @@ def _parameter_table(parameters: Mapping[str, Any]) -> str:
         ceiling = _percent(iou.get("ceiling"), error.get("ceiling"))
         rows.append([title, "Ceiling", ceiling, "", ""])
     return _table(["Parameter", "Method", "IoU [%]", "W₁", "KS"], rows, names=2)
+
+
+def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
+    head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
+    rows = []
+    for method, found in tested.items():
+        if "missing" in found:
+            rows.append([label(method), NO_VALUE, found["missing"]])
+        else:
+            null = f"{_number(found['null_mean'])} ± {_number(found['null_std'])}"
+            auc = f"{_number(found['auc'])} ± {_number(found['auc_std'])}"
+            rows.append([label(method), auc, null])
+    return _table(head, rows)
+
+
+def _survival_html(survival: Mapping[str, Any]) -> str:
+    """Survival of A/E cuts by peak and method."""
+    if "missing" in survival:
+        return f"<p>Not scored: {escape(survival['missing'])}.</p>"
+    rows = []
+    for peak, found in survival.items():
+        for method, value in found.get("survival", {}).items():
+            rows.append(
+                [
+                    peak,
+                    label(method),
+                    _percent(value, found["survival_std"].get(method)),
+                    _percent(
+                        found["difference"].get(method), found["difference_std"].get(method)
+                    ),
+                    _number(found["sigma"].get(method)),
+                ]
+            )
+    head = ["Peak", "Method", "Survival [%]", "Less data [points]", "In sigma"]
+    return _table(head, rows, names=2)
 
 
 def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:

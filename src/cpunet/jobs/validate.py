@@ -23,6 +23,7 @@ from cpunet.jobs.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.pulse_tests import survivals, told_apart
 from cpunet.jobs.rivals import RivalWindows, rival_windows
 from cpunet.jobs.train import resolve_device
 from cpunet.jobs.truth import read_response
@@ -155,6 +156,7 @@ def validate_run(
             )
         metrics = {
             "peaks": peaks,
+            "ae_survival": survivals(values, seed),
             "rivals": {"fits": rivals.fits, "missing": rivals.missing},
             "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
             | {"peak": info["peak"]},
@@ -215,6 +217,8 @@ def _score(
     methods: Mapping[str, Mapping[str, Values]] = {
         method: of_method for method, of_method in values.items() if method != "data"
     }
+    windows = {method: pulses.waveforms for method, pulses in _by_method(peak)}
+    scores["two_sample"] = told_apart(windows, values, seed)
     scores["parameters"] = compare(values["data"], methods, recipe.scores, seed)
     if peak.truth is not None:
         scores["paired"] = _paired(peak, recipe.scores.edge_samples)

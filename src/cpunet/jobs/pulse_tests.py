@@ -1,0 +1,84 @@
+"""What a validation asks beyond distributions: told apart by a classifier, kept by A/E."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from cpunet.analysis.a_over_e import survival_table
+from cpunet.analysis.style import NO_NOISE
+from cpunet.analysis.two_sample import classifier_auc
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import Values
+
+ByMethod = Mapping[str, Mapping[str, Values]]
+
+
+def told_apart(
+    windows: Mapping[str, FloatArray], values: ByMethod, seed: int
+) -> dict[str, Any]:
+    """Classifier test of each method's pulses against the data's, of one peak.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses by method, those of the ``"data"`` among them.
+    values
+        Their pulse-shape parameters.
+    seed
+        Of the folds.
+
+    Returns
+    -------
+    dict
+        The fields of `cpunet.analysis.two_sample.TwoSample` by method, or ``missing`` and
+        the reason.  Methods without noise are left out: the noise alone tells them.
+    """
+    tested: dict[str, Any] = {}
+    for method, others in windows.items():
+        if method == "data" or method.endswith(NO_NOISE):
+            continue
+        try:
+            result = classifier_auc(
+                windows["data"], others, seed=seed, features=(values["data"], values[method])
+            )
+        except CpunetError as error:
+            tested[method] = {"missing": str(error)}
+        else:
+            tested[method] = asdict(result)
+    return tested
+
+
+def survivals(values: Mapping[str, ByMethod], seed: int) -> dict[str, Any]:
+    """A/E survival of all peaks and methods after cuts at 90 % of the DEP.
+
+    Parameters
+    ----------
+    values
+        Parameters by peak and method, ``"data"`` among them; peaks that are not scored are
+        empty.
+    seed
+        Of the errors.
+
+    Returns
+    -------
+    dict
+        As `cpunet.analysis.a_over_e.survival_table` gives it, or ``missing`` and the reason.
+    """
+    amplitudes = {
+        peak: {method: v["current_amplitude"] for method, v in by_method.items()}
+        for peak, by_method in values.items()
+        if by_method
+    }
+    methods = set.intersection(*(set(found) for found in amplitudes.values()))
+    by_method = {
+        method: {peak: found[method] for peak, found in amplitudes.items()}
+        for method in next(iter(amplitudes.values()))
+        if method in methods
+    }
+    try:
+        return dict(survival_table(by_method.pop("data"), by_method, seed=seed))
+    except CpunetError as error:
+        return {"missing": str(error)}
