@@ -12,12 +12,60 @@ from cpunet.recipes import load_recipe, recipe_from, recipe_names
 
 
 def test_the_recipes_that_come_with_the_package():
-    assert {"paper", "small"} <= set(recipe_names())
+    assert {"fast", "paper", "small"} == set(recipe_names())
     for name in recipe_names():
         recipe = load_recipe(name)
         assert recipe.name == name
         assert recipe.preparation.length == 800
-        assert recipe.training.losses.adversarial_weight > 0
+
+
+@pytest.mark.parametrize("name", ["paper", "small"])
+def test_recipes_that_train_a_cyclegan(name):
+    recipe = load_recipe(name)
+    generator, discriminator, training = recipe.cyclegan
+    assert (generator.name, discriminator.name) == ("punet", "gru")
+    assert training.losses.adversarial_weight > 0
+    with pytest.raises(CpunetError, match=rf"^recipe {name}: does not match a response$"):
+        _ = recipe.matching
+
+
+def test_the_recipe_that_matches_a_response():
+    recipe = load_recipe("fast")
+    generator, training = recipe.matching
+    assert generator.name == "response"
+    assert recipe.discriminator is None
+    assert training.iterations == training.steps
+    # what is compared lies within a window, whose half maximum is before its middle
+    assert training.before <= training.baseline[0] <= recipe.preparation.samples_before
+    assert training.after <= recipe.preparation.samples_after
+    assert -training.before <= min(training.segments)
+    assert max(training.segments) <= training.after
+    assert list(training.segments) == sorted(set(training.segments))
+    assert training.squares <= training.components
+    with pytest.raises(CpunetError, match=r"^recipe fast: does not train a CycleGAN$"):
+        _ = recipe.cyclegan
+
+
+def test_all_recipes_see_the_same_pulses():
+    fast, *others = (load_recipe(name) for name in recipe_names())
+    for other in others:
+        assert (other.peaks, other.preparation) == (fast.peaks, fast.preparation)
+        assert (other.cuts, other.scores) == (fast.cuts, fast.scores)
+
+
+@pytest.mark.parametrize(
+    ("room", "other", "said"),
+    [
+        ("generator", "paper", "goes with training method cyclegan"),
+        ("training", "paper", "goes with training method cyclegan"),
+        ("discriminator", "paper", "a discriminator is needed for punet, and for it alone"),
+    ],
+)
+def test_parts_of_different_trainings_are_not_mixed(room, other, said):
+    fast, paper = (load_recipe(name).model_dump(mode="json") for name in ("fast", other))
+    for settings, part in ((fast, paper), (paper, fast)):
+        with pytest.raises(CpunetError, match=f"mine: the whole: .*{said}"):
+            recipe_from(settings | {room: part[room]}, "mine")
 
 
 def test_the_papers_numbers():
@@ -81,7 +129,7 @@ def message(name: str, *overrides: str) -> str:
 def test_a_recipe_that_is_not_there():
     text = message("papre")
     assert "'papre'" in text
-    assert "paper, small" in text
+    assert "fast, paper, small" in text
 
 
 @pytest.mark.parametrize(
@@ -112,7 +160,7 @@ def test_files_that_are_no_recipes(tmp_path, content):
         ("training.average_decay=1", "training.average_decay: "),
         ("training=5", "training: "),
         ("generator.width=3", "generator.width: "),
-        ("generator.name=unet", "generator.name: "),
+        ("generator.name=unet", "generator: "),
         ("generator.dropout=1", "generator.dropout: "),
         ("discriminator.value_range=[1, 0]", "discriminator: "),
         ("discriminator.value_range=[1]", "discriminator.value_range"),
@@ -124,7 +172,36 @@ def test_files_that_are_no_recipes(tmp_path, content):
     ],
 )
 def test_wrong_settings_are_named(override, part):
-    assert part in message("paper", override)
+    assert part in without_kinds(message("paper", override))
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("training.batch_size=16", "no training.batch_size"),
+        ("training.method=cyclegan", "training"),
+        ("training.method=guessing", "training: "),
+        ("training.ridge=1", "training.ridge: "),
+        ("training.clip=0", "training.clip: "),
+        ("training.steps=0", "training.steps: "),
+        ("training.start_factors=[]", "training.start_factors: "),
+        ("training.segments=[0.5, 1]", "training.segments.0: "),
+        ("training.baseline=[230]", "training.baseline"),
+        ("training.max_pulses=99", "training.max_pulses: "),
+        ("generator.poles_ns=[]", "generator.poles_ns: "),
+        ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
+        ("generator.ringing_mhz=0", "generator.ringing_mhz: "),
+    ],
+)
+def test_wrong_settings_of_a_matching_are_named(override, part):
+    assert part in without_kinds(message("fast", override))
+
+
+def without_kinds(text: str) -> str:
+    """A message in which the kind of a part may stand between the part and its key."""
+    for kind in ("cyclegan", "matching", "punet", "response"):
+        text = text.replace(f".{kind}.", ".")
+    return text
 
 
 def test_a_length_that_the_networks_cannot_halve():
@@ -135,12 +212,13 @@ def test_a_length_that_the_networks_cannot_halve():
 def test_unknown_keys_of_a_file_are_refused():
     settings = load_recipe("paper").model_dump(mode="json")
     settings["training"]["epochs"] = 3
-    with pytest.raises(CpunetError, match=r"mine: training\.epochs: .*not permitted"):
+    with pytest.raises(CpunetError, match=r"mine: training\..*epochs: .*not permitted"):
         recipe_from(settings, "mine")
 
 
-def test_every_setting_is_required():
-    settings = load_recipe("paper").model_dump(mode="json")
+@pytest.mark.parametrize("name", ["paper", "fast"])
+def test_every_setting_is_required(name):
+    settings = load_recipe(name).model_dump(mode="json")
     for room, values in settings.items():
         if isinstance(values, dict):
             for key in values:

@@ -8,15 +8,16 @@ which would lose the low frequencies that decide drift time and tail slope.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
+import scipy.cluster.vq
 import scipy.fft
-import scipy.optimize
 
 from cpunet.electronics.exponentials import FloatArray as Values
+from cpunet.electronics.noise_spectrum import spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -27,13 +28,12 @@ FEWEST = 30  # flat baselines
 SHORTEST_SHARE = 0.1  # of the baselines may be shorter than those used
 # Where a pulse is seen to begin, and the samples before that in which it may have crept up.
 START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
-# Below the third frequency of a baseline its mean and the window's leakage hide the
-# spectrum; there it follows from how the noise drifts apart over the baseline's length.
-FIRST_CLEAN_BIN, RECORD_SAMPLES = 3, 8192
-CORNERS, LAGS = 8, 40  # of the slow part's Lorentzians; at which the drift is compared
 TRACES = 64  # drawn at a time, to bound memory
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and how often
 SIGMA_PER_MAD = 1.4826
+# Kinds of baselines are told apart where their powers spread this many times as much as
+# those of baselines of one spectrum.
+KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,21 @@ class BaselineNoise:
         Length of that FFT and the sampling period.
     n_baselines
         How many flat baselines it was estimated from.
+    kinds, lines, shares
+        Spectra of several kinds of baselines: continuum and narrow lines, shapes
+        ``(kinds, bins)``, and how frequent each kind is, shape ``(kinds,)``; `density` is
+        their mean.  None for Gaussian noise of one spectrum.  Traces of several channels, or
+        of different days, have noise of different sizes and colours, which a mean would
+        hide; and a line is a sine of fixed height, not Gaussian noise.
     """
 
     density: Values
     samples: int
     dt_ns: float
     n_baselines: int
+    kinds: Values | None = None
+    lines: Values | None = None
+    shares: Values | None = None
 
     @classmethod
     def from_traces(cls, raw: Pulses, config: PreparationConfig) -> Self:
@@ -83,8 +92,17 @@ class BaselineNoise:
                 f"only {len(flat)} flat baselines among {n} traces; give more traces "
                 f"(at least {FEWEST} with known energy)"
             )
-        density = _with_slow_part(_periodogram(flat), _structure_function(flat))
-        return cls(density, 2 * (len(density) - 1), dt_ns, len(flat))
+        continuum, lines = spectrum(flat)
+        mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
+        which = _kinds(flat, mean)
+        counts = np.bincount(which)
+        # few baselines have no spectrum of their own
+        spectra = [
+            spectrum(flat[which == kind]) if counts[kind] >= FEWEST else (continuum, lines)
+            for kind in range(len(counts))
+        ]
+        kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
+        return replace(mean, kinds=kinds, lines=kinds_lines, shares=counts / counts.sum())
 
     @classmethod
     def from_windows(cls, windows: Pulses, samples: int) -> Self:
@@ -122,8 +140,8 @@ class BaselineNoise:
     ) -> FloatArray:
         """Draw Gaussian noise for pulses of these energies.
 
-        Several pulses take parts of one long trace: noise slower than a record is then much
-        the same in neighbouring pulses, and moves their baselines alike.
+        Several pulses take parts of one long trace, of one kind, in random order: noise
+        slower than a record is much the same in them, and moves their baselines alike.
 
         Parameters
         ----------
@@ -155,23 +173,80 @@ class BaselineNoise:
         # Twice as long as needed, so that end and beginning know nothing of each other.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         each = max(1, (long - length) // length)  # parts of a trace; a gap stays at its end
-        size = np.sqrt(0.5 * long * self.density_of(long)).astype(np.float32)
+        size = self._sizes(self.density[np.newaxis] if self.kinds is None else self.kinds, long)
+        lines = None if self.lines is None else self._sizes(self.lines, long)
         noise = np.empty((n, length), np.float32)
+        order = rng.permutation(n)
         for first in range(0, n, each * TRACES):
-            rows = noise[first : first + each * TRACES]
-            shape = (-(-len(rows) // each), 2 * len(size))
-            bins = rng.standard_normal(shape, np.float32).view(np.complex64) * size
+            rows = order[first : first + each * TRACES]
+            shape = (-(-len(rows) // each), 2 * size.shape[1])
+            bins = rng.standard_normal(shape, np.float32).view(np.complex64)
+            kind = rng.choice(len(size), size=len(bins), p=self.shares)
+            bins *= size[kind]
+            if lines is not None:
+                _add_lines(bins, lines[kind], rng)
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
-            rows[:] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
+            noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
         noise /= energy_kev[:, np.newaxis]
         return noise
 
+    def _sizes(self, densities: Values, long: int) -> FloatArray:
+        """Standard deviation of real and imaginary parts of a spectrum of `long` samples."""
+        return np.asarray(np.sqrt(0.5 * long * self._at(densities, long)), np.float32)
+
     def density_of(self, length: int) -> Values:
-        """Density at the frequencies of a real FFT of `length` samples."""
-        known = np.arange(len(self.density)) / self.samples
-        return np.asarray(
-            np.interp(np.arange(length // 2 + 1) / length, known, self.density), float
-        )
+        """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
+        return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
+
+    def _at(self, densities: Values, length: int) -> Values:
+        known = np.arange(densities.shape[1]) / self.samples
+        wanted = np.arange(length // 2 + 1) / length
+        if len(wanted) == len(known):
+            return densities
+        return np.asarray([np.interp(wanted, known, one) for one in densities], float)
+
+
+def _add_lines(
+    bins: npt.NDArray[np.complex64], lines: FloatArray, rng: np.random.Generator
+) -> None:
+    """Add sines of fixed height and random phase to spectra, shape ``(traces, bins)``."""
+    trace, column = np.nonzero(lines)
+    phase = rng.uniform(0, 2 * np.pi, len(trace))
+    # a Gaussian bin has this modulus on average, a sine has it always
+    bins[trace, column] += np.sqrt(2) * lines[trace, column] * np.exp(1j * phase)
+
+
+def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
+    """Which kind each baseline is of; all of kind 0 if they differ by no more than chance.
+
+    Baselines are told apart by the logarithm of their power in bands, in the directions in
+    which it spreads more than that of baselines drawn from the mean spectrum.
+    """
+    one = np.zeros(len(flat), np.intp)
+    if len(flat) < KINDS * FEWEST:
+        return one
+    rng = np.random.default_rng(0)
+    own = _band_powers(flat)
+    chance = _band_powers(mean.draw(np.ones(len(flat)), flat.shape[1], rng).astype(float))
+    scale = chance.std(axis=0)
+    own, chance = (own - own.mean(axis=0)) / scale, (chance - chance.mean(axis=0)) / scale
+    _, _, axes = np.linalg.svd(np.clip(own, -OUTLIER, OUTLIER), full_matrices=False)
+    axes = axes[(own @ axes.T).std(axis=0) > DIFFERENT * (chance @ axes.T).std(axis=0)]
+    if not len(axes):
+        return one
+    points = np.clip(own @ axes.T, -OUTLIER, OUTLIER)
+    _, which = scipy.cluster.vq.kmeans2(points, KINDS, minit="++", rng=rng, iter=50)
+    return np.asarray(which, np.intp)
+
+
+def _band_powers(baselines: Values) -> Values:
+    """Logarithm of the power in bands of equal width, shape ``(n, bands)``."""
+    window = np.hanning(baselines.shape[1])
+    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
+    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+    # the first bins hold what is left of the mean, and drifts
+    bands = np.array_split(power[:, 4:], BANDS, axis=1)
+    return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 
 def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
@@ -201,66 +276,6 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
     return np.asarray(
         (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
     )
-
-
-def _periodogram(baselines: Values) -> Values:
-    samples = baselines.shape[1]
-    window = np.hanning(samples + 1)[:-1]
-    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
-    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-    return np.asarray(power.mean(axis=0) / (window @ window), float)
-
-
-def _structure_function(baselines: Values) -> Values:
-    """Half the mean square difference of samples 0, 1, 2 ... apart.
-
-    Unlike a spectrum it needs no mean to be taken off, so that nothing is lost of noise
-    slower than the baseline.
-    """
-    n, samples = baselines.shape
-    padded = scipy.fft.next_fast_len(2 * samples, real=True)
-    centred = baselines - baselines.mean(axis=1, keepdims=True)
-    power = np.zeros(padded // 2 + 1)
-    for rows in range(0, n, 512):
-        power += (np.abs(scipy.fft.rfft(centred[rows : rows + 512], padded)) ** 2).sum(axis=0)
-    products = scipy.fft.irfft(power, padded)[:samples]
-    squares = np.cumsum((centred**2).sum(axis=0))
-    lag = np.arange(samples)
-    # the squares of the samples that have a partner later, and of those that have one earlier
-    left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
-    return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)
-
-
-def _with_slow_part(density: Values, drift: Values) -> Values:
-    """The spectrum down to the frequencies of `RECORD_SAMPLES`.
-
-    Parameters
-    ----------
-    density, drift
-        Periodogram and structure function of the baselines.
-
-    Returns
-    -------
-    array
-        Density at the frequencies of a real FFT of `RECORD_SAMPLES`: as measured from
-        `FIRST_CLEAN_BIN` on, and rising from there towards 0 by a sum of Lorentzians, none
-        of them negative, whose structure function comes closest to `drift`.
-    """
-    samples = len(drift)
-    frequency = np.arange(RECORD_SAMPLES // 2 + 1) / RECORD_SAMPLES
-    known = np.arange(len(density)) / samples
-    join = known[FIRST_CLEAN_BIN]
-    fast = np.interp(frequency, known[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
-    corners = np.geomspace(2 / RECORD_SAMPLES, join, CORNERS)[:, np.newaxis]
-    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
-    slow = np.maximum(slow, 0)
-    lags = np.unique(np.geomspace(4, 0.9 * samples, LAGS).astype(int))
-    # both signs of the frequency; a density of 1 is a mean square of 1
-    apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / RECORD_SAMPLES
-    weights = 1 / drift[lags]
-    rest = (drift[lags] - apart @ fast) * weights
-    heights, _ = scipy.optimize.nnls((apart @ slow.T) * weights[:, np.newaxis], rest)
-    return np.asarray(fast + heights @ slow, float)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:

@@ -70,14 +70,15 @@ class Moments:
             If there are too few pulses.
         """
         data = torch.from_numpy(np.ascontiguousarray(windows))
-        level = 0.5 * float(data.mean(dim=0).max())
+        whole = torch.isfinite(data).all(dim=1)
+        level = 0.5 * float(data[whole].mean(dim=0).max())
         aligned, records = at_half_maximum(
             data, level, preparation.samples_before + 1, config, preparation.tail_level
         )
         kernel = torch.from_numpy(current_amplitude_kernel())
         amplitude = _amplitude(aligned, kernel, config.before)
         quiet = aligned[:, : max(1, config.before // 4)].mean(dim=1).abs()
-        usable = torch.isfinite(aligned).all(dim=1) & (quiet < 0.05)
+        usable = whole & torch.isfinite(aligned).all(dim=1) & (quiet < 0.05)
         usable &= amplitude > LEAST_SHARE * amplitude[usable].median()
         if usable.sum() < FEWEST:
             raise CpunetError(

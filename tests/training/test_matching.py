@@ -1,0 +1,236 @@
+"""Responses fitted to unpaired pulses that went through a chain of known numbers."""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.chain import Electronics
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.noise import coloured_noise
+from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.response import linear_response
+from cpunet.errors import CpunetError
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.matching import GOOD_FIT, Fit, fit_response
+
+DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
+KEV, NOISE_KEV = 2614.5, 1.95
+N = 600
+# Slow part and decays are such that the response can describe the chain exactly.
+CHAIN = Electronics.model_validate(
+    read_electronics("legend200").model_dump()
+    | {
+        "bandwidth_poles_ns": (55, 35),
+        "slow": {"fraction": 0.065, "tau_ns": 400.0},
+        "decays": [{"fraction": 1.0, "tau_us": 80.0}],
+    }
+)
+FEW = ("generator.slow_ns=[400]", "generator.fast_decays_us=[]")
+RECIPE = load_recipe("fast", FEW)
+
+
+def charge(n: int, seed: int, longest: float = 100, steepest: float = 5) -> Pulses:
+    """Charge of one or two sites, finely sampled: slow at first, then a steep end.
+
+    `longest` drift and `steepest` end are in samples of the digitiser.
+    """
+    rng = np.random.default_rng(seed)
+    time = (np.arange(240 * FINE_PER_SAMPLE, dtype=np.float32) + 0.5) / FINE_PER_SAMPLE
+
+    def site() -> np.ndarray:
+        drift = rng.uniform(10, longest, (n, 1))
+        steep = rng.uniform(steepest, steepest + 4, (n, 1))
+        since = time - 30 - rng.uniform(0, 1, (n, 1))
+        slow = np.clip(since / drift, 0, 1) ** 2
+        return 0.3 * slow + 0.7 * np.clip((since - drift) / steep + 1, 0, 1)
+
+    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
+    pulses = share * site() + (1 - share) * site()
+    return Pulses.of(pulses, dt_ns=FINE_NS, energy_kev=np.full(n, KEV))
+
+
+def simulated(fine: Pulses) -> Pulses:
+    means = fine.waveforms.reshape(len(fine), -1, FINE_PER_SAMPLE).mean(axis=2)
+    pulses = Pulses.of(means, dt_ns=DT_NS, energy_kev=fine.energy_kev)
+    return prepare(pulses, RECIPE.preparation, "simulated").pulses
+
+
+class Problem(NamedTuple):
+    """Unpaired sets, and the noise as it is measured on one of them."""
+
+    sim: Pulses
+    data: Pulses
+    noise: BaselineNoise
+
+    def fit(self, seed: int, *overrides: str, sim: Pulses | None = None, **options):
+        sim = self.sim if sim is None else sim
+        return fit_response(
+            sim.waveforms,
+            self.data.waveforms,
+            sim.energy_kev,
+            self.noise,
+            load_recipe("fast", [*FEW, *overrides]),
+            seed=seed,
+            **options,
+        )
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    clean = linear_response(charge(N, seed=2), CHAIN)
+    rng = np.random.default_rng(3)
+    noise = coloured_noise(CHAIN.noise.spectrum, N, CHAIN.length, DT_NS, rng)
+    adc = 15_000 + CHAIN.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
+    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
+    data = prepare(raw, RECIPE.preparation, "measured").pulses
+    measured = BaselineNoise.from_traces(raw, RECIPE.preparation)
+    return Problem(simulated(charge(N, seed=1)), data, measured)
+
+
+class Told(NamedTuple):
+    response: ElectronicsResponse
+    fit: Fit
+    steps: list[tuple[int, float]]
+
+
+def told_fit(problem: Problem, seed: int, *overrides: str) -> Told:
+    steps: list[tuple[int, float]] = []
+    found = problem.fit(seed, *overrides, listener=lambda *step: steps.append(step))
+    return Told(*found, steps)
+
+
+@pytest.fixture(scope="module")
+def near(problem: Problem) -> Told:
+    return told_fit(problem, 0)
+
+
+@pytest.fixture(scope="module")
+def far(problem: Problem) -> Told:
+    """Other noise, and a start with three times the bandwidth that there is."""
+    return told_fit(problem, 1, "generator.poles_ns=[20, 10]")
+
+
+def rise_ns(step: np.ndarray) -> float:
+    """From 10 to 90 % of the highest, for a step sampled every ns."""
+    step = step[: int(step.argmax())] / step.max()
+    early, late = np.interp([0.1, 0.9], step, np.arange(len(step)))
+    return float(late - early)
+
+
+def learned_rise_ns(response: ElectronicsResponse) -> float:
+    fine = copy.deepcopy(response)
+    fine.dt_ns.fill_(1.0)
+    with torch.no_grad():
+        return rise_ns(torch.fft.irfft(fine.transfer(16_384), 16_384)[:4000].numpy())
+
+
+@pytest.mark.parametrize("which", ["near", "far"])
+def test_the_chain_is_found(request, which: str) -> None:
+    found: Told = request.getfixturevalue(which)
+    true_rise = rise_ns(CHAIN.step_response(np.arange(4000.0)))
+    assert learned_rise_ns(found.response) == pytest.approx(true_rise, rel=0.02)
+    numbers = found.response.describe()
+    assert numbers["decay_us"] == pytest.approx(80, rel=0.01)
+    assert numbers["slow_400_ns"] == pytest.approx(0.065, rel=0.05)
+    assert found.fit.chi_square < 1.6 * found.fit.moments
+
+
+@pytest.mark.parametrize("which", ["near", "far"])
+def test_the_errors_cover_the_truth(request, which: str) -> None:
+    found: Told = request.getfixturevalue(which)
+    numbers, errors = found.response.describe(), found.fit.errors
+    # which of the two poles is the longer is a matter of the start
+    poles = np.sort(found.response.log_poles_ns.detach().numpy())
+    pole_errors = sorted((errors["log_poles_ns.1"], errors["log_poles_ns.2"]), reverse=True)
+    assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
+    assert abs(numbers["slow_400_ns"] - 0.065) < 4 * errors["slow_weights.1"]
+    # a decay begins at the edge of a sample, not at the charge: 1e-4 of it
+    assert abs(np.log(numbers["decay_us"] / 80)) < 4 * errors["log_decay_us.1"] + 1e-4
+    # and they are no excuse: the set fixes each within a few percent
+    assert max(pole_errors) < 0.1
+    assert errors["slow_weights.1"] < 0.002
+
+
+def test_seeds_and_starts_agree(near: Told, far: Told) -> None:
+    first, second = near.response.describe(), far.response.describe()
+    assert learned_rise_ns(near.response) == pytest.approx(
+        learned_rise_ns(far.response), rel=0.005
+    )
+    assert first["decay_us"] == pytest.approx(second["decay_us"], rel=1e-3)
+    assert first["slow_400_ns"] == pytest.approx(second["slow_400_ns"], abs=1e-3)
+    assert first != second  # other noise was drawn
+
+
+def test_edges_are_those_of_the_true_chain(near: Told) -> None:
+    fine = charge(200, seed=9)
+    truth = finish(
+        linear_response(fine, CHAIN).astype(np.float32), RECIPE.preparation, dt_ns=DT_NS
+    )
+    with torch.no_grad():
+        records = near.response(torch.from_numpy(simulated(fine).waveforms)).numpy()
+    found = finish(records, RECIPE.preparation, dt_ns=DT_NS)
+    edge = slice(RECIPE.preparation.samples_before - 100, RECIPE.preparation.samples_before)
+    # the preparation aligns in whole samples; a pulse in between may go either way
+    best = np.min(
+        [
+            np.sqrt(((np.roll(found, k, axis=1) - truth)[:, edge] ** 2).mean(axis=1))
+            for k in (-1, 0, 1)
+        ],
+        axis=0,
+    )
+    assert np.median(best) < 1e-3
+    assert np.quantile(best, 0.95) < 5e-3
+
+
+def test_what_a_fit_tells(near: Told) -> None:
+    steps, chi_square = zip(*near.steps, strict=True)
+    assert steps == tuple(range(1, near.fit.steps + 1))
+    assert chi_square[-1] == pytest.approx(near.fit.chi_square)
+    assert near.fit.steps <= RECIPE.training.iterations
+    assert len(near.fit.pulls) == near.fit.moments
+    labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
+    assert set(near.fit.errors) == labels
+    # of a good fit they are as standard deviations: a few are 2, hardly one is 4
+    pulls = np.abs(list(near.fit.pulls.values()))
+    assert np.sqrt((pulls**2).mean()) < 1.6
+    assert pulls.max() < 5
+
+
+def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
+    short = ("training.steps=1", "training.max_pulses=300", "training.start_factors=[1]")
+    first, again, other = (problem.fit(seed, *short) for seed in (5, 5, 6))
+    assert first[0].describe() == again[0].describe()
+    assert first[1] == again[1]
+    assert first[0].describe() != other[0].describe()
+
+
+def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> None:
+    other = simulated(charge(N, seed=1, longest=60, steepest=7))
+    _, fit = problem.fit(0, "training.start_factors=[1]", "training.steps=10", sim=other)
+    per_moment = fit.chi_square / fit.moments
+    assert per_moment > 2 * GOOD_FIT
+    assert per_moment > 3 * near.fit.chi_square / near.fit.moments
+
+
+def test_too_few_pulses_are_refused(problem: Problem) -> None:
+    few = Problem(problem.sim[:199], problem.data, problem.noise)
+    with pytest.raises(CpunetError, match="^199 simulated pulses; 200 or more are needed"):
+        few.fit(0)
+    few = Problem(problem.sim, problem.data[:150], problem.noise)
+    with pytest.raises(CpunetError, match="^150 measured pulses can be used; 200 or more"):
+        few.fit(0)
+
+
+def test_energies_are_needed(problem: Problem) -> None:
+    unknown = Pulses.of(problem.sim.waveforms, dt_ns=DT_NS)
+    with pytest.raises(CpunetError, match="pulse 0 has an energy of nan keV"):
+        problem.fit(0, sim=unknown)

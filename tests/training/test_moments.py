@@ -1,0 +1,167 @@
+"""Functions of single pulses against their definitions, and which pulses are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import current_amplitude
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training.moments import FEWEST, Moments
+
+RECIPE = load_recipe("fast")
+CONFIG, PREPARATION = RECIPE.matching.training, RECIPE.preparation
+DT_NS, DECAY_US = 16.0, 54.6
+BEFORE, AFTER = 200, 400  # samples added to a window to make it a record
+LAST = BEFORE + PREPARATION.samples_before + 100
+N = 500
+
+
+def prepared(n: int = N, seed: int = 0, noise: float = 8e-4) -> FloatArray:
+    """Windows of two-site pulses with logistic edges, a decay and white noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(1200)[np.newaxis]
+    share = rng.uniform(0, 1, (n, 1))
+
+    def site() -> np.ndarray:
+        return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / 4))
+
+    record = share * site() + (1 - share) * site()
+    record *= np.exp(-np.maximum(time - 520, 0) * DT_NS * 1e-3 / DECAY_US)
+    raw = Pulses.of(record + rng.normal(0, noise, record.shape), dt_ns=DT_NS)
+    windows = prepare(raw, PREPARATION, "measured")
+    assert len(windows) == n
+    return windows.pulses.waveforms
+
+
+def as_records(windows: FloatArray) -> torch.Tensor:
+    """The windows with room around them, as a response puts out."""
+    return torch.from_numpy(np.pad(windows, ((0, 0), (BEFORE, AFTER)), mode="edge"))
+
+
+@pytest.fixture(scope="module")
+def windows() -> FloatArray:
+    return prepared()
+
+
+@pytest.fixture(scope="module")
+def moments(windows: FloatArray) -> Moments:
+    return Moments.of_data(windows, CONFIG, PREPARATION)
+
+
+def column(moments: Moments, name: str) -> int:
+    return moments.names.index(name)
+
+
+def test_the_datas_own_windows_in_records_have_the_datas_own_values(moments, windows) -> None:
+    again = moments.of_records(as_records(windows), LAST)
+    assert moments.values.shape == (N, len(moments.names))
+    assert again.dtype == moments.values.dtype == torch.float64
+    slope = [column(moments, name) for name in ("tail slope", "tail slope squared")]
+    shape = [i for i in range(len(moments.names)) if i not in slope]
+    torch.testing.assert_close(again[:, shape], moments.values[:, shape], atol=0.02, rtol=0)
+    # 99.9 % of a noisy maximum may be found a few samples beside
+    difference = (again - moments.values)[:, slope].abs()
+    assert float(difference.quantile(0.9)) < 1e-2
+    assert float(difference.mean()) < 0.05
+
+
+def test_every_moment_has_a_name_of_its_own(moments) -> None:
+    assert len(set(moments.names)) == len(moments.names)
+    stretches = len(CONFIG.segments) - 1
+    assert len(moments.names) == (
+        stretches + CONFIG.components + 1 + CONFIG.squares + 1 + CONFIG.amplitude_bins
+    )
+
+
+def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows) -> None:
+    aligned, _ = at_half_maximum(
+        torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
+    )
+    first, stop = CONFIG.segments[6:8]
+    means = aligned[:, CONFIG.before + first : CONFIG.before + stop].mean(dim=1).numpy()
+    centre = np.median(means)
+    sigma = 1.4826 * np.median(np.abs(means - centre))
+    wanted = np.clip((means - centre) / sigma, -CONFIG.clip, CONFIG.clip)
+    found = moments.values[:, column(moments, f"samples {first} to {stop}")].numpy()
+    np.testing.assert_allclose(found, wanted, atol=0.02)
+
+
+def test_principal_components_are_uncorrelated_with_unit_variance() -> None:
+    wide = CONFIG.model_copy(update={"clip": 1e6})
+    moments = Moments.of_data(prepared(), wide, PREPARATION)
+    first = column(moments, "component 1")
+    # in units of the robust width, which is not theirs: correlations only
+    found = np.corrcoef(moments.values[:, first : first + 6].numpy().T)
+    np.testing.assert_allclose(found, np.eye(6), atol=0.02)
+    squares = column(moments, "component 1 squared")
+    np.testing.assert_allclose(
+        moments.values[:, squares].numpy(), moments.values[:, first].numpy() ** 2
+    )
+
+
+def test_the_density_of_the_current_amplitude_is_that_of_its_definition(
+    moments, windows
+) -> None:
+    aligned, _ = at_half_maximum(
+        torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
+    )
+    amplitude = np.log(current_amplitude(aligned.numpy()))
+    edges = np.quantile(amplitude, np.linspace(0.02, 0.995, CONFIG.amplitude_bins + 1))
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    widths = np.maximum(np.diff(edges), CONFIG.amplitude_width)
+    wanted = np.exp(-0.5 * ((amplitude[:, None] - centres) / widths) ** 2)
+    first = column(moments, "current amplitude, bin 1")
+    np.testing.assert_allclose(moments.values[:, first:].numpy(), wanted, atol=2e-3)
+
+
+def test_the_slope_of_the_tails_is_that_of_their_decay(moments) -> None:
+    assert float(moments.slope) == pytest.approx(-DT_NS * 1e-3 / DECAY_US, rel=0.01)
+
+
+def test_outliers_are_clipped(moments, windows) -> None:
+    records = as_records(windows[:3])
+    records[0, LAST:] *= torch.linspace(1, 0.3, records.shape[1] - LAST)
+    records[1, BEFORE + 300 : BEFORE + 380] += 0.3
+    linear = column(moments, "tail slope") + 1
+    clipped = moments.of_records(records, LAST)
+    assert float(clipped[:, :linear].abs().max()) == CONFIG.clip
+    assert float(clipped.abs().max()) <= CONFIG.clip**2
+    wider = moments.of_records(records, LAST, clip=64.0)
+    assert CONFIG.clip < float(wider[:, :linear].abs().max()) <= 64
+    np.testing.assert_array_equal(
+        wider[:, :linear].clamp(-CONFIG.clip, CONFIG.clip), clipped[:, :linear]
+    )
+
+
+def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -> None:
+    spoilt = windows.copy()
+    spoilt[3, 500] = np.nan
+    spoilt[7, 240:300] += 0.5  # another pulse before this one
+    found = Moments.of_data(spoilt, CONFIG, PREPARATION)
+    assert len(found.values) == N - 2
+    assert torch.isfinite(found.values).all()
+    assert found.level == pytest.approx(moments.level, rel=1e-3)
+    good = np.delete(np.arange(N), [3, 7])
+    stretches = len(CONFIG.segments) - 1  # the signs of components are anyone's choice
+    np.testing.assert_allclose(
+        found.values[:, :stretches], moments.values[good, :stretches], atol=0.1
+    )
+
+
+@pytest.mark.parametrize("n", [1, 50, FEWEST - 1])
+def test_too_few_pulses_are_refused(windows, n: int) -> None:
+    with pytest.raises(
+        CpunetError, match=rf"^{n} measured pulses can be used; {FEWEST} or more"
+    ):
+        Moments.of_data(windows[:n], CONFIG, PREPARATION)
+
+
+def test_pulses_without_a_number_are_none(windows) -> None:
+    with pytest.raises(CpunetError, match="^0 measured pulses can be used"):
+        Moments.of_data(np.full_like(windows, np.nan), CONFIG, PREPARATION)

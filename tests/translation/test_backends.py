@@ -1,0 +1,256 @@
+"""A readout chain and its inverse as translators, against the chain's own numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.errors import CpunetError
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.inverse import fit_inverse
+from cpunet.training.run_folder import write_run
+from cpunet.translation import translator
+from cpunet.translation.translator import IREN, REN
+
+RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
+DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
+N = 40
+
+
+def simulated(n: int, seed: int) -> FloatArray:
+    """Charge signals of two sites with logistic edges, long enough to be no windows."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(225)
+    share = rng.uniform(0, 1, (n, 1))
+
+    def site() -> np.ndarray:
+        place, width = rng.uniform(60, 110, (n, 1)), rng.uniform(1.5, 3, (n, 1))
+        return 1 / (1 + np.exp(-(time - place) / width))
+
+    return np.asarray(share * site() + (1 - share) * site(), np.float32)
+
+
+def responded(pulses: FloatArray) -> FloatArray:
+    """The same behind a pole of 50 ns and a decay of 60 µs, by a fine recursion."""
+    fine = 40
+    time = np.arange(1200 * fine) / fine
+    charge = np.array([np.interp(time, 300 + np.arange(225), pulse) for pulse in pulses])
+    step_ns = DT_NS / fine
+    rise, fall = np.exp(-step_ns / 50), np.exp(-step_ns / 60_000)
+    out = np.empty_like(charge)
+    smooth, decayed = np.zeros(len(charge)), np.zeros(len(charge))
+    for sample in range(charge.shape[1]):
+        before, smooth = smooth, rise * smooth + (1 - rise) * charge[:, sample]
+        decayed = fall * decayed + smooth - before
+        out[:, sample] = decayed
+    return out.reshape(len(pulses), -1, fine).mean(axis=2).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that has learned the chain and its white noise exactly."""
+    generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
+    density = np.full(NOISE_BINS, NOISE_KEV**2)
+    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+    raw = Pulses.of(simulated(400, seed=1), dt_ns=DT_NS)
+    windows = prepare(raw, RECIPE.preparation, "simulated").pulses.waveforms
+    inverse = fit_inverse(generator, windows, np.full(len(windows), KEV), RECIPE, seed=0)
+    folder = tmp_path_factory.mktemp("run")
+    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
+    model = nn.ModuleDict({"ren": generator, "iren": inverse})
+    write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ren(run: Path) -> REN:
+    return REN.load(run)
+
+
+@pytest.fixture(scope="module")
+def iren(run: Path) -> IREN:
+    return IREN.load(run)
+
+
+@pytest.fixture(scope="module")
+def sim() -> FloatArray:
+    return simulated(N, seed=2)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def edge_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """RMS before the alignment, which two ways of rounding may put a sample apart."""
+    shifts = [np.roll(found, k, axis=1) - truth for k in (-1, 0, 1)]
+    return np.min([np.sqrt((s[:, 300:400] ** 2).mean(axis=1)) for s in shifts], axis=0)
+
+
+def test_without_noise_pulses_are_those_of_the_chain(ren, sim) -> None:
+    truth = prepare(Pulses.of(responded(sim), dt_ns=DT_NS), RECIPE.preparation, "measured")
+    assert len(truth) == N
+    found = ren.translate(sim, noise=False)
+    errors = edge_errors(found, truth.pulses.waveforms)
+    assert np.median(errors) < 1e-3
+    assert errors.max() < 0.01
+    # prepared as data: no baseline, and the tail at its level
+    assert np.abs(found[:, :200].mean(axis=1)).max() < 1e-6
+    np.testing.assert_allclose(found[:, -5:].mean(axis=1), 0.8, atol=1e-5)
+
+
+def test_without_noise_nothing_is_random_and_no_energy_is_needed(ren, sim) -> None:
+    state = torch.get_rng_state()
+    first, again = (ren.translate(sim, noise=False, seed=seed) for seed in (1, 2))
+    np.testing.assert_array_equal(first, again)
+    energies = np.linspace(100, 3000, N)
+    np.testing.assert_array_equal(ren.translate(sim, noise=False, energy_kev=energies), first)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("tensor", [False, True])
+def test_noise_without_energies_is_refused(ren, sim, tensor: bool) -> None:
+    pulses = torch.from_numpy(sim) if tensor else sim
+    for given in (pulses, pulses[0]):
+        with pytest.raises(CpunetError, match="give energy_kev, or noise=False"):
+            ren.translate(given)
+    windows = ren.translate(sim, noise=False)
+    with pytest.raises(CpunetError, match="give energy_kev, or noise=False"):
+        ren.apply(windows)
+
+
+def test_noise_goes_as_one_over_energy(ren, sim) -> None:
+    clean = ren.translate(sim, noise=False)
+    energies = np.where(np.arange(N) < N // 2, 1000.0, 3000.0)
+    noisy = ren.translate(sim, energy_kev=energies, seed=1)
+    for kev in (1000.0, 3000.0):
+        # the first 200 samples have lost their mean, as those of data
+        found = rms(noisy[energies == kev, :200])
+        assert found == pytest.approx(NOISE_KEV / kev, rel=0.05)
+    assert np.median(edge_errors(noisy, clean)) < 3 * NOISE_KEV / 1000
+
+
+def test_one_energy_may_stand_for_all(ren, sim) -> None:
+    np.testing.assert_array_equal(
+        ren.translate(sim, energy_kev=KEV, seed=1),
+        ren.translate(sim, energy_kev=np.full(N, KEV), seed=1),
+    )
+    single = ren.translate(sim[3], energy_kev=KEV, seed=1)
+    np.testing.assert_array_equal(single, ren.translate(sim[3:4], energy_kev=KEV, seed=1)[0])
+
+
+@pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
+def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
+    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .*{N} pulses") as error:
+        ren.translate(sim, energy_kev=energies)
+    assert "\n" not in str(error.value)
+
+
+def test_seeds(ren, sim) -> None:
+    first, again, other = (
+        ren.translate(sim, energy_kev=KEV, seed=seed) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    # two decks of noise have nothing in common
+    clean = ren.translate(sim, noise=False)
+    noises = [(deck - clean)[:, :200].ravel() for deck in (first, other)]
+    assert abs(np.corrcoef(*noises)[0, 1]) < 0.05
+
+
+def test_batches_have_noise_of_their_own(ren, sim, monkeypatch) -> None:
+    whole = ren.translate(sim, noise=False)
+    monkeypatch.setattr(translator, "BATCH", N // 2)
+    np.testing.assert_allclose(ren.translate(sim, noise=False), whole, atol=1e-6)
+    twice = np.concatenate([sim[: N // 2]] * 2)
+    found = ren.translate(twice, energy_kev=KEV, seed=3)
+    first, second = found[: N // 2, :200].ravel(), found[N // 2 :, :200].ravel()
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
+
+
+def test_pulses_without_energy_are_counted(ren, sim) -> None:
+    energies = np.full(N, KEV)
+    energies[[1, 4, 6]] = np.nan, 0.0, -5.0
+    spoilt = sim.copy()
+    spoilt[2] = np.nan
+    pulses = Pulses.of(spoilt, dt_ns=DT_NS, energy_kev=energies)
+    done = ren.translate_pulses(pulses, generator=ren.seeded(1))
+    wanted = np.full(N, Rejection.ACCEPTED)
+    wanted[[1, 4, 6]], wanted[2] = Rejection.ENERGY_UNKNOWN, Rejection.NAN
+    assert done.codes.tolist() == wanted.tolist()
+    assert np.isnan(done.pulses.waveforms[~done.valid]).all()
+    assert np.isfinite(done.pulses.waveforms[done.valid]).all()
+    # energies stay with their pulses, those that were left out in between or not
+    good = np.flatnonzero(done.valid)
+    alone = ren.translate_pulses(pulses[good], generator=ren.seeded(1))
+    np.testing.assert_array_equal(alone.pulses.waveforms, done.pulses.waveforms[good])
+    without = ren.translate_pulses(pulses, noise=False)
+    assert without.codes.tolist() == np.where(np.arange(N) == 2, Rejection.NAN, 0).tolist()
+
+
+def test_a_pulse_without_energy_is_named(ren, sim) -> None:
+    energies = np.full(N, KEV)
+    energies[5] = np.nan
+    with pytest.raises(CpunetError, match="^pulse 5: energy unknown; "):
+        ren.translate(sim, energy_kev=energies)
+
+
+def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
+    charge = prepare(Pulses.of(sim, dt_ns=DT_NS), RECIPE.preparation, "simulated")
+    truth = charge.pulses.waveforms
+    back = iren.translate(ren.translate(sim, energy_kev=KEV, seed=1))
+
+    def half_times(pulses: FloatArray) -> np.ndarray:
+        return np.array([np.flatnonzero(p < 0.5)[-1] for p in pulses])
+
+    moves = half_times(truth) - half_times(back)
+    moved = np.array([np.roll(p, k) for p, k in zip(back, moves, strict=True)])
+    errors = np.sqrt(((moved - truth)[:, 250:500] ** 2).mean(axis=1))
+    measured = ren.translate(sim, noise=False)
+    moves = half_times(truth) - half_times(measured / measured.max(axis=1, keepdims=True))
+    raw = np.array([np.roll(p, k) for p, k in zip(measured, moves, strict=True)])
+    raw_errors = np.sqrt(((raw - truth)[:, 250:500] ** 2).mean(axis=1))
+    assert np.median(errors) < 0.02
+    assert np.median(errors) < 0.2 * np.median(raw_errors)
+    # prepared as simulated pulses are
+    assert np.abs(back.min(axis=1)).max() < 1e-6
+    np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)
+
+
+def test_the_inverse_draws_nothing_and_needs_no_energies(ren, iren, sim) -> None:
+    assert ren.needs_energies
+    assert not iren.needs_energies
+    data = ren.translate(sim, energy_kev=KEV, seed=1)
+    first, again = iren.translate(data, seed=1), iren.translate(data, seed=2)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(iren.translate(data, noise=False), first)
+
+
+def test_gain_and_offset_are_no_part_of_a_measured_pulse(iren, sim) -> None:
+    traces = responded(sim[:5])
+    np.testing.assert_allclose(
+        iren.translate(300 * traces + 5000), iren.translate(traces), atol=1e-3
+    )
+
+
+def test_no_pulses_at_all(ren, iren) -> None:
+    none = np.zeros((0, 225), np.float32)
+    assert ren.translate(none, energy_kev=np.zeros(0)).shape == (0, 800)
+    assert iren.translate(np.zeros((0, 1200), np.float32)).shape == (0, 800)
+
+
+def test_weights_of_the_other_half_are_missed(run: Path, tmp_path: Path) -> None:
+    generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
+    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
+    model = nn.ModuleDict({"ren": generator})
+    write_run(tmp_path, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
+    REN.load(tmp_path)
+    with pytest.raises(CpunetError, match="weights of another network"):
+        IREN.load(tmp_path)
