@@ -168,7 +168,7 @@ def test_metrics_have_their_schema(report, trained):
     metrics = json.loads((report[0] / "metrics.json").read_text())
     assert set(metrics["peaks"]) == {"SEP", "DEP", "FEP"}
     for scores in metrics["peaks"].values():
-        assert {"n_sim", "n_data", "parameters", "paired"} == set(scores)
+        assert {"n_sim", "n_data", "parameters", "paired", "two_sample"} == set(scores)
         assert scores["n_sim"] == 24
         assert 18 <= scores["n_data"] <= 24
         assert set(scores["parameters"]) == PARAMETERS

@@ -257,7 +257,9 @@ def test_weights_of_another_architecture(translate_refused, run):
 def test_wrong_settings(train_refused, tmp_path):
     assert "error: recipe 'none': neither a file" in train_refused("--recipe", "none")
     assert "the recipe has no training.none" in train_refused("--set", "training.none=1")
-    assert "training.batch_size: " in train_refused("--set", "training.batch_size=x")
+    line = train_refused("--set", "training.batch_size=x")
+    assert line.startswith("error: recipe small: training.")
+    assert "batch_size: " in line
     assert "expected KEY=VALUE" in train_refused("--set", "training.batch_size")
     line = train_refused("--peak", "TEP")
     assert "'TEP' is no known peak (FEP, SEP, DEP)" in line

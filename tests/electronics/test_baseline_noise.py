@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.fft
 import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
+from cpunet.electronics.noise import coloured_noise, noise_power
+from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 
 CONFIG = load_recipe("paper").preparation
@@ -96,3 +100,138 @@ def test_bad_input_is_named(noise) -> None:
         finish(records, CONFIG, dt_ns=DT_NS, noise=noise)
     with pytest.raises(CpunetError, match="noise is sampled every 16 ns, the pulses every 8"):
         finish(records, CONFIG, dt_ns=8.0, noise=noise, energy_kev=np.ones(3))
+
+
+GRID = 8192
+SPECTRUM = read_electronics("legend200").noise.spectrum
+# a step of 1 has come down to this where prepared pulses are 0.8
+TO_PREPARED = 0.8 / np.exp(-397 * DT_NS / 54_600)
+
+
+def of_density(density: np.ndarray) -> BaselineNoise:
+    return BaselineNoise(density, 2 * (len(density) - 1), DT_NS, 100)
+
+
+def on_baselines(baselines: np.ndarray, kev: float = 2000.0) -> Pulses:
+    """Raw traces of one energy with these baselines, in keV, under the pulses too."""
+    energy = np.full(len(baselines), kev)
+    adc = ADC_PER_KEV * (kev * shape(len(baselines), baselines.shape[1], 560) + baselines)
+    return Pulses.of(15_000 + adc, dt_ns=DT_NS, energy_kev=energy)
+
+
+def drift(noise: np.ndarray, apart: int) -> float:
+    """Half the mean square difference of samples this far apart."""
+    return float(0.5 * ((noise[:, apart:] - noise[:, :-apart]) ** 2).mean())
+
+
+def test_drawn_noise_has_the_density_it_is_drawn_from() -> None:
+    frequency = np.linspace(0, 0.5, GRID // 2 + 1)
+    known = of_density(4 / (1 + (frequency / 0.05) ** 2) + 0.5)
+    drawn = known.draw(np.full(1000, 2.0), 1400, np.random.default_rng(4))
+    assert drawn.std() * 2 == pytest.approx(known.rms, rel=0.02)
+    at, found = scipy.signal.welch(drawn * 2.0, nperseg=256, return_onesided=False)
+    positive = at > 0.02
+    wanted = 4 / (1 + (at[positive] / 0.05) ** 2) + 0.5
+    np.testing.assert_allclose(found.mean(axis=0)[positive], wanted, rtol=0.05)
+
+
+def test_white_noise_of_different_pulses_has_nothing_in_common() -> None:
+    white = of_density(np.ones(GRID // 2 + 1))
+    drawn = white.draw(np.ones(300), 1400, np.random.default_rng(5))
+    assert white.rms == pytest.approx(1)
+    products = drawn @ drawn.T / drawn.shape[1]
+    np.testing.assert_allclose(np.diag(products), 1, atol=0.25)
+    others = products[~np.eye(len(products), dtype=bool)]
+    assert others.std() == pytest.approx(1 / np.sqrt(1400), rel=0.1)
+    assert np.abs(others).max() < 6 / np.sqrt(1400)
+
+
+def test_the_same_generator_gives_the_same_noise() -> None:
+    white = of_density(np.ones(GRID // 2 + 1))
+    first, again, other = (
+        white.draw(np.ones(5), 700, np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize(("n", "length"), [(0, 100), (1, 7), (3, 8192), (2, 9001)])
+def test_any_number_and_length(n: int, length: int) -> None:
+    white = of_density(np.ones(GRID // 2 + 1))
+    drawn = white.draw(np.ones(n), length, np.random.default_rng(0))
+    assert drawn.shape == (n, length)
+    assert drawn.dtype == np.float32
+    if n * length > 1000:
+        assert drawn.std() == pytest.approx(1, rel=0.05)
+
+
+def test_noise_slower_than_a_baseline_is_found() -> None:
+    baselines = 2 * coloured_noise(SPECTRUM, 1500, 1200, DT_NS, np.random.default_rng(6))
+    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    assert noise.n_baselines > 1000
+    assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
+    drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(7)) / TO_PREPARED
+    # within a baseline, of some 500 samples, and twice as far apart as one is long
+    for apart, tolerance in ((4, 0.05), (100, 0.05), (400, 0.07), (1100, 0.15)):
+        assert drift(drawn, apart) == pytest.approx(drift(baselines, apart), rel=tolerance)
+    # all the power below a baseline's lowest frequency, 125 kHz
+    power = noise_power(SPECTRUM, DT_NS, GRID)
+    frequency_mhz = scipy.fft.rfftfreq(GRID, DT_NS * 1e-3)
+    slow = (frequency_mhz > 0) & (frequency_mhz < 0.125)
+    found = 2 * noise.density_of(GRID)[slow].sum() / GRID / TO_PREPARED**2
+    # no baseline shows it: a guess from how they drift
+    assert found == pytest.approx(4 * power[slow].sum(), rel=0.5)
+
+
+def test_white_noise_has_no_slow_part() -> None:
+    rng = np.random.default_rng(8)
+    noise = BaselineNoise.from_traces(on_baselines(2 * rng.normal(size=(800, 1200))), CONFIG)
+    density = noise.density_of(GRID) / TO_PREPARED**2
+    assert density[1:30].mean() == pytest.approx(4, rel=0.15)
+    assert density[100:-10].mean() == pytest.approx(4, rel=0.03)
+
+
+def test_a_line_is_a_sine_of_its_height() -> None:
+    rng = np.random.default_rng(9)
+    phase = rng.uniform(0, 2 * np.pi, (800, 1))
+    line = 3 * np.sin(2 * np.pi * 0.11 * np.arange(1200) + phase)
+    baselines = line + rng.normal(size=(800, 1200))
+    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    drawn = noise.draw(np.ones(800), 1200, np.random.default_rng(10)) / TO_PREPARED
+    assert drawn.std() == pytest.approx(np.sqrt(4.5 + 1), rel=0.05)
+    wave = np.exp(-2j * np.pi * 0.11 * np.arange(400))
+    heights = 2 * np.abs(drawn[:, :400] @ wave) / 400
+    assert np.median(heights) == pytest.approx(3, rel=0.07)
+    # Gaussian noise in a narrow band is twice as often low as high
+    assert heights.std() < 0.15 * heights.mean()
+
+
+def test_baselines_of_different_kinds_are_drawn_as_such() -> None:
+    rng = np.random.default_rng(11)
+    heights = np.exp(rng.normal(0, 0.3, 1500))
+    noise = BaselineNoise.from_traces(
+        on_baselines(heights[:, np.newaxis] * rng.normal(size=(1500, 1200))), CONFIG
+    )
+    drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(12)) / TO_PREPARED
+    width = np.log(drawn.std(axis=1))
+    assert np.median(width) == pytest.approx(0, abs=0.1)
+    # one spectrum for all would leave 1/sqrt(2 x 1200) of it, 0.02
+    assert width.std() == pytest.approx(0.3, rel=0.25)
+
+
+def test_beginnings_of_windows_show_the_fast_part() -> None:
+    rng = np.random.default_rng(13)
+    raw = on_baselines(2 * coloured(600, 1200, rng))
+    windows = prepare(raw, CONFIG, "measured").pulses
+    noise = BaselineNoise.from_windows(windows, 200)
+    # so short ones leave what is slow to a guess
+    assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
+    drawn = noise.draw(np.ones(400), 1200, rng) / TO_PREPARED
+    for lag in (1, 3, 8):
+        assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
+
+
+def test_windows_without_energies_are_refused() -> None:
+    windows = Pulses.of(np.zeros((40, 800)), dt_ns=DT_NS)
+    with pytest.raises(CpunetError, match="only 0 flat baselines among 40 traces"):
+        BaselineNoise.from_windows(windows, 100)

@@ -15,6 +15,7 @@ from torch import nn
 
 from cpunet.analysis.response_figure import response_figure
 from cpunet.cli.main import main
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
@@ -61,8 +62,8 @@ def write_response(
             for index, value in (given or {}).items():
                 weights[index] = value
         if noise_density is not None:
-            generator.noise_density.copy_(torch.from_numpy(noise_density))
-            generator.n_baselines.fill_(1000)
+            samples = 2 * (len(noise_density) - 1)
+            generator.set_noise(BaselineNoise(noise_density, samples, dt_ns, 1000))
     folder.mkdir(parents=True)
     model = nn.ModuleDict({"ren": generator})
     write_run(folder, model, recipe, INFO | {"dt_ns": dt_ns} | info)
@@ -219,7 +220,8 @@ def test_the_closed_form_is_the_chain_of_the_stand():
     undecayed = true_chain_of(truth).undecayed.step(time_ns)
     np.testing.assert_allclose(chain.undecayed.step(time_ns), undecayed, atol=1e-6)
     # beyond the first samples, where the layer's spline cannot follow a step
-    layer = response.step_response(torch.arange(600) * DT_NS).detach().numpy()
+    with torch.no_grad():
+        layer = torch.fft.irfft(response.transfer(2400), 2400)[:600].numpy()
     middle_ns = (np.arange(600) + 0.5) * DT_NS
     np.testing.assert_allclose(layer[20:], chain.whole.step(middle_ns)[20:], atol=1e-3)
 

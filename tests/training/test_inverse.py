@@ -200,7 +200,7 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     generator = readout(0.0)
     frequency = np.linspace(0, 0.5, NOISE_BINS)
     density = 400 / (1 + (frequency / 0.004) ** 2)  # slower than the edge
-    generator.noise_density.copy_(torch.from_numpy(density))
+    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
     sim = charge(1200, seed=1)
     inverse = fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
     windows = ren(generator, held_out, FEP_KEV)
@@ -209,7 +209,10 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     other = fit_inverse(white, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
     mistaken = other(torch.from_numpy(windows)).numpy()
     truth = at_half(held_out)
-    assert rms(at_half(found) - truth) < 0.9 * rms(at_half(mistaken) - truth)
+    # of most pulses: noise at half the height may move the alignment of a few by far
+    assert np.median(error(at_half(found), truth)) < 0.85 * np.median(
+        error(at_half(mistaken), truth)
+    )
 
 
 def test_many_pulses_are_thinned_out_by_the_seed():

@@ -163,5 +163,5 @@ def test_too_few_pulses_are_refused(windows, n: int) -> None:
 
 
 def test_pulses_without_a_number_are_none(windows) -> None:
-    with pytest.raises(CpunetError, match="^0 measured pulses can be used"):
+    with pytest.raises(CpunetError, match=r"^0 measured pulses can be used"):
         Moments.of_data(np.full_like(windows, np.nan), CONFIG, PREPARATION)

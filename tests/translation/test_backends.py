@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 import torch
 from torch import nn
 
@@ -22,13 +23,14 @@ from cpunet.translation.translator import IREN, REN
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
+FINE = 16  # samples of the charge to one of the digitiser
 N = 40
 
 
-def simulated(n: int, seed: int) -> FloatArray:
-    """Charge signals of two sites with logistic edges, long enough to be no windows."""
+def charge(n: int, seed: int) -> FloatArray:
+    """Charge of two sites with logistic edges, finely sampled."""
     rng = np.random.default_rng(seed)
-    time = np.arange(225)
+    time = (np.arange(225 * FINE) + 0.5) / FINE
     share = rng.uniform(0, 1, (n, 1))
 
     def site() -> np.ndarray:
@@ -38,20 +40,24 @@ def simulated(n: int, seed: int) -> FloatArray:
     return np.asarray(share * site() + (1 - share) * site(), np.float32)
 
 
-def responded(pulses: FloatArray) -> FloatArray:
-    """The same behind a pole of 50 ns and a decay of 60 µs, by a fine recursion."""
-    fine = 40
-    time = np.arange(1200 * fine) / fine
-    charge = np.array([np.interp(time, 300 + np.arange(225), pulse) for pulse in pulses])
-    step_ns = DT_NS / fine
-    rise, fall = np.exp(-step_ns / 50), np.exp(-step_ns / 60_000)
-    out = np.empty_like(charge)
-    smooth, decayed = np.zeros(len(charge)), np.zeros(len(charge))
-    for sample in range(charge.shape[1]):
-        before, smooth = smooth, rise * smooth + (1 - rise) * charge[:, sample]
-        decayed = fall * decayed + smooth - before
-        out[:, sample] = decayed
-    return out.reshape(len(pulses), -1, fine).mean(axis=2).astype(np.float32)
+def sampled(fine: np.ndarray) -> FloatArray:
+    """Means over the sampling period."""
+    return fine.reshape(len(fine), -1, FINE).mean(axis=2).astype(np.float32)
+
+
+def simulated(n: int, seed: int) -> FloatArray:
+    """Charge pulses, long enough and too short to be prepared windows."""
+    return sampled(charge(n, seed))
+
+
+def responded(n: int, seed: int) -> FloatArray:
+    """Records of 1200 samples behind a pole of 50 ns and a decay of 60 µs, by recursion."""
+    pulses = np.ones((n, 1200 * FINE))
+    pulses[:, : 500 * FINE] = 0
+    pulses[:, 500 * FINE : 725 * FINE] = charge(n, seed)
+    rise, fall = np.exp(-DT_NS / FINE / np.array([50, 60_000]))
+    smooth = scipy.signal.lfilter([1 - rise], [1, -rise], pulses)
+    return sampled(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +102,8 @@ def edge_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def test_without_noise_pulses_are_those_of_the_chain(ren, sim) -> None:
-    truth = prepare(Pulses.of(responded(sim), dt_ns=DT_NS), RECIPE.preparation, "measured")
+    traces = responded(N, seed=2)
+    truth = prepare(Pulses.of(traces, dt_ns=DT_NS), RECIPE.preparation, "measured")
     assert len(truth) == N
     found = ren.translate(sim, noise=False)
     errors = edge_errors(found, truth.pulses.waveforms)
@@ -128,14 +135,12 @@ def test_noise_without_energies_is_refused(ren, sim, tensor: bool) -> None:
 
 
 def test_noise_goes_as_one_over_energy(ren, sim) -> None:
-    clean = ren.translate(sim, noise=False)
     energies = np.where(np.arange(N) < N // 2, 1000.0, 3000.0)
     noisy = ren.translate(sim, energy_kev=energies, seed=1)
     for kev in (1000.0, 3000.0):
         # the first 200 samples have lost their mean, as those of data
         found = rms(noisy[energies == kev, :200])
         assert found == pytest.approx(NOISE_KEV / kev, rel=0.05)
-    assert np.median(edge_errors(noisy, clean)) < 3 * NOISE_KEV / 1000
 
 
 def test_one_energy_may_stand_for_all(ren, sim) -> None:
@@ -149,15 +154,15 @@ def test_one_energy_may_stand_for_all(ren, sim) -> None:
 
 @pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
 def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
-    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .*{N} pulses") as error:
+    with pytest.raises(
+        CpunetError, match=rf"^energy_kev has shape .* beside {N} pulses"
+    ) as error:
         ren.translate(sim, energy_kev=energies)
     assert "\n" not in str(error.value)
 
 
 def test_seeds(ren, sim) -> None:
-    first, again, other = (
-        ren.translate(sim, energy_kev=KEV, seed=seed) for seed in (1, 1, 2)
-    )
+    first, again, other = (ren.translate(sim, energy_kev=KEV, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     # two decks of noise have nothing in common
     clean = ren.translate(sim, noise=False)
@@ -198,7 +203,7 @@ def test_pulses_without_energy_are_counted(ren, sim) -> None:
 def test_a_pulse_without_energy_is_named(ren, sim) -> None:
     energies = np.full(N, KEV)
     energies[5] = np.nan
-    with pytest.raises(CpunetError, match="^pulse 5: energy unknown; "):
+    with pytest.raises(CpunetError, match=r"^pulse 5: energy unknown; "):
         ren.translate(sim, energy_kev=energies)
 
 
@@ -233,8 +238,8 @@ def test_the_inverse_draws_nothing_and_needs_no_energies(ren, iren, sim) -> None
     np.testing.assert_array_equal(iren.translate(data, noise=False), first)
 
 
-def test_gain_and_offset_are_no_part_of_a_measured_pulse(iren, sim) -> None:
-    traces = responded(sim[:5])
+def test_gain_and_offset_are_no_part_of_a_measured_pulse(iren) -> None:
+    traces = responded(5, seed=3)
     np.testing.assert_allclose(
         iren.translate(300 * traces + 5000), iren.translate(traces), atol=1e-3
     )

@@ -13,6 +13,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 
+TESTED = 1000  # pulses a side: resolves an AUC to 0.013
+
 ByMethod = Mapping[str, Mapping[str, Values]]
 
 
@@ -42,7 +44,11 @@ def told_apart(
             continue
         try:
             result = classifier_auc(
-                windows["data"], others, seed=seed, features=(values["data"], values[method])
+                windows["data"],
+                others,
+                seed=seed,
+                features=(values["data"], values[method]),
+                largest=TESTED,
             )
         except CpunetError as error:
             tested[method] = {"missing": str(error)}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,7 +49,8 @@ class Fit:
     Parameters
     ----------
     chi_square, moments
-        Of the comparison, and the number of moments compared.
+        Of the comparison, and the number of moments compared; before errors of the
+        simulation were allowed for, if they were.
     steps
         Steps taken.
     errors
@@ -111,7 +112,7 @@ def fit_response(
     moments = Moments.of_data(data[data_rows], training, recipe.preparation)
     length = ROOM_BEFORE + sim.shape[1] + ROOM_AFTER
     drawn = noise.draw(energy_kev[sim_rows], length, rng)
-    best: tuple[ElectronicsResponse, Fit] | None = None
+    best: tuple[_Problem, Fit] | None = None
     for factor in training.start_factors:
         problem = _Problem(
             _start(config, noise.dt_ns, factor, float(moments.slope)),
@@ -122,11 +123,17 @@ def fit_response(
         )
         fit = _levenberg_marquardt(problem, training.steps, listener)
         if best is None or fit.chi_square < best[1].chi_square:
-            best = problem.response, fit
+            best = problem, fit
         if fit.chi_square < GOOD_FIT * fit.moments:
             break  # no other valley is to be looked for
     assert best is not None  # the recipe has one start at least
-    return best
+    problem, fit = best
+    if fit.chi_square >= GOOD_FIT * fit.moments:
+        problem.allow_for_model_error()
+        again = _levenberg_marquardt(problem, training.steps, listener, coarse=False)
+        # its own chi-square says nothing: what does not fit was allowed for
+        fit = replace(again, chi_square=fit.chi_square, steps=fit.steps + again.steps)
+    return problem.response, fit
 
 
 def _start(
@@ -174,7 +181,18 @@ class _Problem:
         self.sigma = covariance.diagonal().sqrt().clamp_min(1e-12)
         correlation = covariance / self.sigma[:, None] / self.sigma
         ridge = moments.config.ridge
-        correlation = (1 - ridge) * correlation + ridge * torch.eye(len(correlation))
+        self.correlation = (1 - ridge) * correlation + ridge * torch.eye(len(correlation))
+        self.whiten = torch.linalg.cholesky(torch.linalg.inv(self.correlation)).T
+
+    def allow_for_model_error(self) -> None:
+        """Weigh each moment by how well it can be described at all.
+
+        If no response makes the sets agree, the simulated physics differ. Moments that are
+        many standard deviations off would then bend the response to their liking; with their
+        deviation as a further error they count as little as they are understood.
+        """
+        errors = self.moments.model_errors
+        correlation = self.correlation + torch.diag(errors**2)
         self.whiten = torch.linalg.cholesky(torch.linalg.inv(correlation)).T
 
     def vector(self) -> Tensor:
@@ -220,10 +238,12 @@ class _Problem:
         return torch.stack(columns, dim=1)
 
 
-def _levenberg_marquardt(problem: _Problem, steps: int, listener: Listener | None) -> Fit:
+def _levenberg_marquardt(
+    problem: _Problem, steps: int, listener: Listener | None, *, coarse: bool = True
+) -> Fit:
     vector, taken, curvature = problem.vector(), 0, torch.eye(1, dtype=torch.float64)
-    rounds = [(clip, ROUNDS_EACH) for clip in FIRST_CLIPS]
-    for clip, most in [*rounds, (None, steps - ROUNDS_EACH * len(FIRST_CLIPS))]:
+    rounds = [(clip, ROUNDS_EACH) for clip in FIRST_CLIPS if coarse]
+    for clip, most in [*rounds, (None, steps - ROUNDS_EACH * len(rounds))]:
         problem.clip = clip
         residuals, damping = problem.residuals(vector), DAMPING
         cost = float(residuals @ residuals)

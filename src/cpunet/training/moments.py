@@ -27,6 +27,9 @@ from cpunet.training.half_maximum import at_half_maximum
 SIGMA_PER_MAD = 1.4826
 FEWEST = 200  # pulses for a covariance of about a hundred moments
 EDGE = 60  # samples to either side of the half maximum hold the steepest point
+# Up to this sample from the half maximum the physics of drift shape a pulse, later on the
+# electronics do; so many standard deviations off may the moments be where it is wrong.
+EARLY, WRONG, LATE = 30, 20.0, 2.0
 LEAST_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
 
 
@@ -143,6 +146,20 @@ class Moments:
         tail_level = self.preparation.tail_level
         aligned, records = at_half_maximum(records, self.level, last, self.config, tail_level)
         return self._of_aligned(aligned, self._slopes_of(records, last), clip)
+
+    @property
+    def model_errors(self) -> Tensor:
+        """Errors of the moments, in their standard deviations, if the physics are wrong."""
+        edges = self.config.segments
+        early = [stop <= EARLY for stop in edges[1:]]
+        errors = [
+            *(WRONG if e else LATE for e in early),
+            *[WRONG] * self.config.components,
+            0.0,
+        ]
+        errors += [WRONG] * self.config.squares
+        errors += [0.0] * (len(self.names) - len(errors))
+        return torch.tensor(errors, dtype=torch.float64)
 
     @property
     def slope(self) -> Tensor:

@@ -262,8 +262,7 @@ class Translator:
             )
         pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
         if energy_kev is not None:
-            each = np.broadcast_to(np.asarray(energy_kev, float), (len(pulses),))
-            pulses = replace(pulses, energy_kev=each)
+            pulses = replace(pulses, energy_kev=_one_each(energy_kev, len(pulses)))
         done = self.translate_pulses(pulses, noise=noise, generator=self.seeded(seed))
         if not done.valid.all():
             first = int(np.flatnonzero(~done.valid)[0])
@@ -272,6 +271,17 @@ class Translator:
                 "remove it, or use translate_pulses"
             )
         return done.pulses.waveforms[0] if single else done.pulses.waveforms
+
+
+def _one_each(energy_kev: npt.ArrayLike, n: int) -> Energies:
+    """Energies of `n` pulses, given as that many or as one for all."""
+    energies = np.asarray(energy_kev, float)
+    if energies.shape not in ((), (n,)):
+        raise CpunetError(
+            f"energy_kev has shape {energies.shape} beside {n} pulses; give one for each, or "
+            "one for all"
+        )
+    return np.broadcast_to(energies, (n,))
 
 
 class REN(Translator):

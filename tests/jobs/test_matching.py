@@ -1,0 +1,205 @@
+"""A matched response from files to a run folder, and from there to translated pulses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import scipy.signal
+from safetensors.numpy import load_file
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.matching import POOR_FIT
+from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.jobs.train import train_run
+from cpunet.jobs.translate import translate_file
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.translation.translator import IREN, REN
+
+DT_NS, FINE = 16.0, 16
+POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511
+N = 420
+ONE_START = (
+    "generator.poles_ns=[50]",
+    "generator.slow_ns=[]",
+    "generator.fast_decays_us=[]",
+    "training.start_factors=[1]",
+    "training.steps=14",
+)
+RECIPE = load_recipe("fast", ONE_START)
+
+
+class Listening(Monitor):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, list[int | None]] = {}
+        self.notes: list[str] = []
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        done: list[int | None] = [total]
+        self.stages[title] = done
+        yield done.append
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [note for note in self.notes if note.startswith("warning")]
+
+
+def charge(n: int, seed: int, slowest: float = 3.0) -> np.ndarray:
+    """Charge of two sites with logistic edges, finely sampled."""
+    rng = np.random.default_rng(seed)
+    time = (np.arange(225 * FINE) + 0.5) / FINE
+    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
+
+    def site() -> np.ndarray:
+        place = rng.uniform(60, 110, (n, 1))
+        return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, slowest, (n, 1))))
+
+    return np.asarray(share * site() + (1 - share) * site())
+
+
+def sampled(fine: np.ndarray) -> FloatArray:
+    return fine.reshape(len(fine), -1, FINE).mean(axis=2).astype(np.float32)
+
+
+def digitised(n: int, seed: int, *, noise_kev: float = NOISE_KEV) -> FloatArray:
+    """Traces in ADC behind a pole and a decay, by recursion, with white noise."""
+    pulses = np.ones((n, 1200 * FINE))
+    pulses[:, : 500 * FINE] = 0
+    pulses[:, 500 * FINE : 725 * FINE] = charge(n, seed)
+    rise, fall = np.exp(-DT_NS / FINE / np.array([POLE_NS, 1e3 * DECAY_US]))
+    smooth = scipy.signal.lfilter([1 - rise], [1, -rise], pulses)
+    clean = sampled(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
+    noise = np.random.default_rng(seed + 100).normal(0, noise_kev, clean.shape)
+    return np.round(15_000 + 9.6 * (KEV * clean + noise)).astype(np.float32)
+
+
+def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> InputFile:
+    energies = np.full(len(waveforms), kev)
+    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies))
+    return InputFile(path)
+
+
+class Files(NamedTuple):
+    sim: InputFile
+    data: InputFile
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder = tmp_path_factory.mktemp("files")
+    return Files(
+        written(folder / "sim.lh5", sampled(charge(N, seed=1))),
+        written(folder / "data.lh5", digitised(N, seed=2)),
+    )
+
+
+class Run(NamedTuple):
+    folder: Path
+    info: dict[str, Any]
+    monitor: Listening
+
+
+@pytest.fixture(scope="module")
+def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder, monitor = tmp_path_factory.mktemp("runs") / "run", Listening()
+    info = train_run(*files, folder, RECIPE, seed=3, device="cpu", monitor=monitor)
+    return Run(folder, info, monitor)
+
+
+def test_the_run_tells_of_the_fit(run: Run) -> None:
+    info = json.loads((run.folder / "run.json").read_text())
+    assert info == run.info
+    assert (info["recipe"], info["seed"], info["peak"]) == ("fast", 3, "FEP")
+    fit = info["fit"]
+    assert set(fit) >= {"chi_square", "moments", "steps", "errors", "pulls", "noise"}
+    assert fit["chi_square"] < 1.6 * fit["moments"]
+    assert len(fit["pulls"]) == fit["moments"]
+    assert set(fit["errors"]) == {"log_poles_ns.1", "log_decay_us.1"}
+    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.02)
+    assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
+    # prepared pulses are 0.8 where a step has come down for 400 samples
+    prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
+    assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.05)
+    assert fit["noise"]["baselines"] > 0.9 * N
+
+
+def test_what_is_told_on_the_way(run: Run) -> None:
+    assert run.monitor.warnings == []
+    total, *steps = run.monitor.stages["Matching"]
+    assert total == RECIPE.training.iterations
+    assert steps == [1] * run.info["fit"]["steps"]
+    records = [json.loads(x) for x in (run.folder / "losses.jsonl").read_text().splitlines()]
+    assert [record["iteration"] for record in records] == list(range(1, len(steps) + 1))
+    last = records[-1]["losses"]["chi_square"]
+    assert last == pytest.approx(run.info["fit"]["chi_square"])
+
+
+def test_both_directions_are_in_the_weights(run: Run) -> None:
+    weights = load_file(run.folder / "weights.safetensors")
+    assert {name.split(".")[0] for name in weights} == {"ren", "iren"}
+    assert all(np.isfinite(values).all() for values in weights.values())
+    for kind in (REN, IREN):
+        kind.load(run.folder)
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_files_are_translated_in_both_directions(
+    run: Run, files: Files, tmp_path: Path, inverse: bool
+) -> None:
+    source = files.data if inverse else files.sim
+    out = tmp_path / "out.lh5"
+    told = translate_file(run.folder, source, out, inverse=inverse, device="cpu")
+    assert told == {"read": N, "translated": N, "rejections": {}}
+    windows = open_pulses(out).read()
+    assert windows.waveforms.shape == (N, 800)
+    quiet = np.sqrt((windows.waveforms[:, 210:260] ** 2).mean())
+    if inverse:
+        assert quiet < 0.5 * NOISE_KEV / KEV
+    else:
+        assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
+
+
+def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
+    sim = sampled(charge(6, seed=5))
+    energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
+    path = tmp_path / "sim.lh5"
+    write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
+    told = translate_file(run.folder, InputFile(path), tmp_path / "a.lh5", device="cpu")
+    assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
+    quiet = {"noise": False, "device": "cpu"}
+    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", **quiet)
+    assert told == {"read": 6, "translated": 6, "rejections": {}}
+
+
+def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
+    # edges of many widths, as no pole makes them of the right ones
+    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
+    monitor = Listening()
+    info = train_run(other, files.data, tmp_path / "run", RECIPE, device="cpu", monitor=monitor)
+    fit = info["fit"]
+    assert fit["chi_square"] > POOR_FIT * fit["moments"]
+    said = [note for note in monitor.warnings if "describes the data poorly" in note]
+    assert len(said) == 1
+    assert f"for {fit['moments']} moments" in said[0]
+
+
+def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
+    few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1)))
+    with pytest.raises(CpunetError, match=r"^40 simulated pulses; 200 or more are needed"):
+        train_run(few, files.data, tmp_path / "run", RECIPE, device="cpu")
+    assert [path.name for path in tmp_path.iterdir()] == ["few.lh5"]
