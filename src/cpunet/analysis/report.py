@@ -126,6 +126,8 @@ def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
 
 def _survival_html(survival: Mapping[str, Any]) -> str:
     """Survival of A/E cuts by peak and method."""
+    if not survival:
+        return "<p>None recorded.</p>"
     if "missing" in survival:
         return f"<p>Not scored: {escape(survival['missing'])}.</p>"
     rows = []

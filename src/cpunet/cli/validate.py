@@ -16,6 +16,10 @@ Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]
 
+Rivals = Annotated[
+    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
+]
+
 
 def validate(
     run: options.Run,
@@ -23,6 +27,7 @@ def validate(
     data: options.Data,
     out_folder: Out,
     truth: Truth = None,
+    rivals: Rivals = True,
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,
@@ -46,6 +51,7 @@ def validate(
         InputFile(data, data_table, data_energy, kev_per_adc, dt),
         out_folder,
         truth=truth,
+        rivals=rivals,
         seed=seed,
         device=device,
         force=force,

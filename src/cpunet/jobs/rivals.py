@@ -56,6 +56,7 @@ def rival_windows(
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
+    fitted: bool = True,
     response: FloatArray | None,
     seed: int,
     monitor: Monitor,
@@ -72,6 +73,8 @@ def rival_windows(
         Energies that the rivals are fitted to: those of the training.
     recipe
         The run's settings.
+    fitted
+        Whether there are to be any; the truth is finished in any case.
     response
         True noise-free records of the simulated pulses, if known.
     seed
@@ -87,7 +90,7 @@ def rival_windows(
     config, result = recipe.preparation, RivalWindows()
     simulated = sim.prepared.pulses
     # all rivals here; the untranslated simulation stands in the scores anyway
-    kinds = {name: kind for name, kind in RIVALS.items() if name != "raw"}
+    kinds = {name: kind for name, kind in RIVALS.items() if fitted and name != "raw"}
     noise = _or_reason(result.missing, "noise", lambda: noise_of_traces(data_file, config))
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]

@@ -70,6 +70,7 @@ def validate_run(
     out: Path,
     *,
     truth: Path | None = None,
+    rivals: bool = True,
     seed: int = 0,
     device: str = "auto",
     force: bool = False,
@@ -90,6 +91,8 @@ def validate_run(
         Report folder: ``metrics.json``, figures, ``report.html``.
     truth
         ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
+    rivals
+        Fit the rival methods too, which takes most of the time.
     seed
         Of noise and bootstraps.
     device, force, monitor
@@ -121,12 +124,13 @@ def validate_run(
                 f"{ren.dt_ns:g} ns; resample the pulses"
             )
         response = None if truth is None else read_response(truth, sim_set)
-        rivals = rival_windows(
+        others = rival_windows(
             sim_set,
             data_set,
             data,
             parse_selection(str(info["peak"]), recipe.peaks),
             recipe,
+            fitted=rivals,
             response=response,
             seed=seed,
             monitor=monitor,
@@ -141,7 +145,7 @@ def validate_run(
             )
             clean = ren.apply(windows, noise=False, progress=advance)
         sets = [
-            _peak_sets(name, recipe, sim_set, data_set, noisy, clean, rivals) for name in names
+            _peak_sets(name, recipe, sim_set, data_set, noisy, clean, others) for name in names
         ]
         values: dict[str, dict[str, dict[str, Values]]] = {}
         peaks: dict[str, Any] = {}
@@ -157,7 +161,7 @@ def validate_run(
         metrics = {
             "peaks": peaks,
             "ae_survival": survivals(values, seed),
-            "rivals": {"fits": rivals.fits, "missing": rivals.missing},
+            "rivals": {"fits": others.fits, "missing": others.missing},
             "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
             | {"peak": info["peak"]},
             "rejections": {

@@ -71,9 +71,17 @@ def recipe_from(settings: Any, source: str) -> Recipe:
         return Recipe.model_validate(settings)
     except ValidationError as error:
         first, count = error.errors()[0], error.error_count()
-        key = ".".join(str(part) for part in first["loc"]) or "the whole"
+        key = ".".join(str(part) for part in _keys(first["loc"])) or "the whole"
         more = f" (and {count - 1} more)" if count > 1 else ""
         raise CpunetError(f"{source}: {key}: {first['msg']}{more}") from error
+
+
+def _keys(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    """Where in the YAML an error is: without the kind that pydantic puts after a choice."""
+    kinds = {"generator": ("punet", "response", "hybrid"), "training": ("cyclegan", "matching")}
+    if len(location) > 1 and location[1] in kinds.get(str(location[0]), ()):
+        return location[:1] + location[2:]
+    return location
 
 
 def _override(settings: Any, override: str) -> None:

@@ -109,6 +109,36 @@ class ResponseConfig(Config):
     ringing_ns: Positive
 
 
+class ResidualConfig(Config):
+    """A small network beside a matched response, see `cpunet.training.residual`.
+
+    ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
+    ``rate`` that falls to zero; the kept weights are a running average with
+    ``average_decay`` per iteration.  ``projections`` are the directions along which sets are
+    compared in an iteration, ``amplitude_weight`` weighs the density of the current
+    amplitude, and ``size_weight`` the mean square of what is added.  A ``held_out`` part of
+    both sets judges: the distance of these must fall by the fraction ``least_fall``.
+    """
+
+    width: Annotated[int, Field(ge=2, multiple_of=2)]
+    iterations: Count
+    batch_size: Annotated[int, Field(ge=16)]
+    rate: Positive
+    average_decay: Fraction
+    projections: Count
+    amplitude_weight: NonNegative
+    size_weight: NonNegative
+    held_out: Annotated[float, Field(gt=0, lt=1)]
+    least_fall: Fraction
+
+
+class HybridConfig(ResponseConfig):
+    """A readout chain with a small network beside it, see `cpunet.networks.hybrid`."""
+
+    name: Literal["hybrid"]  # type: ignore[assignment]
+    residual: ResidualConfig
+
+
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
@@ -219,6 +249,21 @@ class MatchingConfig(Config):
         """The most steps of the training."""
         return self.steps
 
+    @model_validator(mode="after")
+    def _stretches_fit(self) -> MatchingConfig:
+        first, *rest = self.segments
+        if sorted({*self.segments}) != [*self.segments] or not rest:
+            raise ValueError("segments must be two samples or more, in rising order")
+        if first < -self.before or rest[-1] > self.after:
+            raise ValueError("segments must lie within before and after")
+        if not self.baseline[0] > self.baseline[1]:
+            raise ValueError("baseline goes from more samples before the edge to fewer")
+        if self.level_samples >= self.after:
+            raise ValueError("level_samples must be fewer than after")
+        if self.squares > self.components:
+            raise ValueError("squares must be no more than components")
+        return self
+
 
 class ScoreConfig(Config):
     """Histograms and resampling of the comparison of two distributions."""
@@ -252,7 +297,9 @@ class Recipe(Config):
     peaks: dict[str, PeakConfig]
     preparation: PreparationConfig
     cuts: CutConfig
-    generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
+    generator: Annotated[
+        PunetConfig | ResponseConfig | HybridConfig, Field(discriminator="name")
+    ]
     discriminator: GruConfig | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
@@ -295,7 +342,7 @@ class Recipe(Config):
         network = isinstance(self.generator, PunetConfig)
         if network != isinstance(self.training, TrainingConfig):
             raise ValueError(
-                "generator punet goes with training method cyclegan, response with matching"
+                "generator punet goes with training method cyclegan, the others with matching"
             )
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")

@@ -1,0 +1,79 @@
+"""Translation of prepared pulses on one core: readout chain with noise, and U-Nets.
+
+Run with ``python benchmarks/translation.py``; each rate is the median of three.  The U-Net of
+recipe `paper` in eager float32 is what the others are compared with.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes import load_recipe
+from cpunet.translation.backends import NetworkBackend, ResponseBackend
+
+REPEATS = 3
+DT_NS, FEP_KEV = 16.0, 2614.5
+
+
+def windows(n: int) -> np.ndarray:
+    """Prepared simulated pulses: ramps of random length."""
+    rng = np.random.default_rng(0)
+    length = rng.uniform(20, 90, (n, 1))
+    return np.clip((np.arange(800) - 400) / length + 1, 0, 1).astype(np.float32)
+
+
+def rate(translate: Callable[[], object], n: int) -> float:
+    """Pulses per second, the median of a few runs."""
+    translate()  # compiles, and fills caches
+    times = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        translate()
+        times.append(time.perf_counter() - begin)
+    return n / float(np.median(times))
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    fast = load_recipe("fast")
+    chain = ResponseGenerator(fast.matching.generator, DT_NS)
+    chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
+    response = ResponseBackend(chain, fast.preparation)
+    pulses, energies = windows(8192), np.full(8192, FEP_KEV)
+    blocks = [slice(first, first + 512) for first in range(0, len(pulses), 512)]
+    generator = torch.Generator().manual_seed(0)
+
+    def with_noise(noise: bool) -> None:
+        for rows in blocks:
+            response(pulses[rows], energies[rows], noise, generator)
+
+    with torch.inference_mode():
+        noisy = rate(lambda: with_noise(True), len(pulses))
+        clean = rate(lambda: with_noise(False), len(pulses))
+        unets = {}
+        for name, n in (("paper", 32), ("small", 512)):
+            recipe = load_recipe(name)
+            network = NetworkBackend(PositionalUNet(recipe.cyclegan.generator, 800))
+            part = pulses[:n]
+            unets[name] = rate(partial(network, part, None, True, generator), n)
+    plain = unets["paper"]
+    print(f"{'method':<34}{'pulses/s':>10}{'ratio':>8}")
+    for name, value in (
+        ("readout chain, with noise", noisy),
+        ("readout chain, without", clean),
+        ("U-Net of recipe small", unets["small"]),
+        ("U-Net of recipe paper", plain),
+    ):
+        print(f"{name:<34}{value:>10,.0f}{value / plain:>8.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""A readout chain and a small network beside it, which changes the edge of its records.
+
+A chain treats all pulses alike.  Where the simulated physics differ from the detector's, the
+edges of single-site and multi-site pulses are off by different amounts, which no chain can
+follow.  The network sees a short stretch of each record about its half maximum, folded into
+channels, and adds to it; baseline and tail stay the chain's by construction.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.positional_unet import SLOPE, positional_map
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes.schema import ResidualConfig
+
+BEFORE, AFTER = 64, 192  # samples about the half maximum
+FOLD = 8  # samples to a step
+KERNEL = 5  # steps
+RAMP = 16  # samples over which the correction goes to zero at either end
+SLOPE_SCALE = 20.0  # steepest slopes are a few hundredths of the height per sample
+
+
+class EdgeResidual(nn.Module):
+    """A U-Net of two levels whose output is added to records; zero until it is trained.
+
+    Parameters
+    ----------
+    config
+        Its width.
+    """
+
+    position: Tensor
+    taper: Tensor
+    used: Tensor
+
+    def __init__(self, config: ResidualConfig) -> None:
+        super().__init__()
+        width, steps = config.width, (BEFORE + AFTER) // FOLD
+
+        def block(channels_in: int, channels_out: int) -> nn.Sequential:
+            return nn.Sequential(
+                nn.Conv1d(channels_in, channels_out, KERNEL, padding="same"),
+                nn.LeakyReLU(SLOPE, inplace=True),
+                nn.Conv1d(channels_out, channels_out, KERNEL, padding="same"),
+                nn.LeakyReLU(SLOPE, inplace=True),
+            )
+
+        self.inlet = block(2 * FOLD, width)
+        self.down = block(width, 2 * width)
+        self.up = block(3 * width, width)
+        self.outlet = nn.Conv1d(width, FOLD, 1)
+        nn.init.zeros_(self.outlet.weight)
+        if self.outlet.bias is not None:
+            nn.init.zeros_(self.outlet.bias)
+        self.register_buffer("position", positional_map(width, steps, 0), persistent=False)
+        self.register_buffer("taper", _taper(), persistent=False)
+        # whether there is anything to add: a network of zeros is not run
+        self.register_buffer("used", torch.zeros((), dtype=torch.bool))
+
+    def clear(self) -> None:
+        """Make the correction exactly zero."""
+        with torch.no_grad():
+            for parameter in self.outlet.parameters():
+                parameter.zero_()
+        self.used.fill_(False)
+
+    def forward(self, records: Tensor) -> Tensor:
+        """Correct records.
+
+        Parameters
+        ----------
+        records
+            Noise-free, of any height, shape (batch, samples).
+
+        Returns
+        -------
+        Tensor
+            Of the same shape; the same outside the stretch about the half maximum.
+        """
+        if not self.training and not self.used:
+            return records
+        corrected, _ = self.corrected(records)
+        return corrected
+
+    def corrected(self, records: Tensor) -> tuple[Tensor, Tensor]:
+        """Corrected records, and what was added in units of each one's maximum."""
+        with torch.no_grad():
+            height, at = records.max(dim=1, keepdim=True)
+            sample = half_sample(records, height, at)
+            inside = stretch(records, sample, -BEFORE, AFTER) / height
+        added = self.correction(inside)
+        index = sample[:, None] + torch.arange(-BEFORE, AFTER, device=records.device)
+        index = index.clamp(0, records.shape[1] - 1)
+        return records.scatter_add(1, index, added * height), added
+
+    def correction(self, inside: Tensor) -> Tensor:
+        """What to add to stretches of height 1, shape (batch, BEFORE + AFTER)."""
+        slope = SLOPE_SCALE * torch.diff(inside, dim=1, prepend=inside[:, :1])
+        folded = torch.cat([_folded(inside), _folded(slope)], dim=1)
+        fine = self.inlet(folded) + self.position
+        coarse = self.down(nn.functional.avg_pool1d(fine, 2))
+        wide = nn.functional.interpolate(coarse, scale_factor=2, mode="nearest")
+        out: Tensor = self.outlet(self.up(torch.cat([fine, wide], dim=1)))
+        return out.transpose(1, 2).flatten(1) * self.taper
+
+
+class HybridGenerator(ResponseGenerator):
+    """A readout chain with its noise, and a correction of its records.
+
+    Parameters
+    ----------
+    chain
+        Whose response and noise are taken over.
+    residual
+        The correction.
+    """
+
+    def __init__(self, chain: ResponseGenerator, residual: EdgeResidual) -> None:
+        nn.Module.__init__(self)  # not the base's: all that it would make is there
+        self.response = chain.response
+        for name, values in chain.named_buffers(recurse=False):
+            self.register_buffer(name, values)
+        self.residual = residual
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Noise-free records of prepared simulated windows, as `ResponseGenerator`."""
+        records: Tensor = self.residual(self.response(windows))
+        return records
+
+
+def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
+    """Last sample below half of each maximum (height and place, (n, 1)) before it, (n,)."""
+    index = torch.arange(records.shape[1], device=records.device)
+    below = (records < 0.5 * height) & (index < at)
+    return ((below * (index + 1)).amax(dim=1) - 1).clamp_min(0)
+
+
+def _folded(stretches: Tensor) -> Tensor:
+    """(batch, samples) → (batch, FOLD, samples / FOLD)."""
+    return stretches.unflatten(1, (-1, FOLD)).transpose(1, 2)
+
+
+def _taper() -> Tensor:
+    """1 but for the ends, where it goes to zero smoothly."""
+    samples = torch.arange(BEFORE + AFTER)
+    edge = torch.minimum(samples + 0.5, BEFORE + AFTER - 0.5 - samples)
+    return torch.sin(0.5 * torch.pi * (edge / RAMP).clamp(max=1)) ** 2
