@@ -111,7 +111,7 @@ def test_slew_and_quadratic_bend_tall_pulses_more():
         ({"bandwidth_poles_ns": [-40]}, "bandwidth_poles_ns"),
         ({"slow": {"fraction": 0.1, "tau_ns": 0}}, "slow.tau_ns"),
         ({"decays": [{"fraction": 0.9, "tau_us": 50}]}, "decays"),
-        ({"n_pre": 1200}, "n_pre"),
+        ({"n_pre": 1400}, "n_pre"),
         ({"baseline_mean_adc": 70000}, "baseline_mean_adc"),
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),

@@ -78,7 +78,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     >>> step = Pulses.of(np.ones((2, 900)), dt_ns=4, energy_kev=[1592.5, 2614.5])
     >>> traces = read_out(step, read_electronics("legend200"), seed=1)
     >>> traces.waveforms.shape, traces.waveforms.dtype
-    ((2, 1200), dtype('uint16'))
+    ((2, 1400), dtype('uint16'))
     """
     energy, n = required_energy_kev(pulses), len(pulses)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
