@@ -1,0 +1,276 @@
+"""Further pulse-shape parameters: times, charge that comes late, tail, current, noise.
+
+`cpunet.pulses.parameters` holds the three by which a translation is judged; here are
+those and what else an analysis may cut on, each with its definition and source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.pulses import _shape_kernels as kernels
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import (
+    BLOCK,
+    Parameter,
+    Values,
+    current_amplitude,
+    current_amplitude_kernel,
+    drift_time,
+    tail_slope,
+)
+from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+
+# Fractions of the maximum at which a pulse is timed.
+TIME_POINTS = {"t01": 0.01, "t10": 0.1, "t50": 0.5, "t90": 0.9, "t99": 0.99}
+# Rise times: the time points at which they begin and end.
+RISE_TIMES = {
+    "rise_10_90": ("t10", "t90"),
+    "rise_01_99": ("t01", "t99"),
+    "rise_10_99": ("t10", "t99"),
+    "rise_90_99": ("t90", "t99"),
+}
+LATE_FRACTION = 0.8  # charge after 80 % of the height is late (Majorana)
+# The fast of two decays.  The window holds no more than the difference of a tail
+# from a slow decay, so that a second free time would only follow the noise.
+FAST_DECAY_NS = 4000.0
+
+
+@dataclass(frozen=True)
+class ShapeParameter(Parameter):
+    """A parameter with its definition in one sentence and the source of that definition."""
+
+    definition: str
+    source: str
+
+
+_AVSE = "Majorana, arXiv:1901.05388; dspeed"
+_PAPER = "Bhimani et al. 2026"
+_DSPEED_TIME = "dspeed, interpolated_time_point_thresh"
+_RISE = "LEGEND, rt1090 and its like"
+
+
+def _time_point(fraction: float) -> ShapeParameter:
+    return ShapeParameter(
+        rf"$t_{{{100 * fraction:g}\,\%}}$",
+        "ns",
+        f"time of the last crossing of {100 * fraction:g} % of the pulse's own maximum before "
+        "that maximum, interpolated linearly and counted from the aligned sample",
+        _DSPEED_TIME,
+    )
+
+
+def _rise_time(begin: str, end: str) -> ShapeParameter:
+    return ShapeParameter(
+        f"Rise time {int(begin[1:])}–{end[1:]} %", "ns", f"`{end}` less `{begin}`", _RISE
+    )
+
+
+SHAPE_PARAMETERS: dict[str, ShapeParameter] = {
+    "current_amplitude": ShapeParameter(
+        "Current amplitude $I_{max}$",
+        "1/sample",
+        "maximum of the current after three moving averages of 48 ns on a 1-ns grid (at 16 ns "
+        "a sample), which for a normalised pulse is A/E as well as A",
+        _AVSE,
+    ),
+    "current_width": ShapeParameter(
+        "Current width",
+        "ns",
+        "full width at half maximum of that smoothed current, from its highest value to the "
+        "nearest half on either side",
+        "smoothing as for A",
+    ),
+    "drift_time": ShapeParameter(
+        "Drift time",
+        "ns",
+        "time from the last crossing of `drift_start_fraction` of the maximum to the first "
+        "sample that holds the maximum",
+        f"{_PAPER}, section 4.3.1",
+    ),
+    **{name: _time_point(fraction) for name, fraction in TIME_POINTS.items()},
+    **{name: _rise_time(*points) for name, points in RISE_TIMES.items()},
+    "effective_drift_time": ShapeParameter(
+        "Effective drift time",
+        "ns",
+        "area between the pulse and its maximum, from `t01` to the maximum, divided by the "
+        "maximum",
+        "LEGEND, dt_eff (there pole-zero corrected, over 4 µs)",
+    ),
+    "late_charge": ShapeParameter(
+        "Late charge LQ80",
+        "ns",
+        "area between the plateau and the pole-zero corrected pulse, from 80 % of the plateau "
+        "to the end, divided by the plateau (the mean of the last `decay_fit_samples`)",
+        "Majorana, arXiv:2207.07638; LEGEND, lq80",
+    ),
+    "overshoot": ShapeParameter(
+        "Overshoot",
+        "%",
+        "maximum of the pole-zero corrected pulse before the plateau, divided by the plateau, "
+        "less 1",
+        "as in `cpunet response`",
+    ),
+    "tail_slope": ShapeParameter(
+        "Tail slope",
+        "1/ms",
+        "slope of a straight line through the logarithm of the last `decay_fit_samples`",
+        f"{_PAPER}, section 4.3.3",
+    ),
+    "slow_tail_slope": ShapeParameter(
+        "Slow tail slope",
+        "1/ms",
+        "slope of the logarithm of the slow one of two decays fitted to the last "
+        "`decay_fit_samples`, the fast one having 4 µs",
+        "least squares, one free time",
+    ),
+    "fast_share": ShapeParameter(
+        "Fast share of the tail",
+        "%",
+        "share of the fast decay in the sum of the two, both traced back to the aligned sample",
+        "the same fit",
+    ),
+    "tail_rms": ShapeParameter(
+        "Tail residual RMS",
+        "pulse height",
+        "square root of the sum of the squared residuals of that fit over its degrees of "
+        "freedom",
+        "the same fit",
+    ),
+    "baseline_rms": ShapeParameter(
+        "Baseline RMS",
+        "pulse height",
+        "square root of the sum of the squared residuals of the first `baseline_samples` about "
+        "a straight line over its degrees of freedom",
+        "as in the preparation, which takes samples nearer the pulse",
+    ),
+}
+
+
+def all_parameters(
+    pulses: Pulses, preparation: PreparationConfig, scores: ScoreConfig
+) -> dict[str, Values]:
+    """All parameters of `SHAPE_PARAMETERS`, each an array with one value per pulse.
+
+    Parameters
+    ----------
+    pulses
+        Prepared pulses.
+    preparation
+        Says where they are aligned and what belongs to baseline and tail.
+    scores
+        Says at which fraction of the maximum the drift time begins.
+
+    Returns
+    -------
+    dict
+        Float64 arrays of shape ``(n,)`` in the units of `SHAPE_PARAMETERS` and in its order;
+        NaN for a pulse with a value that is not finite and for one without such a parameter.
+
+    Raises
+    ------
+    CpunetError
+        If the pulses do not have the length that the preparation makes, or too few samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cpunet.recipes import load_recipe
+    >>> recipe = load_recipe("paper")
+    >>> ramp = np.clip((np.arange(800) - 300) / 100, 0, 1)[np.newaxis]
+    >>> found = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
+    >>> found["rise_10_90"].round(3), found["effective_drift_time"].round(1)
+    (array([1280.]), array([784.1]))
+    """
+    if pulses.length != preparation.length:
+        raise CpunetError(
+            f"the pulses have {pulses.length} samples and prepared ones "
+            f"{preparation.length}; prepare them first"
+        )
+    values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
+    for first in range(0, len(pulses), BLOCK):
+        rows = slice(first, first + BLOCK)
+        block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
+        block[~np.isfinite(block).all(axis=1)] = np.nan  # one kind of unusable is enough
+        # what overflows is as good as unknown, and is NaN below
+        with np.errstate(all="ignore"):
+            found = _of_block(block, pulses.dt_ns, preparation, scores)
+        for name, column in found.items():
+            values[name][rows] = np.where(np.isfinite(column), column, np.nan)
+    return values
+
+
+def _of_block(
+    block: FloatArray, dt_ns: float, preparation: PreparationConfig, scores: ScoreConfig
+) -> dict[str, Values]:
+    fitted = preparation.decay_fit_samples
+    slopes = tail_slope(block, dt_ns, fitted)
+    weights = current_amplitude_kernel()
+    overshoots, late = kernels.corrected_shapes(
+        block, -slopes * dt_ns * 1e-6, fitted, LATE_FRACTION
+    )
+    return {
+        "current_amplitude": current_amplitude(block),
+        "current_width": kernels.current_widths(block, weights) * dt_ns,
+        "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
+        **_times(block, dt_ns, preparation.samples_before),
+        "late_charge": late * dt_ns,
+        "overshoot": 100 * overshoots,
+        "tail_slope": slopes,
+        **_two_decays(block, slopes, dt_ns, preparation),
+        "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
+    }
+
+
+def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
+    """Time points and what follows from them, in ns."""
+    from dspeed.processors import interpolated_time_point_thresh, min_max
+
+    _, top, _, height = min_max(block)
+    positive = height > 0  # False for NaN
+    stop = np.where(positive, top, 0).astype(np.int64)
+    thresholds = np.outer(
+        np.where(positive, height, np.nan), np.array(list(TIME_POINTS.values()))
+    )
+    samples = interpolated_time_point_thresh(
+        block[:, np.newaxis], thresholds.astype(np.float32), stop[:, np.newaxis], 0, ord("l")
+    ).astype(float)
+    times: dict[str, Values] = dict(
+        zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
+    )
+    rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
+    areas = kernels.missing_areas(block, samples[:, 0], stop.astype(float))
+    return {**times, **rises, "effective_drift_time": areas * dt_ns}
+
+
+def _two_decays(
+    block: FloatArray, slopes: Values, dt_ns: float, preparation: PreparationConfig
+) -> dict[str, Values]:
+    fitted = preparation.decay_fit_samples
+    rates, shares, rms = kernels.two_decay_fits(
+        np.ascontiguousarray(block[:, -fitted:]),
+        -slopes * dt_ns * 1e-6,
+        dt_ns / FAST_DECAY_NS,
+        preparation.samples_after - fitted,
+    )
+    return {
+        "slow_tail_slope": -rates / (dt_ns * 1e-6),
+        "fast_share": 100 * shares,
+        "tail_rms": rms,
+    }
+
+
+def _rms_about_line(baseline: FloatArray) -> Values:
+    """RMS of the residuals of a straight line, over its degrees of freedom."""
+    samples = baseline.shape[1]
+    if samples < 3:
+        return np.full(len(baseline), np.nan)
+    lever = np.arange(samples) - (samples - 1) / 2
+    values = baseline.astype(float)
+    values -= values.mean(axis=1, keepdims=True)
+    values -= np.outer(values @ lever / (lever @ lever), lever)
+    rms: Values = np.sqrt((values**2).sum(axis=1) / (samples - 2))
+    return rms
