@@ -12,7 +12,7 @@ from cpunet.recipes import load_recipe, recipe_from, recipe_names
 
 
 def test_the_recipes_that_come_with_the_package():
-    assert {"fast", "paper", "small"} == set(recipe_names())
+    assert {"best", "fast", "paper", "small"} == set(recipe_names())
     for name in recipe_names():
         recipe = load_recipe(name)
         assert recipe.name == name

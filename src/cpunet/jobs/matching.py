@@ -11,12 +11,14 @@ from torch import nn
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import measured_noise
+from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import HybridConfig, Recipe
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import Record
 from cpunet.training.matching import fit_response
+from cpunet.training.residual import fit_residual
 
 POOR_FIT = 3.0  # chi-square per moment from which on a response does not describe the data
 
@@ -86,10 +88,30 @@ def match(
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
     ren.set_noise(noise)
+    chain, parts, more = ren, {}, {}
+    if isinstance(recipe.generator, HybridConfig):
+        residual, kept = fit_residual(
+            chain,
+            sides.sim.waveforms,
+            sides.data.waveforms,
+            sides.sim.energy_kev,
+            recipe,
+            seed=seed,
+        )
+        if not kept.kept:
+            monitor.note("the residual does not help held-out pulses and is left out")
+        # beside the chain, not in it: what reads chains finds it where it always is
+        ren, parts, more = (
+            HybridGenerator(chain, residual),
+            {"residual": residual},
+            asdict(kept),
+        )
     iren = fit_inverse(ren, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
     told = {
         "parameters": response.describe(),
         **asdict(fit),
         "noise": {"baselines": noise.n_baselines, "rms": noise.rms},
     }
-    return nn.ModuleDict({"ren": ren, "iren": iren}), {"fit": told}
+    if more:
+        told["residual"] = more
+    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}

@@ -3,7 +3,8 @@
 A chain treats all pulses alike.  Where the simulated physics differ from the detector's, the
 edges of single-site and multi-site pulses are off by different amounts, which no chain can
 follow.  The network sees a short stretch of each record about its half maximum, folded into
-channels, and adds to it; baseline and tail stay the chain's by construction.
+channels, and says by how much each sample comes earlier or later.  That times the slope is
+added: where nothing moves, nothing is, so that baseline, top and tail stay the chain's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from cpunet.networks.positional_unet import SLOPE, positional_map
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.schema import ResidualConfig
 
-BEFORE, AFTER = 64, 192  # samples about the half maximum
+BEFORE, AFTER = 64, 96  # samples about the half maximum; tail slopes are measured later
 FOLD = 8  # samples to a step
 KERNEL = 5  # steps
 RAMP = 16  # samples over which the correction goes to zero at either end
@@ -97,14 +98,17 @@ class EdgeResidual(nn.Module):
         return records.scatter_add(1, index, added * height), added
 
     def correction(self, inside: Tensor) -> Tensor:
-        """What to add to stretches of height 1, shape (batch, BEFORE + AFTER)."""
-        slope = SLOPE_SCALE * torch.diff(inside, dim=1, prepend=inside[:, :1])
-        folded = torch.cat([_folded(inside), _folded(slope)], dim=1)
+        """What to add to stretches of height 1, shape (batch, BEFORE + AFTER).
+
+        The network's output is a time in samples.
+        """
+        slope = torch.diff(inside, dim=1, prepend=inside[:, :1])
+        folded = torch.cat([_folded(inside), _folded(SLOPE_SCALE * slope)], dim=1)
         fine = self.inlet(folded) + self.position
         coarse = self.down(nn.functional.avg_pool1d(fine, 2))
         wide = nn.functional.interpolate(coarse, scale_factor=2, mode="nearest")
         out: Tensor = self.outlet(self.up(torch.cat([fine, wide], dim=1)))
-        return out.transpose(1, 2).flatten(1) * self.taper
+        return out.transpose(1, 2).flatten(1) * slope * self.taper
 
 
 class HybridGenerator(ResponseGenerator):
@@ -140,7 +144,7 @@ def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
 
 def _folded(stretches: Tensor) -> Tensor:
     """(batch, samples) → (batch, FOLD, samples / FOLD)."""
-    return stretches.unflatten(1, (-1, FOLD)).transpose(1, 2)
+    return stretches.reshape(len(stretches), -1, FOLD).transpose(1, 2)
 
 
 def _taper() -> Tensor:

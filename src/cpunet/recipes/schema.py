@@ -116,8 +116,9 @@ class ResidualConfig(Config):
     ``rate`` that falls to zero; the kept weights are a running average with
     ``average_decay`` per iteration.  ``projections`` are the directions along which sets are
     compared in an iteration, ``amplitude_weight`` weighs the density of the current
-    amplitude, and ``size_weight`` the mean square of what is added.  A ``held_out`` part of
-    both sets judges: the distance of these must fall by the fraction ``least_fall``.
+    amplitude, ``size_weight`` the mean square of what is added, and ``slope_weight`` that of
+    its steps from sample to sample.  A ``held_out`` part of both sets judges: the distance of
+    these must fall by the fraction ``least_fall``, and by more than chance.
     """
 
     width: Annotated[int, Field(ge=2, multiple_of=2)]
@@ -128,6 +129,7 @@ class ResidualConfig(Config):
     projections: Count
     amplitude_weight: NonNegative
     size_weight: NonNegative
+    slope_weight: NonNegative
     held_out: Annotated[float, Field(gt=0, lt=1)]
     least_fall: Fraction
 
@@ -336,6 +338,19 @@ class Recipe(Config):
         ):
             raise CpunetError(f"recipe {self.name}: does not match a response")
         return MatchingSettings(self.generator, self.training)
+
+    @property
+    def residual(self) -> ResidualConfig:
+        """The settings of a network beside a response.
+
+        Raises
+        ------
+        CpunetError
+            If the recipe has none.
+        """
+        if not isinstance(self.generator, HybridConfig):
+            raise CpunetError(f"recipe {self.name}: has no residual")
+        return self.generator.residual
 
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:

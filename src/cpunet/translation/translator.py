@@ -17,12 +17,13 @@ import numpy.typing as npt
 import torch
 
 from cpunet.errors import CpunetError
+from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
-from cpunet.recipes.schema import PunetConfig, Recipe
+from cpunet.recipes.schema import HybridConfig, PunetConfig, Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.translation.backends import (
     Backend,
@@ -34,6 +35,7 @@ from cpunet.translation.backends import (
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
+RESIDUAL = "residual"  # its weights lie beside those of the chain
 BATCH = 512  # pulses at a time: bounds the memory, hardly touches the speed
 
 
@@ -96,6 +98,10 @@ class Translator:
         if cls.part == REN.part:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
+            if isinstance(generator, HybridConfig):
+                residual = EdgeResidual(generator.residual)
+                load_network(run, RESIDUAL, residual, device)
+                response = HybridGenerator(response, residual)
             return ResponseBackend(response, recipe.preparation)
         inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
         load_network(run, cls.part, inverse, device)
