@@ -248,8 +248,8 @@ class MatchingConfig(Config):
 
     @property
     def iterations(self) -> int:
-        """The most steps of the training."""
-        return self.steps
+        """The most steps of the training: every start, and a last fit."""
+        return self.steps * (len(self.start_factors) + 1)
 
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:

@@ -37,6 +37,8 @@ FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
 # Chi-square per moment at which a fit has found its valley; the data's own outliers and the
 # ridge keep it from 1.
 GOOD_FIT = 1.6
+# A wrong valley gives three per moment; this is another detector.
+HOPELESS_FIT = 20.0
 CONVERGED = 0.05  # fall of chi-square
 DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
 BLOCK = 512  # pulses at a time, to bound memory
@@ -124,7 +126,7 @@ def fit_response(
         fit = _levenberg_marquardt(problem, training.steps, listener)
         if best is None or fit.chi_square < best[1].chi_square:
             best = problem, fit
-        if fit.chi_square < GOOD_FIT * fit.moments:
+        if not GOOD_FIT <= fit.chi_square / fit.moments <= HOPELESS_FIT:
             break  # no other valley is to be looked for
     assert best is not None  # the recipe has one start at least
     problem, fit = best
