@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--no-rivals", action="store_false", dest="rivals")
     arguments = parser.parse_args()
-    console = Console()
+    console = Console(width=110)  # whole rows, also into a file
     for stand in arguments.stands:
         for recipe in arguments.recipe or ["fast"]:
             runs = []
