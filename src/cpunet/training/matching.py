@@ -1,7 +1,7 @@
 """A readout chain fitted to unpaired pulses: least squares on moments, with errors.
 
 The parameters of a response are those for which the moments of the translated simulation,
-noise and all, agree best with those of the data: a chi-square fit in about a dozen
+noise and all, agree best with those of the data: a chi-square fit in about ten
 parameters by the Levenberg–Marquardt method, with derivatives by finite differences on
 fixed random numbers.  Its value says whether the response describes the data, its
 curvature how well each parameter is known.
