@@ -142,3 +142,9 @@ def test_the_same_report_gives_the_same_bytes(report, tmp_path_factory):
     write_report(again, metrics(), drawn, ["Trained on FEP; 1 < 2 & 3."])
     for path in report.iterdir():
         assert path.read_bytes() == (again / path.name).read_bytes()
+
+
+def test_pulses_that_cannot_be_prepared_are_counted_on_the_page(tmp_path):
+    peaks = {"SEP": {"n_sim": 9, "n_data": 9, "parameters": {}, "not_prepared": {"ren": 7}}}
+    write_report(tmp_path, {"peaks": peaks}, {}, [])
+    assert "REN translation: 7." in (tmp_path / "report.html").read_text()

@@ -20,6 +20,7 @@ from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.training import matching
 from cpunet.training.matching import GOOD_FIT, Fit, fit_response
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
@@ -234,3 +235,11 @@ def test_energies_are_needed(problem: Problem) -> None:
     unknown = Pulses.of(problem.sim.waveforms, dt_ns=DT_NS)
     with pytest.raises(CpunetError, match="pulse 0 has an energy of nan keV"):
         problem.fit(0, sim=unknown)
+
+
+def test_steps_of_several_fits_are_one_count() -> None:
+    told: list[tuple[int, float]] = []
+    counted = matching._counted(lambda *step: told.append(step))
+    for step, chi_square in ((1, 9.0), (2, 5.0), (1, 8.0)):  # the last of another start
+        counted(step, chi_square)
+    assert told == [(1, 9.0), (2, 5.0), (3, 8.0)]

@@ -42,8 +42,9 @@ def write_report(
     folder
         An existing folder, see `files.folder_written_aside`.
     metrics
-        ``peaks``: by peak, ``n_sim``, ``n_data``, ``parameters`` (the result of
-        `comparisons.compare`) and, if the truth is known, ``paired`` (by method, the
+        ``peaks``: by peak, ``n_sim``, ``n_data``, ``not_prepared`` (counts by method),
+        ``parameters`` (the result of `comparisons.compare`), ``two_sample`` (the classifier
+        test by method) and, if the truth is known, ``paired`` (by method, the
         result of `paired.paired_scores`), or ``missing``: why it is not scored;
         ``training``: how the network was trained; ``rejections``: counts by reason,
         possibly nested.  Numbers that are not finite are written as ``null``.
@@ -81,6 +82,12 @@ def _peak_html(peak: str, scores: Mapping[str, Any]) -> str:
         if "missing" in scores
         else _parameter_table(scores.get("parameters", {})),
     ]
+    if scores.get("not_prepared"):
+        counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
+        parts.append(
+            "<p>Simulated pulses left out because they cannot be prepared as data are once "
+            f"they are translated: {escape('; '.join(counts))}.</p>"
+        )
     if scores.get("two_sample"):
         parts.append(_two_sample_table(scores["two_sample"]))
     if scores.get("paired"):

@@ -54,6 +54,12 @@ class PeakSets:
     truth: FloatArray | None
     others: Mapping[str, FloatArray]
 
+    def not_prepared(self) -> dict[str, int]:
+        """How many translated pulses cannot be prepared as data are, by method."""
+        left = {"ren": self.ren.waveforms, **self.others}
+        counts = {method: len(self.raw) - len(windows) for method, windows in left.items()}
+        return {method: count for method, count in counts.items() if count}
+
     def missing(self) -> str | None:
         """Say what keeps the peak from being scored, if anything does."""
         sides = (("simulated", self.raw), ("measured", self.data))
@@ -210,7 +216,11 @@ def _score(
     peak: PeakSets, recipe: Recipe, seed: int
 ) -> tuple[dict[str, dict[str, Values]], dict[str, Any]]:
     """Return parameter values by method and the scores of one peak."""
-    scores: dict[str, Any] = {"n_sim": len(peak.raw), "n_data": len(peak.data)}
+    scores: dict[str, Any] = {
+        "n_sim": len(peak.raw),
+        "n_data": len(peak.data),
+        "not_prepared": peak.not_prepared(),
+    }
     missing = peak.missing()
     if missing is not None:
         return {}, scores | {"parameters": {}, "missing": missing}

@@ -9,6 +9,7 @@ curvature how well each parameter is known.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -59,6 +60,8 @@ class Fit:
         Standard deviations of the parameters, by name, as their curvature gives them.
     pulls
         Deviation of each moment in its standard deviations, by name.
+    data_left_out
+        Measured pulses that the moments leave out: a second pulse, or no baseline.
     """
 
     chi_square: float
@@ -66,6 +69,7 @@ class Fit:
     steps: int
     errors: dict[str, float]
     pulls: dict[str, float]
+    data_left_out: int
 
 
 def fit_response(
@@ -114,6 +118,8 @@ def fit_response(
     moments = Moments.of_data(data[data_rows], training, recipe.preparation)
     length = ROOM_BEFORE + sim.shape[1] + ROOM_AFTER
     drawn = noise.draw(energy_kev[sim_rows], length, rng)
+    if listener is not None:
+        listener = _counted(listener)
     best: tuple[_Problem, Fit] | None = None
     for factor in training.start_factors:
         problem = _Problem(
@@ -136,6 +142,12 @@ def fit_response(
         # its own chi-square says nothing: what does not fit was allowed for
         fit = replace(again, chi_square=fit.chi_square, steps=fit.steps + again.steps)
     return problem.response, fit
+
+
+def _counted(listener: Listener) -> Listener:
+    """A listener told the steps of all fits as one count."""
+    steps = itertools.count(1)
+    return lambda _, chi_square: listener(next(steps), chi_square)
 
 
 def _start(
@@ -166,7 +178,7 @@ class _Problem:
         named = [(n, p) for n, p in response.named_parameters() if p.numel()]
         self.parameters = [parameter for _, parameter in named]
         self.labels = [n for n, p in named for _ in range(p.numel())]
-        self.centre = self.start = self.vector()
+        self.centre = self.vector()
         widths = {
             "decay_weights": DECAY_WIDTH,
             "ringing": RINGING_WIDTH,
@@ -187,14 +199,13 @@ class _Problem:
         self.whiten = torch.linalg.cholesky(torch.linalg.inv(self.correlation)).T
 
     def allow_for_model_error(self) -> None:
-        """Weigh each moment by how well it can be described at all.
+        """Let the moments that physics shape, and electronics do not, count for little.
 
-        If no response makes the sets agree, the simulated physics differ. Moments that are
-        many standard deviations off would then bend the response to their liking; with their
-        deviation as a further error they count as little as they are understood.
+        If no response makes the sets agree, the simulated physics differ.  The shape of the
+        edge would then bend the response to its liking; current amplitude, top and tail
+        decide instead, see `Moments.model_errors`.
         """
-        errors = self.moments.model_errors
-        correlation = self.correlation + torch.diag(errors**2)
+        correlation = self.correlation + torch.diag(self.moments.model_errors**2)
         self.whiten = torch.linalg.cholesky(torch.linalg.inv(correlation)).T
 
     def vector(self) -> Tensor:
@@ -284,6 +295,7 @@ def _levenberg_marquardt(
         steps=taken,
         errors=_by_name(problem.labels, covariance.diagonal().sqrt()),
         pulls=dict(zip(problem.moments.names, pulls.tolist(), strict=True)),
+        data_left_out=problem.moments.left_out,
     )
 
 

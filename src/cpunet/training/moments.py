@@ -45,6 +45,8 @@ class Moments:
         Functions of the measured pulses, shape (pulses, moments), float64.
     names
         Of the moments.
+    left_out
+        Measured pulses that are no single pulses with a flat baseline, and do not count.
     """
 
     config: MatchingConfig
@@ -60,6 +62,7 @@ class Moments:
     amplitude_widths: Tensor
     values: Tensor
     names: tuple[str, ...]
+    left_out: int
 
     @classmethod
     def of_data(
@@ -122,6 +125,7 @@ class Moments:
             amplitude_widths=(edges[1:] - edges[:-1]).clamp_min(config.amplitude_width),
             values=torch.empty(0),
             names=_names(config),
+            left_out=int((~usable).sum()),
         )
         values = drawn_up._of_aligned(aligned, linear[:, -1])
         return cls(**{**vars(drawn_up), "values": values})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +21,18 @@ from cpunet.recipes.schema import PreparationConfig
 Energies = npt.NDArray[np.float64]
 
 
-class Backend(Protocol):
+class Backend(ABC):
     """Translates a batch of prepared windows."""
+
+    network: nn.Module
 
     @property
     def device(self) -> torch.device:
         """Where it computes."""
+        weights: torch.Tensor = next(iter(self.network.state_dict().values()))
+        return weights.device
 
+    @abstractmethod
     def __call__(
         self,
         windows: FloatArray,
@@ -38,16 +43,11 @@ class Backend(Protocol):
         """Return windows, rows of NaN where there is none, and a `Rejection` for each."""
 
 
-class NetworkBackend:
+class NetworkBackend(Backend):
     """A network from window to window; its noise is the latent one."""
 
     def __init__(self, network: PositionalUNet) -> None:
         self.network = network.eval()
-
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        return _device(self.network)
 
     def __call__(
         self,
@@ -64,17 +64,12 @@ class NetworkBackend:
         return result, np.zeros(len(windows), np.uint8)
 
 
-class ResponseBackend:
+class ResponseBackend(Backend):
     """A readout chain, electronic noise, and the preparation of measured traces."""
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
-        self.network = generator.eval()
+        self.network = self.chain = generator.eval()
         self.config = config
-
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        return _device(self.network)
 
     def __call__(
         self,
@@ -95,32 +90,26 @@ class ResponseBackend:
             raise CpunetError(
                 "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
             )
-        drawn = self.network.noise if noise else None
+        drawn = self.chain.noise if noise else None
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
         return finish_with_codes(
             records,
             self.config,
-            dt_ns=float(self.network.response.dt_ns),
+            dt_ns=float(self.chain.response.dt_ns),
             noise=drawn,
             energy_kev=energy_kev if noise else None,
             seed=int(seed),
         )
 
 
-class InverseBackend:
+class InverseBackend(Backend):
     """A linear inverse, and the preparation of simulated pulses."""
 
     def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
         self.network = inverse.eval()
         self.config = config
         self.dt_ns = dt_ns
-
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        weights: torch.Tensor = next(self.network.buffers())
-        return weights.device
 
     def __call__(
         self,
@@ -136,7 +125,3 @@ class InverseBackend:
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms
         return result, prepared.codes
-
-
-def _device(network: nn.Module) -> torch.device:
-    return next(network.parameters()).device
