@@ -168,7 +168,9 @@ def test_metrics_have_their_schema(report, trained):
     metrics = json.loads((report[0] / "metrics.json").read_text())
     assert set(metrics["peaks"]) == {"SEP", "DEP", "FEP"}
     for scores in metrics["peaks"].values():
-        assert {"n_sim", "n_data", "parameters", "paired", "two_sample"} == set(scores)
+        counts = {"n_sim", "n_data", "not_prepared"}
+        assert counts | {"parameters", "paired", "two_sample"} == set(scores)
+        assert all(0 < n <= 24 for n in scores["not_prepared"].values())
         assert scores["n_sim"] == 24
         assert 18 <= scores["n_data"] <= 24
         assert set(scores["parameters"]) == PARAMETERS
