@@ -34,7 +34,8 @@ def test_the_recipe_that_matches_a_response():
     generator, training = recipe.matching
     assert generator.name == "response"
     assert recipe.discriminator is None
-    assert recipe.training.iterations == recipe.training.steps * 4  # three starts, a last fit
+    # three starts, a ringing, and two last fits
+    assert recipe.training.iterations == recipe.training.steps * 6
     # what is compared lies within a window, whose half maximum is before its middle
     assert training.before <= training.baseline[0] <= recipe.preparation.samples_before
     assert training.after <= recipe.preparation.samples_after

@@ -87,10 +87,14 @@ class Problem(NamedTuple):
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    clean = linear_response(charge(N, seed=2), CHAIN)
+    return measured_with(CHAIN)
+
+
+def measured_with(chain: Electronics) -> Problem:
+    clean = linear_response(charge(N, seed=2), chain)
     rng = np.random.default_rng(3)
-    noise = coloured_noise(CHAIN.noise.spectrum, N, CHAIN.length, DT_NS, rng)
-    adc = 15_000 + CHAIN.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
+    noise = coloured_noise(chain.noise.spectrum, N, chain.length, DT_NS, rng)
+    adc = 15_000 + chain.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
     raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
     data = prepare(raw, RECIPE.preparation, "measured").pulses
     measured = BaselineNoise.from_traces(raw, RECIPE.preparation)
@@ -216,10 +220,27 @@ def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
 
 def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> None:
     other = simulated(charge(N, seed=1, longest=60, steepest=7))
-    _, fit = problem.fit(0, "training.start_factors=[1]", "training.steps=10", sim=other)
+    short = ("training.start_factors=[1]", "training.steps=10", "training.ringing_mhz=[]")
+    _, fit = problem.fit(0, *short, sim=other)
     per_moment = fit.chi_square / fit.moments
     assert per_moment > 2 * GOOD_FIT
     assert per_moment > 3 * near.fit.chi_square / near.fit.moments
+
+
+def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> None:
+    ringing = {"frequency_MHz": 6.0, "fraction": 0.25, "damping_ns": 160.0}
+    chain = Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing})
+    rings = measured_with(chain)
+    short = ("training.start_factors=[1]", "training.noise_sets=1")
+    response, fit = rings.fit(0, *short)
+    numbers = response.describe()
+    assert fit.chi_square < GOOD_FIT * fit.moments
+    assert numbers["ringing_mhz"] == pytest.approx(6.0, rel=0.02)
+    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.2)  # with its damping
+    assert np.sort(response.log_poles_ns.detach().exp()) == pytest.approx([35, 55], rel=0.03)
+    assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
+    # and none where there is none
+    assert "ringing_mhz" not in near.response.describe()
 
 
 def test_too_few_pulses_are_refused(problem: Problem) -> None:

@@ -140,8 +140,9 @@ class BaselineNoise:
     ) -> FloatArray:
         """Draw Gaussian noise for pulses of these energies.
 
-        Several pulses take parts of one long trace, of one kind, in random order: noise
-        slower than a record is much the same in them, and moves their baselines alike.
+        Several pulses take parts of one long trace, of one kind, in random order and with
+        random signs: noise slower than a record is much the same in them, but for the sign,
+        so that it does not move their means alike.
 
         Parameters
         ----------
@@ -187,7 +188,7 @@ class BaselineNoise:
                 _add_lines(bins, lines[kind], rng)
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
             noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
-        noise /= energy_kev[:, np.newaxis]
+        noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
         return noise
 
     def _sizes(self, densities: Values, long: int) -> FloatArray:

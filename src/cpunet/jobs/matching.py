@@ -14,7 +14,7 @@ from cpunet.jobs.noise import measured_noise
 from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import HybridConfig, Recipe
+from cpunet.recipes.schema import HybridConfig, Recipe, ResponseConfig
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import Record
 from cpunet.training.matching import fit_response
@@ -32,13 +32,21 @@ class Sides:
     data_file: InputFile
 
 
+def _with_found_ringing(recipe: Recipe, found: ResponseConfig) -> Recipe:
+    """The recipe of the response as it was fitted: it may have begun to ring."""
+    if not isinstance(recipe.generator, ResponseConfig):
+        return recipe
+    rings = {"ringing_mhz": found.ringing_mhz}
+    return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=rings)})
+
+
 def match(
     sides: Sides,
     recipe: Recipe,
     seed: int,
     listen: Callable[[list[Record]], None],
     monitor: Monitor,
-) -> tuple[nn.Module, dict[str, Any]]:
+) -> tuple[nn.Module, dict[str, Any], Recipe]:
     """Measure the noise, fit the response, and invert it.
 
     Parameters
@@ -57,7 +65,8 @@ def match(
     Returns
     -------
     tuple
-        A module with ``ren`` and ``iren``, and what ``run.json`` is to say of the fit.
+        A module with ``ren`` and ``iren``, what ``run.json`` is to say of the fit, and the
+        recipe of the response as it was fitted.
 
     Raises
     ------
@@ -85,6 +94,7 @@ def match(
             f"warning: the response describes the data poorly, chi-square "
             f"{fit.chi_square:.0f} for {fit.moments} moments; look at the report"
         )
+    recipe = _with_found_ringing(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
     ren.set_noise(noise)
@@ -114,4 +124,4 @@ def match(
     }
     if more:
         told["residual"] = more
-    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}
+    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe

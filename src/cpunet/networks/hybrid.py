@@ -144,7 +144,8 @@ def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
 
 def _folded(stretches: Tensor) -> Tensor:
     """(batch, samples) → (batch, FOLD, samples / FOLD)."""
-    return stretches.reshape(len(stretches), -1, FOLD).transpose(1, 2)
+    # not by the number of pulses, which would fix it in an exported graph
+    return stretches.unflatten(1, (-1, FOLD)).transpose(1, 2)
 
 
 def _taper() -> Tensor:

@@ -41,6 +41,7 @@ class ElectronicsResponse(nn.Module):
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__()
+        self.config = config
         self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
 
         def log(values: list[float]) -> nn.Parameter:

@@ -194,7 +194,8 @@ class TrainingConfig(Config):
     ``instance_noise`` is the RMS of white noise added to all that the discriminators
     see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
     paper): translations carry no electronic noise, and a discriminator that can tell
-    them by that alone teaches nothing about the shape.
+    them by that alone teaches nothing about the shape.  After every
+    ``checkpoint_interval`` iterations all that a training needs to go on is stored.
     """
 
     method: Literal["cyclegan"]
@@ -211,6 +212,7 @@ class TrainingConfig(Config):
     average_decay: Fraction
     statistics_batches: Count
     log_interval: Count
+    checkpoint_interval: Count
     losses: LossConfig
 
 
@@ -227,7 +229,9 @@ class MatchingConfig(Config):
     ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
     ``max_pulses`` bounds the sets, ``steps`` the iterations of a fit.  A fit that ends in the
     wrong valley is begun again with the response's poles times the next of
-    ``start_factors``; the best of all is kept.
+    ``start_factors``; the best of all is kept.  If it is still poor, a ringing is looked for at
+    ``ringing_mhz``.  The last steps average over up to ``noise_sets`` draws of the noise, if
+    there are so few pulses that ``max_pulses`` allows it.
     """
 
     method: Literal["matching"]
@@ -245,11 +249,13 @@ class MatchingConfig(Config):
     max_pulses: Annotated[int, Field(ge=100)]
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    ringing_mhz: tuple[Positive, ...]
+    noise_sets: Count
 
     @property
     def iterations(self) -> int:
-        """The most steps of the training: every start, and a last fit."""
-        return self.steps * (len(self.start_factors) + 1)
+        """The most steps of the training: every start, a ringing, and two last fits."""
+        return self.steps * (len(self.start_factors) + 3)
 
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:
@@ -268,12 +274,27 @@ class MatchingConfig(Config):
 
 
 class ScoreConfig(Config):
-    """Histograms and resampling of the comparison of two distributions."""
+    """Histograms and resampling of the comparison of two distributions.
+
+    ``sideband_kev`` are the nearest and farthest distances from a line at which there is
+    nothing but its background, and ``continuum_kev`` named ranges without lines, from and to:
+    the survival of an A/E cut is told for them too.
+    """
 
     max_bins: Annotated[int, Field(ge=2)]
     bootstraps: Annotated[int, Field(ge=2)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
     edge_samples: Count
+    sideband_kev: tuple[Positive, Positive]
+    continuum_kev: dict[str, tuple[Positive, Positive]]
+
+    @model_validator(mode="after")
+    def _ranges_are_not_empty(self) -> ScoreConfig:
+        ranges = {"sideband_kev": self.sideband_kev, **self.continuum_kev}
+        for name, (low, high) in ranges.items():
+            if not low < high:
+                raise ValueError(f"{name} must go from a lower to a higher energy")
+        return self
 
 
 class CycleGanSettings(NamedTuple):

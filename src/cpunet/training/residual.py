@@ -27,8 +27,9 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import Recipe, ResidualConfig
 from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.matching import BLOCK, DELAY
+from cpunet.training.matching import DELAY
 from cpunet.training.moments import EDGE, Moments
+from cpunet.training.response_problem import BLOCK
 
 Listener = Callable[[int, float], None]
 
