@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from cpunet.errors import CpunetError
 from cpunet.training.cyclegan import LOSS_NAMES
-from cpunet.training.loop import train
+from cpunet.training.loop import Keeping, StoppedError, train
 
 
 def run(sets, recipe, seed=0):
@@ -84,7 +86,7 @@ def test_a_loss_that_is_no_number_stops_the_training(tiny, sets, residual, side,
     with pytest.raises(CpunetError) as error:
         train(*sets, tiny(f"generator.residual={residual}"), seed=0)
     assert "training diverged" in str(error.value)
-    assert "in iteration 0; lower the learning rates" in str(error.value)
+    assert "in iteration 0 (seed 0); lower the learning rates" in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -98,7 +100,7 @@ def test_the_first_bad_iteration_is_named(tiny, sets, monkeypatch):
             return {"identity_sim": torch.tensor(value)}
 
     monkeypatch.setattr(loop, "Step", Diverging)
-    with pytest.raises(CpunetError, match="identity_sim is inf in iteration 4;"):
+    with pytest.raises(CpunetError, match=r"identity_sim is inf in iteration 4 \(seed 0\);"):
         train(*sets, tiny("training.iterations=20", "training.log_interval=10"), seed=0)
 
 
@@ -148,3 +150,73 @@ def test_a_training_on_a_gpu(tiny, sets, penalty):
     model = train(*sets, recipe, seed=0, device="cuda")
     assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
     assert torch.equal(torch.cuda.get_rng_state(), before)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_training_on_a_gpu_goes_on(tiny, sets):
+    states, recipe = [], tiny("training.checkpoint_interval=2")
+    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)))
+    whole = train(*sets, recipe, seed=0, device="cuda", keeping=keeping).state_dict()
+    keeping = Keeping(lambda _state: None, start=states[0])
+    again = train(*sets, recipe, seed=0, device="cuda", keeping=keeping).state_dict()
+    # cuDNN's kernels may add in another order
+    for name, value in whole.items():
+        torch.testing.assert_close(again[name], value, rtol=1e-3, atol=1e-4)
+
+
+def kept(sets, recipe, stop=lambda: False):
+    """Train; numbers of iterations after which the state was kept, and of records by then."""
+    records, states = [], []
+
+    def save(state):
+        states.append((state["iteration"], len(records)))
+
+    try:
+        train(*sets, recipe, seed=0, listener=records.extend, keeping=Keeping(save, stop=stop))
+    finally:
+        assert [record["iteration"] for record in records] == [*range(len(records))]
+    return states
+
+
+def test_the_state_is_kept_at_its_interval_and_at_the_end(tiny, sets):
+    recipe = tiny("training.iterations=5", "training.checkpoint_interval=2")
+    # never before the listener has had all that led to it
+    assert kept(sets, recipe) == [(2, 2), (4, 4), (5, 5)]
+
+
+def test_a_stop_is_kept(tiny, sets):
+    asked = iter([False, False, True])
+    states = []
+    keeping = Keeping(lambda state: states.append(state["iteration"]), stop=lambda: next(asked))
+    with pytest.raises(
+        StoppedError, match=r"^stopped after 3 of 4 iterations; go on with --res"
+    ):
+        train(*sets, tiny(), seed=0, keeping=keeping)
+    assert states == [3]
+
+
+def test_a_stop_in_the_last_iteration_is_none(tiny, sets):
+    assert kept(sets, tiny("training.iterations=1"), stop=lambda: True) == [(1, 1)]
+
+
+def test_what_diverged_is_not_kept(tiny, sets, monkeypatch):
+    from cpunet.training import loop
+    from cpunet.training.cyclegan import Step
+
+    class Diverging(Step):
+        def __call__(self, iteration, sim, data):
+            if iteration == 3:  # its losses are still those of the weights before
+                with torch.no_grad():
+                    next(self.model.parameters())[:] = torch.nan
+            return {"identity_sim": torch.zeros(())}
+
+    monkeypatch.setattr(loop, "Step", Diverging)
+    states = []
+    recipe = tiny("training.iterations=20", "training.checkpoint_interval=2")
+    keeping = Keeping(lambda state: states.append(state["iteration"]))
+    with pytest.raises(
+        CpunetError, match=r"diverged: .* is not finite after iteration 3 \(seed 8"
+    ):
+        train(*sets, recipe, seed=8, keeping=keeping)
+    assert states == [2]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
-from typing import Annotated
+from types import FrameType
+from typing import Annotated, Self
 
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import fail, monitor, out
+from cpunet.jobs.monitor import Monitor
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
@@ -22,6 +25,12 @@ Set = Annotated[
     typer.Option("--set", help="Override a value: --set training.batch_size=64 (repeatable)."),
 ]
 Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores by default.")]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume", help="Go on with OUT.unfinished; give all other options as before."
+    ),
+]
 Board = Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs too.")]
 
 
@@ -42,32 +51,79 @@ def train(
     threads: Threads = None,
     device: options.Device = "auto",
     tensorboard: Board = False,
+    resume: Resume = False,
     force: options.Force = False,
 ) -> None:
     """Train REN and IREN on simulated and measured pulses, unpaired.
 
     Example: cpunet train --sim sim.lh5 --data raw.lh5 --out run
+
+    Example: cpunet train --recipe paper --sim sim.lh5 --data raw.lh5 --out run --resume
     """
     import torch
 
     from cpunet.jobs.inputs import InputFile
     from cpunet.jobs.train import train_run
     from cpunet.recipes import load_recipe
+    from cpunet.training.loop import StoppedError
 
     if threads is not None:
         torch.set_num_threads(threads)
-    info = train_run(
-        InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-        InputFile(data, data_table, data_energy, kev_per_adc, dt),
-        out_folder,
-        load_recipe(recipe, set_values or ()),
-        peak=peak,
-        seed=seed,
-        device=device,
-        force=force,
-        tensorboard=tensorboard,
-        monitor=monitor(),
-    )
+    shown = monitor()
+    with _StopRequest(shown) as stop:
+        try:
+            info = train_run(
+                InputFile(sim, sim_table, sim_energy, dt_ns=dt),
+                InputFile(data, data_table, data_energy, kev_per_adc, dt),
+                out_folder,
+                load_recipe(recipe, set_values or ()),
+                peak=peak,
+                seed=seed,
+                device=device,
+                resume=resume,
+                force=force,
+                tensorboard=tensorboard,
+                stop=stop,
+                monitor=shown,
+            )
+        except StoppedError as stopped:
+            fail(str(stopped))
+            raise typer.Exit(128 + stop.signal) from None
     out.print(
         f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
     )
+
+
+class _StopRequest:
+    """Ctrl-C and batch systems stop a training between two iterations, with its state stored.
+
+    A second signal, or one before anyone asks whether to stop, acts as it did before.
+    """
+
+    def __init__(self, shown: Monitor) -> None:
+        self.signal = 0
+        self._shown = shown
+        self._asked = False
+        self._before: dict[int, signal._HANDLER] = {}
+
+    def __call__(self) -> bool:
+        """Whether to stop."""
+        self._asked = True
+        return self.signal != 0
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, _frame: FrameType | None) -> None:
+        self.__exit__()
+        if self._asked:
+            self.signal = number
+            self._shown.note("stopping after this iteration; once more to stop at once")
+        else:
+            signal.raise_signal(number)

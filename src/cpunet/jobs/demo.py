@@ -16,7 +16,7 @@ from cpunet.jobs.stand import write_stand
 from cpunet.jobs.stand_plan import Kind, StandPlan
 from cpunet.jobs.train import train_run
 from cpunet.jobs.validate import validate_run
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import Recipe, TrainingConfig
 from cpunet.simulation.geometry import Detector
 
 QUIET = Monitor()
@@ -81,7 +81,19 @@ def demonstrate(
         write_stand(plan, stand, monitor=monitor)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     if not run.exists():
-        train_run(sim, data, run, recipe, peak=_PEAK, seed=seed, device=device, monitor=monitor)
+        train_run(
+            sim,
+            data,
+            run,
+            recipe,
+            peak=_PEAK,
+            seed=seed,
+            device=device,
+            # what was begun and not ended goes on, but for --force
+            resume=isinstance(recipe.training, TrainingConfig) and not force,
+            force=force,
+            monitor=monitor,
+        )
     return validate_run(
         run,
         sim,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import chain
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +71,23 @@ class Step:
         self.schedules = [
             LambdaLR(o, self._rate_factor) for o in (self.generators, *self.discriminators)
         ]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of optimisers and schedules; the networks have their own."""
+        return {
+            "optimisers": [o.state_dict() for o in (self.generators, *self.discriminators)],
+            "schedules": [schedule.state_dict() for schedule in self.schedules],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where a step of the same settings was."""
+        optimisers = (self.generators, *self.discriminators)
+        for optimiser, own in zip(optimisers, state["optimisers"], strict=True):
+            # a file knows names only, the optimisers count their parameters
+            by_number = {int(number): value for number, value in own["state"].items()}
+            optimiser.load_state_dict(own | {"state": by_number})
+        for schedule, own in zip(self.schedules, state["schedules"], strict=True):
+            schedule.load_state_dict(own)
 
     def _rate_factor(self, iteration: int) -> float:
         """Constant, then linear to zero at the end (paper, section 3.4.2)."""

@@ -1,10 +1,12 @@
-"""The training loop: deal, step, log, and stop when a loss is no longer a number."""
+"""The training loop: deal, step, log, keep, and stop when a loss is no longer a number."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import Recipe, TrainingConfig
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.sampling import Deck
 from cpunet.training.start import match_skips
@@ -20,6 +22,35 @@ from cpunet.training.statistics import refresh_batch_statistics
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
+State = dict[str, Any]  # dicts and lists of tensors, numbers and text; has "iteration"
+
+
+class StoppedError(CpunetError):
+    """A training ended early because it was asked to; its state was handed over before."""
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """How a training outlives its process.
+
+    Parameters
+    ----------
+    save
+        Given the state every ``checkpoint_interval`` iterations, after the last one and
+        before a stop, always after the listener has had all records before it.  The
+        tensors go on changing once it returns.
+    start
+        A state to go on from.
+    stop
+        Asked after each iteration whether to stop there.
+    """
+
+    save: Callable[[State], None]
+    start: State | None = None
+    stop: Callable[[], bool] = lambda: False
+
+
+NOTHING_KEPT = Keeping(lambda _state: None)
 
 
 def train(
@@ -30,10 +61,12 @@ def train(
     seed: int,
     device: str = "cpu",
     listener: Listener | None = None,
+    keeping: Keeping = NOTHING_KEPT,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
-    The same seed on the same machine gives the same weights.
+    The same seed on the same machine gives the same weights, whether the training was
+    interrupted and went on or not.
 
     Parameters
     ----------
@@ -46,13 +79,17 @@ def train(
     device
         ``"cpu"`` or ``"cuda"``.
     listener
-        Called every ``log_interval`` iterations with the records since the last
-        call: ``{"iteration": i, "rate": r, "losses": {name: value}}``.
+        Called every ``log_interval`` iterations, and before each state is kept, with the
+        records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``.
+    keeping
+        Where the state goes and comes from, and whether to stop.
 
     Raises
     ------
     CpunetError
         If a set is empty or a loss becomes NaN or infinite.
+    StoppedError
+        If `keeping` asked to stop.
     """
     for name, pulses in (("simulated", sim), ("measured", data)):
         if not len(pulses):
@@ -65,38 +102,105 @@ def train(
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
         match_skips(model, decks[0].pulses, decks[1].pulses, recipe.preparation.samples_before)
-        _iterate(model, decks, recipe, listener)
+        training = _Training(model, decks, config, device)
+        if keeping.start is not None:
+            training.load_state_dict(keeping.start)
+        try:
+            _iterate(training, listener, keeping)
+        except _DivergenceError as error:
+            raise CpunetError(
+                f"training diverged: {error} (seed {seed}); lower the learning rates or change "
+                "the seed, and begin again"
+            ) from error
+        training.take_averages()
         refresh_batch_statistics(model.ren, decks[0], config.statistics_batches)
         refresh_batch_statistics(model.iren, decks[1], config.statistics_batches)
     return model.eval()
 
 
-def _iterate(
-    model: CycleGan, decks: list[Deck], recipe: Recipe, listener: Listener | None
-) -> None:
-    config = recipe.cyclegan.training
-    step = Step(model, config)
-    average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
-    averages = [
-        AveragedModel(network, multi_avg_fn=average) for network in (model.ren, model.iren)
-    ]
-    pending: list[tuple[int, float, dict[str, Tensor]]] = []
-    for iteration in range(config.iterations):
-        rate = float(step.schedules[0].get_last_lr()[0])
-        losses = step(iteration, decks[0].deal(), decks[1].deal())
-        for averaged, network in zip(averages, (model.ren, model.iren), strict=True):
+class _DivergenceError(Exception):
+    """Something is no number any more; the message says what and when."""
+
+
+class _Training:
+    """All that changes from iteration to iteration."""
+
+    def __init__(
+        self, model: CycleGan, decks: list[Deck], config: TrainingConfig, device: str
+    ) -> None:
+        self.model, self.decks, self.config = model, decks, config
+        self.device = torch.device(device)
+        self.step = Step(model, config)
+        average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
+        self.generators = (model.ren, model.iren)
+        self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
+        self.iteration = 0  # how many are done
+
+    def advance(self) -> tuple[int, float, dict[str, Tensor]]:
+        """Do an iteration; return its number, learning rate and losses."""
+        iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
+        losses = self.step(iteration, self.decks[0].deal(), self.decks[1].deal())
+        for averaged, network in zip(self.averages, self.generators, strict=True):
             averaged.update_parameters(network)
-        pending.append((iteration, rate, losses))
-        last = iteration + 1 == config.iterations
+        self.iteration += 1
+        return iteration, rate, losses
+
+    def take_averages(self) -> None:
+        """Give the generators their averaged weights."""
+        for averaged, network in zip(self.averages, self.generators, strict=True):
+            network.load_state_dict(averaged.module.state_dict())
+
+    def state_dict(self) -> State:
+        """Return all that the next iterations depend on, but the pulses and the settings."""
+        random = {"cpu": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
+        return {
+            "iteration": self.iteration,
+            "model": self.model.state_dict(),
+            "averages": [averaged.state_dict() for averaged in self.averages],
+            "step": self.step.state_dict(),
+            "decks": [deck.state_dict() for deck in self.decks],
+            "random": random,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on where a training of the same pulses and settings was."""
+        self.iteration = state["iteration"]
+        self.model.load_state_dict(state["model"])
+        for averaged, own in zip(self.averages, state["averages"], strict=True):
+            averaged.load_state_dict(own)
+        self.step.load_state_dict(state["step"])
+        for deck, own in zip(self.decks, state["decks"], strict=True):
+            deck.load_state_dict(own)
+        torch.set_rng_state(state["random"]["cpu"])
+        if self.device.type == "cuda" and "cuda" in state["random"]:
+            torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
+
+
+def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -> None:
+    config = training.config
+    pending: list[tuple[int, float, dict[str, Tensor]]] = []
+    while training.iteration < config.iterations:
+        pending.append(training.advance())
+        done = training.iteration
+        last = done == config.iterations
+        stop = keeping.stop() and not last
+        keep = last or stop or done % config.checkpoint_interval == 0
         # values are fetched in bunches: each fetch makes a GPU wait
-        if last or len(pending) == config.log_interval:
+        if keep or len(pending) == config.log_interval:
             records = [_record(*entry) for entry in pending]
             pending.clear()
             _require_finite(records)
             if listener is not None:
                 listener(records)
-    for averaged, network in zip(averages, (model.ren, model.iren), strict=True):
-        network.load_state_dict(averaged.module.state_dict())
+        if keep:
+            _require_finite_weights(training)
+            keeping.save(training.state_dict())
+        if stop:
+            raise StoppedError(
+                f"stopped after {done} of {config.iterations} iterations; go on with --resume"
+            )
 
 
 def _record(iteration: int, rate: float, losses: dict[str, Tensor]) -> Record:
@@ -113,10 +217,16 @@ def _require_finite(records: list[Record]) -> None:
         assert isinstance(losses, dict)
         for name, value in losses.items():
             if not math.isfinite(value):
-                raise CpunetError(
-                    f"training diverged: {name} is {value} in iteration "
-                    f"{record['iteration']}; lower the learning rates or change the seed"
-                )
+                raise _DivergenceError(f"{name} is {value} in iteration {record['iteration']}")
+
+
+def _require_finite_weights(training: _Training) -> None:
+    """Keep no state that can only diverge: a loss is one iteration behind its weights."""
+    for name, value in training.model.state_dict().items():
+        if not bool(torch.isfinite(value).all()):
+            raise _DivergenceError(
+                f"{name} is not finite after iteration {training.iteration - 1}"
+            )
 
 
 def _deck_seeds(seed: int) -> Iterator[int]:

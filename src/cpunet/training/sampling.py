@@ -29,6 +29,15 @@ class Deck:
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the cards not yet dealt and the state of the random numbers."""
+        return {"order": self._order.clone(), "random": self._random.get_state()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on dealing where a deck of the same pulses was."""
+        self._order = state["order"]
+        self._random.set_state(state["random"])
+
     def deal(self) -> Tensor:
         """Return the next batch, shape (batch, 1, samples)."""
         n = len(self.pulses)

@@ -1,0 +1,279 @@
+"""A training on its way: ``RUN.unfinished`` beside the run folder that it becomes.
+
+``unfinished.json``
+    Recipe, seed and pulses, for whoever looks in; locked by the process that trains.
+``losses.jsonl``
+    The log of the losses, cut to the checkpoint's iteration when a training goes on.
+``checkpoint.safetensors``, ``checkpoint.previous.safetensors``
+    See `cpunet.training.checkpoints`.
+
+The folder is visible, so that nobody wonders where a day of GPU time went.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside, refuse_existing, require_replaceable
+from cpunet.training.checkpoints import (
+    CHECKPOINT,
+    PREVIOUS,
+    Checkpoint,
+    differences,
+    has_checkpoint,
+    read_checkpoints,
+    remove_checkpoints,
+    require_same,
+    write_checkpoint,
+)
+from cpunet.training.loop import Record, State
+from cpunet.training.run_folder import INFO, LOSSES
+
+MARKER = "unfinished.json"
+_NOT_KEPT = (MARKER, CHECKPOINT, PREVIOUS, ".*")
+
+
+@contextmanager
+def unfinished_folder(
+    out: Path, *, resume: bool = False, force: bool = False
+) -> Iterator[Path]:
+    """Give ``OUT.unfinished`` to work in; what is there at the end becomes `out`.
+
+    On an exception the folder stays if there is a checkpoint in it.
+
+    Parameters
+    ----------
+    out
+        The run folder to be.
+    resume
+        Whether an unfinished training may be there; it is left for `UnfinishedRun` to go
+        on with.
+    force
+        Replace an existing run folder, and begin anew where an unfinished one is.
+
+    Raises
+    ------
+    CpunetError
+        If `out` exists and may not be replaced, an unfinished training is there and is
+        neither to go on nor to be replaced, another process works on it, or the folder
+        cannot be written to.
+    """
+    out = Path(out)
+    refuse_existing(out, force=force)
+    require_replaceable(out, marker=INFO)
+    folder = out.parent / f"{out.name}.unfinished"
+    require_replaceable(folder, marker=MARKER)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder):
+            if has_checkpoint(folder) and not (resume or force):
+                raise CpunetError(
+                    f"{folder}: an unfinished training; go on with --resume, or begin again "
+                    "with --force"
+                )
+            finished = False
+            try:
+                yield folder
+                _put_in_place(folder, out, force=force)
+                finished = True
+            finally:
+                if finished or not has_checkpoint(folder):
+                    shutil.rmtree(folder, ignore_errors=True)
+    except OSError as error:
+        raise CpunetError(
+            f"{folder}: cannot be written ({error.strerror or error}); what is stored is kept, "
+            "go on with --resume"
+        ) from error
+
+
+def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
+    # a copy: until it is in its place, the folder is all that a resumed training needs
+    ignore = shutil.ignore_patterns(*_NOT_KEPT)
+    try:
+        with folder_written_aside(out, marker=INFO, force=force) as whole:
+            shutil.copytree(folder, whole, ignore=ignore, dirs_exist_ok=True)
+    except CpunetError as error:
+        raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out; the system takes the lock back however this one ends."""
+    with (folder / MARKER).open("a") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise CpunetError(
+                f"{folder}: another process is training there; wait for it, or choose "
+                "another --out"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+
+
+class UnfinishedRun:
+    """Log and checkpoints of a training in its folder.
+
+    Parameters
+    ----------
+    folder
+        From `unfinished_folder`.
+    fingerprint
+        What determines the weights, for `require_same`.
+    environment
+        What may change their last bits: device, threads, version.
+    note
+        Told of what the user should know.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        fingerprint: dict[str, Any],
+        environment: dict[str, Any],
+        note: Callable[[str], None],
+    ) -> None:
+        self.folder = folder
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
+        self.resumed_at: list[int] = []
+        self._fingerprint, self._environment = fingerprint, environment
+        self._note = note
+        self._log = LossLog(folder)
+        self._seconds_before = 0.0
+        self._clock = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time taken so far, without what was lost and the pauses between."""
+        return self._seconds_before + time.perf_counter() - self._clock
+
+    def begin(self, *, resume: bool) -> State | None:
+        """Clear the folder, or find the state to go on from (None if there is none).
+
+        Raises
+        ------
+        CpunetError
+            If the training was begun otherwise, or all its checkpoints are damaged.
+        """
+        checkpoint = self._latest() if resume else None
+        if checkpoint is None:
+            if resume:
+                self._note("no checkpoint to go on from; beginning at the beginning")
+            remove_checkpoints(self.folder)
+            self._log.cut(0)
+        else:
+            self._take_up(checkpoint)
+        told = {"started": self.started} | self._fingerprint | self._environment
+        (self.folder / MARKER).write_text(json.dumps(told, indent=2) + "\n")
+        return None if checkpoint is None else checkpoint.state
+
+    def log(self, records: Iterable[Record]) -> None:
+        """Add training records to the log; if the disk is full, they wait for a later call."""
+        self._log.add(records)
+        with suppress(OSError):  # `save` tells of it
+            self._log.write()
+
+    def save(self, state: State) -> None:
+        """Store a checkpoint; if it cannot be, say so and keep the one before."""
+        facts = {
+            "fingerprint": self._fingerprint,
+            "environment": self._environment,
+            "started": self.started,
+            "seconds": self.seconds,
+            "resumed_at": self.resumed_at,
+        }
+        try:
+            facts["log_bytes"] = self._log.write(sync=True)
+            write_checkpoint(self.folder, Checkpoint(state, facts))
+        except OSError as error:
+            self._note(
+                f"warning: {self.folder}: no checkpoint after {state['iteration']} iterations "
+                f"({error.strerror or error}); the one before is kept"
+            )
+
+    def finish(self) -> None:
+        """Write what is left of the log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        self._log.write(sync=True)
+
+    def _latest(self) -> Checkpoint | None:
+        damaged = 0
+        for checkpoint in read_checkpoints(self.folder):
+            if checkpoint is None or checkpoint.facts["log_bytes"] > self._log.length:
+                damaged += 1
+                continue
+            if damaged:
+                self._note(
+                    f"warning: {self.folder / CHECKPOINT}: damaged; going on from the previous "
+                    f"one, after {checkpoint.state['iteration']} iterations"
+                )
+            return checkpoint
+        if damaged:
+            raise CpunetError(
+                f"{self.folder}: no checkpoint is whole; begin again with --force"
+            )
+        return None
+
+    def _take_up(self, checkpoint: Checkpoint) -> None:
+        facts, iteration = checkpoint.facts, checkpoint.state["iteration"]
+        require_same(facts["fingerprint"], self._fingerprint)
+        for difference in differences(facts["environment"], self._environment):
+            self._note(f"warning: resumed elsewhere: {difference}; the last bits may differ")
+        self.started, self._seconds_before = facts["started"], facts["seconds"]
+        self.resumed_at = [*facts["resumed_at"], iteration]
+        self._log.cut(facts["log_bytes"])
+        self._note(f"going on after {iteration} iterations")
+
+
+class LossLog:
+    """``losses.jsonl``, of which nothing is lost or doubled when a write fails halfway."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / LOSSES
+        self.length = self._path.stat().st_size if self._path.exists() else 0
+        self._waiting: list[str] = []
+
+    def cut(self, length: int) -> None:
+        """Drop all beyond `length` bytes."""
+        with self._path.open("ab") as stream:
+            stream.truncate(length)
+        self.length = length
+
+    def add(self, records: Iterable[Record]) -> None:
+        """Take records, one line each, for the next `write`."""
+        self._waiting += (json.dumps(record) + "\n" for record in records)
+
+    def write(self, *, sync: bool = False) -> int:
+        """Write what waits; return the length in bytes.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; the next call writes it in the same place.
+        """
+        content = "".join(self._waiting).encode()
+        with self._path.open("r+b") as stream:
+            stream.seek(self.length)
+            stream.write(content)
+            stream.flush()
+            if sync:
+                os.fsync(stream.fileno())
+        self.length += len(content)
+        self._waiting.clear()
+        return self.length
