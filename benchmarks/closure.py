@@ -17,9 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.evaluation import evaluate
 from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train import train_run
-from cpunet.jobs.validate import validate_run
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -32,10 +33,18 @@ def scores_of(
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
-        run, report = Path(folder) / "run", Path(folder) / "report"
+        run = Path(folder) / "run"
         train_run(sim, data, run, load_recipe(recipe, overrides), seed=seed)
-        known = truth if truth.exists() else None
-        return validate_run(run, sim, data, report, truth=known, rivals=rivals, seed=seed)
+        return evaluate(
+            run,
+            sim,
+            data,
+            truth=truth if truth.exists() else None,
+            rivals=rivals,
+            seed=seed,
+            device="auto",
+            monitor=Monitor(),
+        ).metrics
 
 
 def summarise(title: str, runs: list[dict[str, Any]]) -> Table:

@@ -15,9 +15,9 @@ from cpunet.analysis.comparisons import compare, data_axis
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.recipes.schema import ScoreConfig
+from cpunet.recipes import load_recipe
 
-SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 LOSSES = [name for panel in figures.LOSS_PANELS.values() for name in panel]
 
 

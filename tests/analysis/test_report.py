@@ -12,10 +12,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import compare
+from cpunet.analysis.nested_tables import nested_html
 from cpunet.analysis.report import write_report
-from cpunet.recipes.schema import ScoreConfig
+from cpunet.analysis.views import distributions, method_looks
+from cpunet.recipes import load_recipe
 
-SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 VOID = {"meta", "img", "link", "br"}
 
 
@@ -96,14 +98,14 @@ def test_page_stands_alone(report):
     html = (report / "report.html").read_text()
     own = re.sub(r"base64,[^\"]*", "", html)
     assert not re.search(r"https?:|//[a-z]|url\(|@import|<script", own)
+    assert "default-src 'none'" in html
     checker = Checker()
     checker.feed(html)
     assert checker.open == []
-    assert len(checker.addresses) == 2
+    images = [a for a in checker.addresses if not a.startswith("#")]
+    assert len(images) == 2
     png = (report / "SEP_drift_time.png").read_bytes()
-    embedded = [
-        base64.b64decode(a.removeprefix("data:image/png;base64,")) for a in checker.addresses
-    ]
+    embedded = [base64.b64decode(a.removeprefix("data:image/png;base64,")) for a in images]
     assert png in embedded
 
 
@@ -148,3 +150,101 @@ def test_pulses_that_cannot_be_prepared_are_counted_on_the_page(tmp_path):
     peaks = {"SEP": {"n_sim": 9, "n_data": 9, "parameters": {}, "not_prepared": {"ren": 7}}}
     write_report(tmp_path, {"peaks": peaks}, {}, [])
     assert "REN translation: 7." in (tmp_path / "report.html").read_text()
+
+
+def views() -> dict:
+    rng = np.random.default_rng(0)
+    values = {m: {"drift_time": rng.normal(1000, 10, 200)} for m in ("data", "raw", "ren")}
+    return {
+        "methods": method_looks(values),
+        "distributions": distributions({"SEP</script>": values}, {}),
+    }
+
+
+def test_views_are_embedded_as_data_that_cannot_end_their_element(tmp_path):
+    write_report(tmp_path, metrics(), {}, [], views())
+    html = (tmp_path / "report.html").read_text()
+    checker = Checker()
+    checker.feed(html)
+    assert checker.open == []
+    data = re.search(r'id="view-data">(.*?)</script>', html)
+    assert data
+    assert json.loads(data[1]) == views()
+    assert not re.search(r"https?:|url\((?!#)|@import", html)
+
+
+def test_views_that_are_missing_are_said_to_be(tmp_path):
+    write_report(tmp_path, metrics(), {}, [])
+    bare = (tmp_path / "report.html").read_text()
+    assert "without the data of the interactive views" in bare
+    assert "<script" not in bare
+    write_report(tmp_path, metrics(), {}, [], views())
+    html = (tmp_path / "report.html").read_text()
+    assert html.count("this report has no data of this view") == 3
+    assert html.count('<div id="view-') == 1
+
+
+def test_distances_have_errors_and_what_chance_leaves(tmp_path):
+    found = {
+        "iou": {"ren": 80.0, "ceiling": 85.0},
+        "iou_std": {"ren": 2.0, "ceiling": 1.5},
+        "wasserstein": {"ren": 12.345},
+        "wasserstein_std": {"ren": 1.2},
+        "wasserstein_null": 9.0,
+        "wasserstein_null_std": 2.1,
+        "ks": {"ren": 0.0512},
+        "ks_std": {"ren": 0.011},
+        "ks_null": 0.04,
+        "ks_null_std": None,
+    }
+    peak = {"n_sim": 9, "n_data": 9, "parameters": {"drift_time": found, "rise_10_90": found}}
+    write_report(tmp_path, {"peaks": {"SEP": peak}}, {}, [])
+    html = (tmp_path / "report.html").read_text()
+    for text in (">12.3 ± 1.2<", ">0.051 ± 0.011<", ">9.0 ± 2.1<", ">0.04<"):
+        assert html.count(text) == 2
+    assert "<td>Drift time [ns]</td>" in html
+    assert "<summary>Further parameters: 1</summary>" in html
+
+
+def test_verdicts_in_words(tmp_path):
+    one = {"SEP": {"ren": {"drift_time": {"sigma": 3.14, "words": "off by 3.1 sigma"}}}}
+    verdicts = {"summary": ["REN, SEP: <all> agree"], "table": one}
+    write_report(tmp_path, {"verdicts": verdicts}, {}, [])
+    html = (tmp_path / "report.html").read_text()
+    assert "<li>REN, SEP: &lt;all&gt; agree</li>" in html
+    row = r"<td>SEP</td><td[^>]*>REN translation</td><td[^>]*>drift time</td><td>\+3\.1</td>"
+    assert re.search(row, html)
+
+
+def test_many_figures_are_folded(tmp_path):
+    write_report(tmp_path, {}, {f"figure {i}": figure() for i in range(5)}, [])
+    html = (tmp_path / "report.html").read_text()
+    assert "5 figures, also as PNG beside this page</summary>" in html
+
+
+def test_any_nesting_becomes_tables():
+    html = nested_html(
+        {
+            "edges_ns": [100.0, 200.0],
+            "power": list(range(30)),
+            "SEP": {
+                "ren": {"rms": 0.0123, "rms_std": 0.001, "fits": True},
+                "raw": {"rms": 0.5, "rms_std": 0.1, "more": None},
+            },
+            "slices": {"ren": [{"n": 4, "rms": 1.5}, {"n": 1, "missing": "1 <pulse>"}]},
+            "FEP": {"missing": "no pulses"},
+        }
+    )
+    for text in (
+        "<td>100, 200</td>",
+        "<td>30 values from 0 to 29</td>",
+        "<h4>SEP</h4>",
+        "<td>REN translation</td><td>0.0123 ± 0.0010</td><td>yes</td><td>–</td>",
+        "<td>Simulation</td><td>0.50 ± 0.10</td><td>–</td><td>–</td>",
+        "<td>2</td><td>1</td><td>–</td><td>1 &lt;pulse&gt;</td>",
+        "<p>Missing: no pulses.</p>",
+    ):
+        assert text in html
+    checker = Checker()
+    checker.feed(html)
+    assert checker.open == []

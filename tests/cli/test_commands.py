@@ -169,7 +169,8 @@ def test_metrics_have_their_schema(report, trained):
     assert set(metrics["peaks"]) == {"SEP", "DEP", "FEP"}
     for scores in metrics["peaks"].values():
         counts = {"n_sim", "n_data", "not_prepared"}
-        assert counts | {"parameters", "paired", "two_sample"} == set(scores)
+        compared = {"parameters", "further", "noise", "paired", "two_sample"}
+        assert counts | compared == set(scores)
         assert all(0 < n <= 24 for n in scores["not_prepared"].values())
         assert scores["n_sim"] == 24
         assert 18 <= scores["n_data"] <= 24
@@ -292,3 +293,22 @@ def test_existing_output_is_refused_and_with_force_replaced(
     else:
         assert "old" not in listing(out)
         assert (out / marker).stat().st_size > 0
+
+
+def test_figures_one_by_one(command, trained, stand, tmp_path):
+    words = ("figure", trained, *stand.inputs, "--no-rivals", "--out", tmp_path, "--format")
+    outcome = command(*words, "svg", "spectrum", "SEP single_pulse")
+    assert outcome.code == 0
+    assert listing(tmp_path) == ["SEP_single_pulse.svg", "spectrum.svg"]
+    again = command(*words, "svg", "spectrum")
+    assert again.code == 2
+    assert "exists already" in again.err
+    assert command("figure", trained, "losses", "--out", tmp_path).code == 0
+
+
+def test_figures_that_there_are_not(command, trained, stand, tmp_path):
+    outcome = command("figure", trained, "spectrum", "--out", tmp_path)
+    assert "give --sim and --data" in outcome.err
+    outcome = command("figure", trained, "nonsense", *stand.inputs, "--no-rivals")
+    assert "no figure 'nonsense'; there are: spectrum, " in " ".join(outcome.err.split())
+    assert command("figure", trained, "losses", "--format", "bmp").code == 2

@@ -130,7 +130,7 @@ def test_measured_pulses_given_as_simulated_ones_are_doubted(files):
 
 
 def test_sets_of_different_sampling(sim_set, files):
-    other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"))
+    other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev)
     require_same_sampling(sim_set, sim_set)
     with pytest.raises(CpunetError) as error:
         require_same_sampling(sim_set, other)

@@ -19,7 +19,8 @@ from cpunet.pulses.parameters import (
     pulse_parameters,
     tail_slope,
 )
-from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import PreparationConfig
 
 DT_NS = 16.0
 TIME = np.arange(800.0)
@@ -36,7 +37,7 @@ PREPARATION = PreparationConfig(
     max_padding_after=0,
     saturation_run=4,
 )
-SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 
 
 def multi_site(n: int, noise: float, seed: int) -> np.ndarray:

@@ -20,7 +20,8 @@ from cpunet.pulses.shape_parameters import (
     TIME_POINTS,
     all_parameters,
 )
-from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import PreparationConfig
 
 DT_NS = 16.0
 TIME = np.arange(800.0)
@@ -38,7 +39,7 @@ PREPARATION = PreparationConfig(
     max_padding_after=0,
     saturation_run=4,
 )
-SCORES = ScoreConfig(max_bins=49, bootstraps=10, drift_start_fraction=0.01, edge_samples=100)
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 
 
 def parameters_of(waveforms: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,20 +8,45 @@ with itself, resampled at the sizes of both sets.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TypedDict
 
 import hist
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.analysis.distances import (
+    distance_errors,
+    kolmogorov_smirnov,
+    null_distances,
+    resampled,
+    wasserstein,
+)
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import ScoreConfig
 
 Values = npt.NDArray[np.float64]
-Comparison = dict[str, dict[str, float | None]]
+ByMethod = dict[str, float | None]
 
 # Tukey's far-out fence: wide enough for both peaks of an escape line's I_max, and
 # up to a quarter of the events may be outliers without moving it.
 FENCE = 3.0
+
+
+class Comparison(TypedDict):
+    """What `compare` says of one parameter."""
+
+    iou: ByMethod
+    iou_std: ByMethod
+    wasserstein: ByMethod
+    wasserstein_std: ByMethod
+    wasserstein_null: float | None
+    wasserstein_null_std: float | None
+    ks: ByMethod
+    ks_std: ByMethod
+    ks_null: float | None
+    ks_null_std: float | None
+    missing: dict[str, int]
+    axis: ByMethod
 
 
 def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
@@ -131,7 +156,7 @@ def ceiling(
     """
     rng = np.random.default_rng(seed)
     counts = histogram(data, axis)
-    scores = _overlap(*(_resampled(counts, n, bootstraps, rng) for n in (n_sim, n_data)))
+    scores = _overlap(*(resampled(counts, n, bootstraps, rng) for n in (n_sim, n_data)))
     return float(scores.mean()), float(scores.std())
 
 
@@ -142,35 +167,13 @@ def iou_error(
     bootstraps: int,
     seed: int | np.random.Generator,
 ) -> float:
-    """Standard deviation, in percent, of `iou` under resampling of both sets."""
+    """Standard deviation, in percent, of `iou` under resampling of both sets.
+
+    Near the ceiling it is a sixth larger than the scatter of fresh samples.
+    """
     rng = np.random.default_rng(seed)
-    drawn = (_resampled(histogram(v, axis), len(v), bootstraps, rng) for v in (a, b))
+    drawn = (resampled(histogram(v, axis), len(v), bootstraps, rng) for v in (a, b))
     return float(_overlap(*drawn).std())
-
-
-def wasserstein(a: Values, b: Values) -> float:
-    """Wasserstein-1 distance of the finite values, in the parameter's own unit.
-
-    NaN if a set has no finite values.
-    """
-    from scipy.stats import wasserstein_distance
-
-    a, b = a[np.isfinite(a)], b[np.isfinite(b)]
-    return float(wasserstein_distance(a, b)) if a.size and b.size else float("nan")
-
-
-def kolmogorov_smirnov(a: Values, b: Values) -> float:
-    """Largest difference of the cumulative distributions of the finite values, 0 … 1.
-
-    NaN if a set has no finite values.
-    """
-    from scipy.stats import ks_2samp
-
-    a, b = a[np.isfinite(a)], b[np.isfinite(b)]
-    # "asymp": the statistic is the same, and its exact p-value is not needed
-    return (
-        float(ks_2samp(a, b, method="asymp").statistic) if a.size and b.size else float("nan")
-    )
 
 
 def compare(
@@ -200,8 +203,13 @@ def compare(
         ``iou``, ``iou_std``
             percent, by method and for the ``ceiling``.  The ceiling is that of the
             largest of the simulated sets.
-        ``wasserstein``, ``ks``
-            of the finite values, by method; in the parameter's unit, and 0 … 1.
+        ``wasserstein``, ``ks``, ``wasserstein_std``, ``ks_std``
+            of the finite values, by method; in the parameter's unit, and 0 … 1.  The
+            errors are spreads over bootstraps of both sets.
+        ``wasserstein_null``, ``ks_null``, ``wasserstein_null_std``, ``ks_null_std``
+            one number each: what two samples of the data's own distribution have, on
+            average and as spread, at the sizes of the data and of the largest of the
+            simulated sets.
         ``missing``
             how many values are NaN, by method and for the ``data``.
         ``axis``
@@ -212,30 +220,57 @@ def compare(
     CpunetError
         If a method lacks a parameter of the data.
     """
-    rng = np.random.default_rng(seed)
+    # each has its own, so that neither changes the other's numbers
+    rng, distance_rng = (np.random.default_rng(s) for s in (seed, (seed, 1)))
     for method, values in methods.items():
         if absent := data.keys() - values.keys():
             raise CpunetError(f"{method}: parameter {min(absent)} is missing; compute it too")
     return {
-        name: _compare_one(values, {m: p[name] for m, p in methods.items()}, scores, rng)
+        name: _compare_one(
+            values, {m: p[name] for m, p in methods.items()}, scores, rng, distance_rng
+        )
         for name, values in data.items()
     }
 
 
 def _compare_one(
-    data: Values, methods: Mapping[str, Values], scores: ScoreConfig, rng: np.random.Generator
+    data: Values,
+    methods: Mapping[str, Values],
+    scores: ScoreConfig,
+    rng: np.random.Generator,
+    distance_rng: np.random.Generator,
 ) -> Comparison:
-    sets = {"data": data, **methods}
-    result: Comparison = {
-        "iou": dict.fromkeys([*methods, "ceiling"]),
-        "iou_std": dict.fromkeys([*methods, "ceiling"]),
-        "wasserstein": {m: _or_none(wasserstein(data, v)) for m, v in methods.items()},
-        "ks": {m: _or_none(kolmogorov_smirnov(data, v)) for m, v in methods.items()},
-        "missing": {m: int(np.isnan(v).sum()) for m, v in sets.items()},
-        "axis": dict.fromkeys(("low", "high", "bins")),
-    }
-    if not np.isfinite(data).any():
-        return result
+    draws = scores.bootstraps
+    errors = {m: distance_errors(data, v, draws, distance_rng) for m, v in methods.items()}
+    n_sim = max((int(np.isfinite(v).sum()) for v in methods.values()), default=0)
+    null = null_distances(data, n_sim, int(np.isfinite(data).sum()), draws, distance_rng)
+    result = Comparison(
+        iou=dict.fromkeys([*methods, "ceiling"]),
+        iou_std=dict.fromkeys([*methods, "ceiling"]),
+        wasserstein={m: _or_none(wasserstein(data, v)) for m, v in methods.items()},
+        wasserstein_std={m: _or_none(w1) for m, (w1, _) in errors.items()},
+        wasserstein_null=_or_none(null.wasserstein),
+        wasserstein_null_std=_or_none(null.wasserstein_std),
+        ks={m: _or_none(kolmogorov_smirnov(data, v)) for m, v in methods.items()},
+        ks_std={m: _or_none(ks) for m, (_, ks) in errors.items()},
+        ks_null=_or_none(null.ks),
+        ks_null_std=_or_none(null.ks_std),
+        missing={m: int(np.isnan(v).sum()) for m, v in {"data": data, **methods}.items()},
+        axis=dict.fromkeys(("low", "high", "bins")),
+    )
+    if np.isfinite(data).any():
+        _add_overlap(result, data, methods, scores, rng)
+    return result
+
+
+def _add_overlap(
+    result: Comparison,
+    data: Values,
+    methods: Mapping[str, Values],
+    scores: ScoreConfig,
+    rng: np.random.Generator,
+) -> None:
+    """Fill in what depends on the binning."""
     axis = data_axis(data, scores.max_bins)
     for method, values in methods.items():
         result["iou"][method] = _or_none(iou(data, values, axis))
@@ -247,7 +282,6 @@ def _compare_one(
     result["iou"]["ceiling"], result["iou_std"]["ceiling"] = _or_none(mean), _or_none(std)
     low, high = axis.edges[[0, -1]].tolist()
     result["axis"] = {"low": low, "high": high, "bins": axis.size}
-    return result
 
 
 def _overlap(a: Values, b: Values) -> Values:
@@ -256,13 +290,6 @@ def _overlap(a: Values, b: Values) -> Values:
     with np.errstate(invalid="ignore"):
         a, b = a / sums[0], b / sums[1]
     return np.asarray(100 * np.minimum(a, b).sum(axis=-1) / np.maximum(a, b).sum(axis=-1))
-
-
-def _resampled(counts: Values, size: int, draws: int, rng: np.random.Generator) -> Values:
-    """Histograms of `draws` bootstrap samples: a bootstrap's counts are multinomial."""
-    if not counts.sum():
-        return np.zeros((draws, len(counts)))
-    return rng.multinomial(size, counts / counts.sum(), size=draws).astype(float)
 
 
 def _or_none(value: float) -> float | None:

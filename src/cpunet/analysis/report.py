@@ -1,6 +1,7 @@
 """The validation's outcome as files: ``metrics.json``, figures, one page to read.
 
-The page needs nothing but itself: figures are embedded, and no request leaves it.
+The page needs nothing but itself: figures, data and script are embedded, and its content
+security policy lets no request leave it.
 """
 
 from __future__ import annotations
@@ -20,13 +21,52 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.analysis.style import label
-from cpunet.pulses.parameters import PARAMETERS
+from cpunet.analysis.nested_tables import nested_html
+from cpunet.analysis.report_tables import (
+    gap,
+    pairs_table,
+    peak_html,
+    survival_html,
+    verdicts_html,
+)
 
 METRICS = "metrics.json"
 DPI = 150
 WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
-NO_VALUE = "–"
+MANY = 4  # figures, from which on they are folded away
+
+SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
+
+# what the views are called, and what is said of each
+VIEWS = {
+    "distributions": (
+        "Parameter distributions",
+        "In the bins in which they are scored, with the data's statistical errors; below, the "
+        "pull of each bin: method less data in standard deviations of both. The frame is "
+        "fitted without the raw simulation's points. The IoU beside the data is the ceiling.",
+    ),
+    "slices": (
+        "Mean pulses by drift time",
+        "Pulses aligned at half maximum and averaged within slices of drift time; below, the "
+        "differences from the data's, with the standard error of each mean as a band and that "
+        "of the data in grey about zero. Errors of neighbouring samples are correlated.",
+    ),
+    "pulses": (
+        "Single pulses",
+        "The same simulated event by every method, without noise, aligned at half maximum.",
+    ),
+    "scatter": (
+        "Current amplitude and drift time",
+        "One point a pulse; of larger sets a part, drawn at random.",
+    ),
+}
+# parts of the metrics that are shown as they are
+DETAILS = {
+    "ae_details": "A/E in detail",
+    "drift_slices": "Slices of drift time",
+    "linearity": "Linearity",
+    "noise": "Noise",
+}
 
 
 def write_report(
@@ -34,6 +74,7 @@ def write_report(
     metrics: Mapping[str, Any],
     figures: Mapping[str, Figure],
     notes: Sequence[str],
+    views: Mapping[str, Any] | None = None,
 ) -> None:
     """Write ``metrics.json``, a PNG per figure and ``report.html`` into a folder.
 
@@ -46,12 +87,19 @@ def write_report(
         ``parameters`` (the result of `comparisons.compare`), ``two_sample`` (the classifier
         test by method) and, if the truth is known, ``paired`` (by method, the
         result of `paired.paired_scores`), or ``missing``: why it is not scored;
+        ``verdicts``: ``summary``, a list of sentences, and ``table``, by peak, method and
+        quantity its ``sigma`` and ``words``; ``ae_survival``; ``ae_details``,
+        ``drift_slices``, ``linearity``, ``noise``: any nesting, shown as tables;
         ``training``: how the network was trained; ``rejections``: counts by reason,
         possibly nested.  Numbers that are not finite are written as ``null``.
     figures
         Figures by name; the names become file names and captions.
     notes
         Paragraphs of plain text for the top of the page.
+    views
+        Data of the interactive charts, as `views` makes them: ``methods`` (see
+        `views.method_looks`), ``distributions``, ``slices``, ``pulses``, ``scatter``; any of
+        them may be missing.  Without, the page has its figures only.
     """
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
@@ -61,140 +109,77 @@ def write_report(
         png = _png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
         drawn.append(_figure_html(name, figure, png))
-    page = Template(files("cpunet.analysis").joinpath("report.html").read_text("utf-8"))
-    html = page.substitute(
+    judged = metrics.get("verdicts", {}).get("table", {})
+    views = _json_ready(views or {})
+    html = Template(_asset("page.html")).substitute(
+        css=_asset("page.css"),
         notes="\n".join(f"<p>{escape(note)}</p>" for note in notes),
-        scores="\n".join(_peak_html(n, p) for n, p in metrics.get("peaks", {}).items()),
-        survival=_survival_html(metrics.get("ae_survival", {})),
-        figures="\n".join(drawn),
-        rejections=_pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
-        training=_pairs_table(metrics.get("training", {}), ("Setting", "Value")),
+        verdicts=verdicts_html(metrics.get("verdicts")),
+        scores="\n".join(
+            peak_html(name, scores, judged.get(name))
+            for name, scores in metrics.get("peaks", {}).items()
+        )
+        or gap("no peak was scored"),
+        views=_views_html(views),
+        survival=survival_html(metrics.get("ae_survival", {})),
+        details=_details_html(metrics),
+        figures=_gallery(drawn),
+        rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
+        training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
+        script=_script(views),
     )
     (folder / "report.html").write_text(html, encoding="utf-8")
 
 
-def _peak_html(peak: str, scores: Mapping[str, Any]) -> str:
-    """One peak: its numbers of events and its two tables."""
-    parts = [
-        f"<h3>{escape(peak)}: {_number(scores.get('n_sim'))} simulated, "
-        f"{_number(scores.get('n_data'))} measured pulses</h3>",
-        f"<p>Not scored: {escape(scores['missing'])}.</p>"
-        if "missing" in scores
-        else _parameter_table(scores.get("parameters", {})),
-    ]
-    if scores.get("not_prepared"):
-        counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
-        parts.append(
-            "<p>Simulated pulses left out because they cannot be prepared as data are once "
-            f"they are translated: {escape('; '.join(counts))}.</p>"
-        )
-    if scores.get("two_sample"):
-        parts.append(_two_sample_table(scores["two_sample"]))
-    if scores.get("paired"):
-        parts.append(_paired_table(scores["paired"]))
+def _asset(name: str) -> str:
+    return files("cpunet.analysis").joinpath("page", name).read_text("utf-8")
+
+
+def _views_html(views: Mapping[str, Any]) -> str:
+    """Where the script draws, or why it does not."""
+    if not any(views.get(name) for name in VIEWS):
+        return gap("this report was written without the data of the interactive views")
+    parts = ["<noscript><p>The views need JavaScript; the figures do not.</p></noscript>"]
+    for name, (title, about) in VIEWS.items():
+        parts.append(f"<h3>{title}</h3>")
+        if views.get(name):
+            parts.append(f'<p class="about">{about}</p>\n<div id="view-{name}"></div>')
+        else:
+            parts.append(gap("this report has no data of this view"))
     return "\n".join(parts)
 
 
-def _parameter_table(parameters: Mapping[str, Any]) -> str:
-    """One row per parameter and method, and one with the ceiling."""
-    rows = []
-    for name, values in parameters.items():
-        unit = PARAMETERS[name].unit if name in PARAMETERS else ""
-        iou, error = values["iou"], values.get("iou_std", {})
-        title = name.replace("_", " ").capitalize()
-        for method, distance in values["wasserstein"].items():
-            rows.append(
-                [
-                    title,
-                    label(method),
-                    _percent(iou.get(method), error.get(method)),
-                    f"{_number(distance)} {unit}",
-                    _number(values["ks"].get(method)),
-                ]
-            )
-            title = ""
-        ceiling = _percent(iou.get("ceiling"), error.get("ceiling"))
-        rows.append([title, "Ceiling", ceiling, "", ""])
-    return _table(["Parameter", "Method", "IoU [%]", "W₁", "KS"], rows, names=2)
-
-
-def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
-    head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
-    rows = []
-    for method, found in tested.items():
-        if "missing" in found:
-            rows.append([label(method), NO_VALUE, found["missing"]])
-        else:
-            null = f"{_number(found['null_mean'])} ± {_number(found['null_std'])}"
-            auc = f"{_number(found['auc'])} ± {_number(found['auc_std'])}"
-            rows.append([label(method), auc, null])
-    return _table(head, rows)
-
-
-def _survival_html(survival: Mapping[str, Any]) -> str:
-    """Survival of A/E cuts by peak and method."""
-    if not survival:
-        return "<p>None recorded.</p>"
-    if "missing" in survival:
-        return f"<p>Not scored: {escape(survival['missing'])}.</p>"
-    rows = []
-    for peak, found in survival.items():
-        for method, value in found.get("survival", {}).items():
-            rows.append(
-                [
-                    peak,
-                    label(method),
-                    _percent(value, found["survival_std"].get(method)),
-                    _percent(
-                        found["difference"].get(method), found["difference_std"].get(method)
-                    ),
-                    _number(found["sigma"].get(method)),
-                ]
-            )
-    head = ["Peak", "Method", "Survival [%]", "Less data [points]", "In sigma"]
-    return _table(head, rows, names=2)
-
-
-def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
-    head = ["Against the true shapes", "RMSE", "RMSE of the edge"]
-    rows = [
-        [label(method), _number(scores.get("rmse")), _number(scores.get("edge_rmse"))]
-        for method, scores in paired.items()
-    ]
-    return _table(head, rows)
-
-
-def _pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> str:
-    """Names and values; nested names are joined: ``data: saturated``."""
-    rows = [[name, _number(value)] for name, value in _flat(values)]
-    return _table(list(head), rows) if rows else "<p>None recorded.</p>"
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for name, value in values.items():
-        nested = isinstance(value, Mapping)
-        rows += _flat(value, f"{prefix}{name}: ") if nested else [(f"{prefix}{name}", value)]
-    return rows
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], names: int = 1) -> str:
-    """A table whose first columns, as many as `names`, hold words, the others numbers."""
-    # the page aligns numbers, and the first column already as words
-    styles = ["", *[' style="text-align: left"'] * (names - 1), *[""] * (len(head) - names)]
-
-    def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
-        return "".join(
-            f"<{tag}{attribute}{style}>{escape(cell)}</{tag}>"
-            for cell, style in zip(row, styles, strict=True)
-        )
-
-    top = cells("th", head, ' scope="col"')
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+def _script(views: Mapping[str, Any]) -> str:
+    """Return the data and the script that draws them; nothing without data."""
+    if not any(views.get(name) for name in VIEWS):
+        return ""
+    data = json.dumps(views, allow_nan=False, separators=(",", ":"))
+    # within a script element "<" may begin its end, whatever the JSON
+    data = data.replace("<", "\\u003c")
+    code = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
     return (
-        f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody>\n</table></div>"
+        f'<script type="application/json" id="view-data">{data}</script>\n'
+        f'<script>\n(() => {{\n"use strict";\n{code}}})();\n</script>'
     )
+
+
+def _details_html(metrics: Mapping[str, Any]) -> str:
+    """Return the parts of the metrics that are shown as they are, where there are any."""
+    return "\n".join(
+        f"<details><summary>{title}</summary>\n{nested_html(metrics[name])}</details>"
+        for name, title in DETAILS.items()
+        if metrics.get(name)
+    )
+
+
+def _gallery(drawn: Sequence[str]) -> str:
+    if not drawn:
+        return gap("no figures were drawn")
+    gallery = '<div class="figures">\n' + "\n".join(drawn) + "\n</div>"
+    if len(drawn) <= MANY:
+        return gallery
+    title = f"{len(drawn)} figures, also as PNG beside this page"
+    return f"<details><summary>{title}</summary>\n{gallery}\n</details>"
 
 
 def _figure_html(name: str, figure: Figure, png: bytes) -> str:
@@ -231,16 +216,3 @@ def _json_ready(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def _number(value: Any) -> str:
-    """A value as the page shows it: four digits are enough to compare two scores."""
-    if value is None:
-        return NO_VALUE
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _percent(value: float | None, error: float | None) -> str:
-    if value is None:
-        return NO_VALUE
-    return f"{value:.1f}" if error is None else f"{value:.1f} ± {error:.1f}"

@@ -9,9 +9,16 @@ from types import FrameType
 
 import typer
 
+from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
+from cpunet.cli.ensemble import ensemble
+from cpunet.cli.explore import explore
+from cpunet.cli.export import export
 from cpunet.cli.fields import fields
+from cpunet.cli.figure import figure
+from cpunet.cli.import_weights import import_
 from cpunet.cli.info import info
+from cpunet.cli.library import library
 from cpunet.cli.messages import fail
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
@@ -27,8 +34,25 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for command in (demo, simulate, fields, stand, train, translate, validate, response, info):
+for command in (
+    demo,
+    simulate,
+    fields,
+    stand,
+    train,
+    ensemble,
+    translate,
+    validate,
+    compare,
+    response,
+    figure,
+    explore,
+    export,
+    info,
+):
     app.command()(command)
+app.add_typer(library, name="library")
+app.add_typer(import_, name="import")
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.monitor import Monitor
@@ -18,6 +19,8 @@ from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
 from cpunet.recipes.schema import Recipe
+
+Energies = npt.NDArray[np.float64]
 
 LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
@@ -45,11 +48,15 @@ class InputFile:
 
 @dataclass(frozen=True, eq=False)
 class InputSet:
-    """What was made of a file: prepared pulses, and the cuts if it was measured."""
+    """What was made of a file: prepared pulses, and the cuts if it was measured.
+
+    ``energies_kev`` holds the known energies of all its pulses, selected or not.
+    """
 
     prepared: Prepared
     dt_ns: float
     path: Path
+    energies_kev: Energies
     cuts: CutWindows | None = None
 
     def provenance(self) -> dict[str, Any]:
@@ -98,12 +105,18 @@ def _load(
     measured: bool,
 ) -> InputSet:
     source = file.open()
+    seen: list[Energies] = []
+
+    def select(energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        seen.append(np.array(energy_kev, float))
+        return selection.select(energy_kev)
+
     with monitor.stage(f"Preparing {file.path.name}", source.n_pulses) as advance:
         prepared = load_prepared(
             source,
             recipe.preparation,
             "measured" if measured else "simulated",
-            select=selection.select,
+            select=select,
             peaks=lambda energies: label_peaks(energies, recipe.peaks),
             progress=advance,
         )
@@ -125,7 +138,7 @@ def _load(
         f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
         + (f" (left out: {rejected})" if rejected else "")
     )
-    return InputSet(prepared, source.dt_ns, file.path, cuts)
+    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts)
 
 
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:

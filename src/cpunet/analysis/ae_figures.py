@@ -1,0 +1,133 @@
+"""Figures of A/E against the drift time, and of both together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.analysis.style import colours, label, styled
+from cpunet.pulses.parameters import PARAMETERS
+
+AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
+LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
+COLUMNS = 3  # panels beside each other
+
+
+@styled
+def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
+    """Median A/E against drift time with its error, and the range from 16 to 84 %.
+
+    Parameters
+    ----------
+    table
+        Of `ae_details.ae_against_drift_time`.
+    peak
+        Name of the gamma line, for the title.
+    """
+    methods = table["methods"]
+    palette = colours(methods)
+    figure = Figure(figsize=(6.4, 5.4))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    # so that small differences show beside those of an untranslated simulation
+    below.set_yscale("symlog", linthresh=LINEAR)
+    below.yaxis.set_major_formatter("{x:g}")
+    for method, rows in methods.items():
+        known = [row for row in rows if "missing" not in row]
+        time, median, low, high, error = (
+            np.array([row[key] for row in known], float)
+            for key in ("time_ns", "median", "q16", "q84", "median_error")
+        )
+        look = {"color": palette[method], "marker": "o", "markersize": 3.5}
+        above.errorbar(time, median, error, label=label(method), **look)
+        for edge in (low, high):
+            above.plot(time, edge, color=palette[method], linestyle=":", linewidth=1.1)
+        if method != "data":
+            below.errorbar(*_ratio(rows, methods["data"]), **look)
+    below.axhline(0, color="black", linewidth=0.8)
+    above.set(ylabel=AMPLITUDE)
+    below.set(xlabel="Drift time [ns]", ylabel="Median,\nmethod / data − 1 [%]")
+    figure.legend(
+        *above.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=3,
+        title=f"{peak}: median of A/E in bins of the drift time; dotted: 16 and 84 %",
+        alignment="left",
+    )
+    return figure
+
+
+@styled
+def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
+    """Distributions of A/E and drift time together, a panel for each method.
+
+    Parameters
+    ----------
+    table
+        Of `ae_details.two_dimensional`, one that is not missing.
+    peak
+        Name of the gamma line, for the title.
+    """
+    counts = {m: np.array(c, float) for m, c in table["counts"].items()}
+    totals = {m: _total(table, m, c) for m, c in counts.items()}
+    shares = {m: 100 * c / max(totals[m], 1) for m, c in counts.items()}
+    columns = min(COLUMNS, len(shares))
+    rows = -(-len(shares) // columns)
+    figure = Figure(figsize=(0.9 + 3.1 * columns, 0.6 + 2.9 * rows))
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    top = shares["data"].max()
+    for axes, (method, share) in zip(grid.flat, shares.items(), strict=False):
+        drawn = axes.pcolormesh(
+            table["time_edges_ns"],
+            table["amplitude_edges"],
+            np.where(share > 0, share, np.nan),
+            cmap="viridis_r",
+            vmin=0,
+            vmax=top,
+        )
+        axes.grid(visible=False)
+        outside = 100 - share.sum()
+        axes.set_title(f"{label(method)}{_score(table, method)}\n{outside:.1f} % outside")
+    for axes in grid.flat[len(shares) :]:
+        axes.set_axis_off()
+    _label_outer(grid.tolist(), len(shares))
+    figure.colorbar(drawn, ax=grid, label="Events per cell [%]", extend="max")
+    figure.suptitle(f"{peak}: A/E and drift time", x=0.02, ha="left", fontsize=10)
+    return figure
+
+
+def _ratio(rows: list[Any], data: list[Any]) -> tuple[list[float], list[float], list[float]]:
+    """Time, median over that of the data less 1 in percent, and its error."""
+    points: list[tuple[float, float, float]] = []
+    for row, measured in zip(rows, data, strict=True):
+        if "missing" in row or "missing" in measured or not measured["median"]:
+            continue
+        ratio = row["median"] / measured["median"]
+        own = row["median_error"] / measured["median"]
+        other = ratio * measured["median_error"] / measured["median"]
+        points.append((row["time_ns"], 100 * (ratio - 1), 100 * float(np.hypot(own, other))))
+    return [p[0] for p in points], [p[1] for p in points], [p[2] for p in points]
+
+
+def _total(table: Mapping[str, Any], method: str, counts: np.ndarray[Any, Any]) -> float:
+    undefined, outside = table["undefined"][method], table["outside"][method]
+    return float(counts.sum() + outside + undefined)
+
+
+def _score(table: Mapping[str, Any], method: str) -> str:
+    name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
+    return f", {kind} {table['iou'][name]:.1f} ± {table['iou_std'][name]:.1f} %"
+
+
+def _label_outer(grid: list[list[Axes]], drawn: int) -> None:
+    columns = len(grid[0])
+    for i in range(drawn):
+        axes = grid[i // columns][i % columns]
+        if i % columns == 0:
+            axes.set_ylabel(AMPLITUDE)
+        if i + columns >= drawn:
+            axes.set_xlabel("Drift time [ns]")
+            axes.tick_params(labelbottom=True)

@@ -1,0 +1,174 @@
+"""How far two distributions of a parameter are apart, and how far they are by chance.
+
+The Wasserstein-1 (W1) and Kolmogorov–Smirnov (KS) distances of two finite samples of the
+*same* distribution are not zero, so each comes with its null: the distance of two
+samples that are drawn from the data themselves.
+
+Distances between the sets themselves are exact.  Those of their bootstraps are computed all at
+once on a common grid: the pooled values' quantiles, with each of the outermost values in
+a bin of its own.  The events of a bin stand at its mean, and a bootstrap's counts are
+multinomial.  With 256 bins and thousands of events, W1 is right within a twentieth of
+its null and KS within 0.004; sets of fewer values than bins are treated exactly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Values = npt.NDArray[np.float64]
+
+NODES = 256  # bins of a bootstrapped error: the spread is that of a finer grid
+# A null's mean is compared with exact values, and on a grid the KS distance is too small:
+# by about 4 % with 256 bins, by 1 % with these.
+NULL_NODES = 4096
+
+
+class NullDistances(NamedTuple):
+    """Distances of two samples of one distribution: mean and standard deviation."""
+
+    wasserstein: float
+    wasserstein_std: float
+    ks: float
+    ks_std: float
+
+
+def wasserstein(a: Values, b: Values) -> float:
+    """Wasserstein-1 distance of the finite values, in the parameter's own unit.
+
+    NaN if a set has no finite values.
+    """
+    from scipy.stats import wasserstein_distance
+
+    a, b = _finite(a), _finite(b)
+    return float(wasserstein_distance(a, b)) if a.size and b.size else float("nan")
+
+
+def kolmogorov_smirnov(a: Values, b: Values) -> float:
+    """Largest difference of the cumulative distributions of the finite values, 0 … 1.
+
+    NaN if a set has no finite values.
+    """
+    a, b = np.sort(_finite(a)), np.sort(_finite(b))
+    if not (a.size and b.size):
+        return float("nan")
+    everywhere = np.concatenate([a, b])
+    below = [np.searchsorted(v, everywhere, side="right") / v.size for v in (a, b)]
+    return float(np.abs(below[0] - below[1]).max())
+
+
+def distance_errors(
+    a: Values, b: Values, bootstraps: int, seed: int | np.random.Generator
+) -> tuple[float, float]:
+    """Standard deviations of W1 and KS under resampling of the finite values of both sets.
+
+    Well above the null they are the scatter of fresh samples, within a tenth.  Near it
+    they are a fifth too large, as a bootstrap adds its own scatter to the samples', and
+    `null_distances` has the scale.
+
+    Returns
+    -------
+    tuple of float
+        In the parameter's unit, and of the KS distance; NaN if a set has no finite values.
+    """
+    a, b = _finite(a), _finite(b)
+    if not (a.size and b.size):
+        return float("nan"), float("nan")
+    rng = np.random.default_rng(seed)
+    upper, positions = _grid(np.concatenate([a, b]), NODES)
+    drawn = [resampled(_counts(v, upper), v.size, bootstraps, rng) for v in (a, b)]
+    w1, ks = _distances(drawn[0], drawn[1], positions)
+    return float(w1.std()), float(ks.std())
+
+
+def null_distances(
+    data: Values,
+    n_sim: int,
+    n_data: int,
+    bootstraps: int,
+    seed: int | np.random.Generator,
+) -> NullDistances:
+    """W1 and KS of the data with themselves: what a perfect translation would have.
+
+    Two sets are drawn from the data's finite values with replacement, one as large as
+    the simulated set and one as large as the measured one, again and again.  Both
+    distances scatter with a tail upwards: of two samples of one distribution, 4 … 7 % are
+    further apart than two standard deviations above the mean.
+
+    Returns
+    -------
+    NullDistances
+        NaN if the data have no finite values or a set is empty.
+    """
+    finite = _finite(data)
+    if not (finite.size and n_sim and n_data):
+        return NullDistances(*[float("nan")] * 4)
+    rng = np.random.default_rng(seed)
+    upper, positions = _grid(finite, NULL_NODES)
+    counts = _counts(finite, upper)
+    drawn = [resampled(counts, n, bootstraps, rng) for n in (n_sim, n_data)]
+    w1, ks = _distances(drawn[0], drawn[1], positions)
+    return NullDistances(*(float(x) for x in (w1.mean(), w1.std(), ks.mean(), ks.std())))
+
+
+def resampled(counts: Values, size: int, draws: int, rng: np.random.Generator) -> Values:
+    """Histograms of `draws` bootstrap samples: a bootstrap's counts are multinomial.
+
+    Parameters
+    ----------
+    counts
+        Events by bin of the set that is resampled.
+    size
+        Events of each bootstrap sample.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape ``(draws, bins)``; all 0 if the set is empty.
+    """
+    bins, total = len(counts), int(counts.sum())
+    if not total:
+        return np.zeros((draws, bins))
+    if size > 2 * bins:
+        return rng.multinomial(size, counts / total, size=draws).astype(float)
+    # with few events a bin, drawing events is faster than drawing the bins' counts
+    bin_of_event = np.repeat(np.arange(bins), counts.astype(int))
+    drawn = bin_of_event[rng.integers(total, size=(draws, size))]
+    drawn += bins * np.arange(draws)[:, np.newaxis]
+    drawn_counts = np.bincount(drawn.ravel(), minlength=draws * bins)
+    return drawn_counts.reshape(draws, bins).astype(float)
+
+
+def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
+    """Upper edges of bins that hold every value, and the mean of the values in each.
+
+    The outermost values have bins of their own: a few far out can be most of W1.
+    """
+    pooled = np.sort(pooled)
+    n, tail = len(pooled), nodes // 8
+    if n > nodes:
+        bulk = np.linspace(tail, n - 1 - tail, nodes - 2 * tail).round().astype(int)
+        pooled_upper = pooled[np.r_[0:tail, bulk, n - tail : n]]
+    else:
+        pooled_upper = pooled
+    upper = np.unique(pooled_upper)
+    first = np.searchsorted(pooled, upper[:-1], side="right")
+    starts = np.r_[0, first]
+    return upper, np.add.reduceat(pooled, starts) / np.diff(np.r_[starts, n])
+
+
+def _counts(values: Values, upper: Values) -> Values:
+    return np.bincount(np.searchsorted(upper, values), minlength=len(upper)).astype(float)
+
+
+def _distances(a: Values, b: Values, positions: Values) -> tuple[Values, Values]:
+    """W1 and KS of histograms along the last axis whose events stand at `positions`."""
+    sums = [h.sum(axis=-1, keepdims=True) for h in (a, b)]
+    apart = np.abs(np.cumsum(a / sums[0] - b / sums[1], axis=-1))
+    return np.asarray(apart[..., :-1] @ np.diff(positions)), np.asarray(apart.max(axis=-1))
+
+
+def _finite(values: Values) -> Values:
+    return values[np.isfinite(values)]

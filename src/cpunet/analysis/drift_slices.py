@@ -1,0 +1,298 @@
+"""Mean pulses of slices in drift time: where in the detector a translation is wrong.
+
+Pulses of one slice come from the same places of the detector, and differ by their
+sites and by noise; their mean, aligned at half maximum, is the slice's superpulse.
+Its standard error is known, so a difference between simulation and data can be told
+from chance.
+
+The slices are bounded by quantiles of the *data's* times, and each method is sliced by its
+own: one with the wrong response has other events in a slice, which is its fault as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+
+SLICES = 4
+FEWEST = 10  # pulses of a slice, below which the error of its mean is not known
+EDGE_SAMPLES = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Superpulse:
+    """The mean of aligned pulses.
+
+    Attributes
+    ----------
+    mean, error
+        Of shape ``(before + after,)``, in pulse heights; NaN where fewer than 2 pulses are
+        known.  Errors of neighbouring samples are correlated.
+    n
+        Pulses in the mean.
+    """
+
+    mean: Values
+    error: Values
+    n: int
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """The superpulses of a set by time, and how many of its pulses are in none.
+
+    Attributes
+    ----------
+    pulses, edges
+        One for each slice, and the edges between them in ns.
+    before
+        Samples before the crossing of half the maximum.
+    left_out
+        Pulses by reason: ``no_time``, ``outside`` the edges, ``unaligned`` (no crossing).
+    """
+
+    pulses: tuple[Superpulse, ...]
+    edges: Values
+    before: int
+    left_out: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """A method's superpulse less that of the data, with its error, in pulse heights."""
+
+    difference: Values
+    error: Values
+
+    @property
+    def z(self) -> Values:
+        """The difference in units of its error; NaN where there is none."""
+        known = self.error > 0
+        return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
+
+
+def slicing_time(parameters: Mapping[str, Values]) -> Values:
+    """Time from 1 to 90 % of the pulse, which orders pulses by their drift.
+
+    The drift begins where the pulse does, at 1 %.  The paper's drift time ends at the
+    maximum, on a flat top that of the noise, which smears slices; at 90 % the pulse rises.
+
+    Parameters
+    ----------
+    parameters
+        As of `cpunet.pulses.shape_parameters.all_parameters`.
+
+    Returns
+    -------
+    numpy.ndarray
+        In ns, shape ``(n,)``; NaN where a time does not exist.
+
+    Examples
+    --------
+    >>> slicing_time({"t01": np.array([-900.0]), "t90": np.array([-160.0])})
+    array([740.])
+    """
+    return np.asarray(parameters["t90"] - parameters["t01"])
+
+
+def slice_edges(drift_time: Values, slices: int = SLICES) -> Values:
+    """Edges of slices that hold equally many of the data.
+
+    Parameters
+    ----------
+    drift_time
+        Of the measured pulses in ns, best `slicing_time`; NaN and infinity are ignored.
+    slices
+        How many; the edges, in ns, are one more.
+
+    Raises
+    ------
+    CpunetError
+        If there are no slices, or no time is finite.
+
+    Examples
+    --------
+    >>> slice_edges(np.arange(101.0), slices=4)
+    array([  0.,  25.,  50.,  75., 100.])
+    """
+    finite = drift_time[np.isfinite(drift_time)]
+    if slices < 1:
+        raise CpunetError(f"{slices} slices of the drift time; give 1 or more")
+    if not finite.size:
+        raise CpunetError("no measured pulse has a drift time; check the peak's selection")
+    return np.quantile(finite, np.linspace(0, 1, slices + 1))
+
+
+def superpulses(
+    windows: FloatArray, drift_time: Values, edges: Values, before: int, after: int
+) -> Slices:
+    """Mean pulse of each slice, aligned at half maximum.
+
+    Parameters
+    ----------
+    windows
+        Pulses of shape ``(n, length)`` with the baseline at 0.
+    drift_time
+        By which they are sliced, shape ``(n,)``, in ns.
+    edges
+        Of the slices, see `slice_edges`; the last slice includes its upper one.
+    before, after
+        Samples before the crossing of half the maximum, and from it on.
+
+    Raises
+    ------
+    CpunetError
+        If times and pulses are not equally many, or the pulses have no such shape.
+    """
+    if drift_time.shape != (len(windows),):
+        raise CpunetError(
+            f"{len(windows)} pulses beside drift times of shape {drift_time.shape}; "
+            "give one for each"
+        )
+    timed = np.isfinite(drift_time)
+    inside = timed & (drift_time >= edges[0]) & (drift_time <= edges[-1])
+    place = np.searchsorted(edges[1:-1], drift_time, side="right")
+    found, unaligned = [], 0
+    for i in range(len(edges) - 1):
+        aligned = align_half_maximum(windows[inside & (place == i)], before, after)
+        usable = np.isfinite(aligned).any(axis=1)
+        unaligned += int((~usable).sum())
+        found.append(_mean(aligned[usable]))
+    left_out = {
+        "no_time": int((~timed).sum()),
+        "outside": int((timed & ~inside).sum()),
+        "unaligned": unaligned,
+    }
+    return Slices(tuple(found), edges, before, left_out)
+
+
+def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]:
+    """Differences of the superpulses of a method from those of the data.
+
+    Returns
+    -------
+    tuple
+        One for each slice; None where a side has fewer than 10 pulses.
+
+    Raises
+    ------
+    CpunetError
+        If the two were not sliced and cut out alike.
+    """
+    alike = np.array_equal(data.edges, method.edges) and data.before == method.before
+    if not alike or data.pulses[0].mean.shape != method.pulses[0].mean.shape:
+        raise CpunetError(
+            "superpulses of different slices or windows cannot be compared; "
+            "take the data's edges for both"
+        )
+    return tuple(
+        None
+        if min(measured.n, other.n) < FEWEST
+        else Residual(other.mean - measured.mean, np.hypot(other.error, measured.error))
+        for measured, other in zip(data.pulses, method.pulses, strict=True)
+    )
+
+
+def slice_table(
+    sets: Mapping[str, Slices], dt_ns: float, edge_samples: int = EDGE_SAMPLES
+) -> dict[str, Any]:
+    """How far each method's superpulses are from those of the data.
+
+    Parameters
+    ----------
+    sets
+        By method, the measured ones under ``"data"``.
+    dt_ns
+        Sampling period in ns.
+    edge_samples
+        The numbers are those of ``2 * edge_samples + 1`` samples around the crossing.
+
+    Returns
+    -------
+    dict
+        JSON-ready:
+
+        ``edges_ns``
+            of the slices.
+        ``left_out``
+            pulses in no slice, by method and reason.
+        ``slices``
+            by method a list with, for each slice, ``n`` and ``n_data``; ``rms`` of the
+            residual and ``rms_error``, what chance alone would leave, both in percent of
+            full charge; ``largest`` residual in percent and the time of it,
+            ``largest_at_ns``, from the crossing; ``mean_abs_z`` and ``rms_z``, in units of
+            the error (0.80 and 1 if there is no difference).  Or ``missing`` and the
+            reason.
+
+    Raises
+    ------
+    CpunetError
+        If the sets do not fit each other.
+    """
+    data = sets["data"]
+    return {
+        "edges_ns": [float(edge) for edge in data.edges],
+        "left_out": {method: dict(slices.left_out) for method, slices in sets.items()},
+        "slices": {
+            method: _rows(data, slices, dt_ns, edge_samples)
+            for method, slices in sets.items()
+            if method != "data"
+        },
+    }
+
+
+def _mean(aligned: FloatArray) -> Superpulse:
+    known = np.isfinite(aligned)
+    count = known.sum(axis=0)
+    values = np.where(known, aligned, 0.0)
+    mean = values.sum(axis=0) / np.maximum(count, 1)
+    squares = np.where(known, (aligned - mean) ** 2, 0.0).sum(axis=0)
+    error = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
+    enough = count >= 2
+    return Superpulse(
+        np.where(enough, mean, np.nan), np.where(enough, error, np.nan), len(aligned)
+    )
+
+
+def _rows(data: Slices, method: Slices, dt_ns: float, edge_samples: int) -> list[Any]:
+    near = slice(max(data.before - edge_samples, 0), data.before + edge_samples + 1)
+    residuals = slice_residuals(data, method)
+    rows: list[Any] = []
+    for residual, own, measured in zip(residuals, method.pulses, data.pulses, strict=True):
+        counts = {"n": own.n, "n_data": measured.n}
+        if residual is None:
+            few = f"{own.n} pulses beside {measured.n} measured ones"
+            rows.append({**counts, "missing": f"{few} (at least {FEWEST} are needed)"})
+        else:
+            rows.append({**counts, **_numbers(residual, near, data.before, dt_ns)})
+    return rows
+
+
+def _numbers(residual: Residual, near: slice, before: int, dt_ns: float) -> dict[str, Any]:
+    difference, error, z = residual.difference[near], residual.error[near], residual.z[near]
+    known, judged = np.isfinite(difference), np.isfinite(z)
+    if not known.any():
+        return {"missing": "no sample around the crossing is known on both sides"}
+    worst = int(np.nanargmax(np.abs(difference)))
+    return {
+        "rms": 100 * _rms(difference[known]),
+        "rms_error": 100 * _rms(error[known]),
+        "largest": 100 * float(difference[worst]),
+        "largest_at_ns": float((worst + near.start - before) * dt_ns),
+        "mean_abs_z": float(np.abs(z[judged]).mean()) if judged.any() else None,
+        "rms_z": _rms(z[judged]) if judged.any() else None,
+    }
+
+
+def _rms(values: Values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,269 @@
+"""One page to look at a crystal's pulses place by place: ideal, translated, measured.
+
+The page needs nothing but itself: pulses are embedded as 16-bit numbers, and no request
+leaves it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.nearest import Nearest
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.style import COLOURS, LABELS
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import Values, current_amplitude_kernel
+from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.recipes.schema import Recipe
+from cpunet.simulation.geometry import POINT_CONTACT, Detector
+
+Indices = npt.NDArray[np.int64]
+
+EDGE = 150  # samples on both sides of half maximum that are kept one by one
+TAIL_STEP = 4  # of the samples after them, one in so many
+NUMBERS = {
+    "drift_time": ("Drift time", "ns", 1),
+    "current_amplitude": ("Current amplitude", "1/sample", 5),
+    "rise_10_90": ("Rise time 10–90 %", "ns", 1),
+}
+SCRIPTS = ("data", "drawing", "hands")  # parts of the page's program, in order
+_MISSING = -32768
+_FULL = 32000
+_OUTLINE_POINTS = 500  # along the longer side of the crystal
+_MAP_COLOURS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Exploration:
+    """What the page shows.
+
+    Parameters
+    ----------
+    detector
+        For name and outline.
+    recipe
+        Of the runs: preparation and scores.
+    runs
+        Their names.
+    dt_ns
+        Sampling period of all pulses in ns.
+    step_mm
+        Distance of neighbouring places.
+    r_mm, z_mm
+        Places in the crystal, each of shape ``(places,)``.
+    missing
+        Why a place has no pulse, ``""`` where it has one.
+    ideal
+        Prepared simulated windows of the places with a pulse, ``(n, samples)``.
+    translated
+        The same without noise by each run, ``(runs, n, samples)``.
+    measured, nearest
+        Prepared measured pulses and which of them are drawn, if there are any.
+    notes
+        Lines of plain text for the foot of the page.
+    """
+
+    detector: Detector
+    recipe: Recipe
+    runs: tuple[str, ...]
+    dt_ns: float
+    step_mm: float
+    r_mm: Values
+    z_mm: Values
+    missing: tuple[str, ...]
+    ideal: FloatArray
+    translated: FloatArray
+    measured: Pulses | None = None
+    nearest: Nearest | None = None
+    notes: tuple[str, ...] = ()
+
+
+def explorer_page(shown: Exploration) -> str:
+    """The page as HTML.
+
+    Parameters
+    ----------
+    shown
+        Places, pulses and what is known of them.
+    """
+    folder = files("cpunet.analysis")
+    scripts = [(folder / f"explorer_{part}.js").read_text("utf-8") for part in SCRIPTS]
+    # no text in the data can end the element that holds it
+    data = json.dumps(_content(shown), separators=(",", ":"), allow_nan=False)
+    return Template((folder / "explorer.html").read_text("utf-8")).substitute(
+        title=escape(f"Pulses of {shown.detector.name or 'a detector'} by place"),
+        style=(folder / "explorer.css").read_text("utf-8"),
+        script="\n".join(scripts),
+        data=data.replace("<", "\\u003c"),
+    )
+
+
+def _content(shown: Exploration) -> dict[str, Any]:
+    reasons = sorted({reason for reason in shown.missing if reason})
+    kept = np.array([not reason for reason in shown.missing])
+    row = np.where(kept, np.cumsum(kept) - 1, -1)
+    samples = _samples(shown.recipe)
+    return {
+        "detector": shown.detector.name,
+        "runs": shown.runs,
+        "dt_ns": shown.dt_ns,
+        "step_mm": shown.step_mm,
+        "r_mm": _rounded(shown.r_mm, 3),
+        "z_mm": _rounded(shown.z_mm, 3),
+        "row": row.tolist(),
+        "reason": [reasons.index(r) if r else -1 for r in shown.missing],
+        "reasons": reasons,
+        "samples": samples.tolist(),
+        "edge": int((samples < EDGE).sum()),
+        "edge_samples": shown.recipe.scores.edge_samples,
+        "kernel": _rounded(_smoothing(), 7),
+        "names": {name: [label, unit] for name, (label, unit, _) in NUMBERS.items()},
+        "colours": {name: COLOURS[name] for name in ("raw", "ren", "data", "truth")},
+        "labels": LABELS,
+        "map": _colour_map(),
+        "outline": _outlines(shown.detector),
+        "notes": shown.notes,
+        "ideal": {
+            "wave": _packed(_drawn(shown.ideal, samples)),
+            "numbers": _told(_numbers(shown.ideal, shown)),
+        },
+        "ren": _of_runs(shown, samples),
+        "measured": _measured(shown, samples),
+    }
+
+
+def _samples(recipe: Recipe) -> Indices:
+    """Samples drawn, counted from half maximum: all of the edge, some of the tail."""
+    before, after = recipe.preparation.samples_before, recipe.preparation.samples_after
+    edge = np.arange(-min(EDGE, before), min(EDGE, after))
+    return np.concatenate([edge, np.arange(EDGE, after, TAIL_STEP)])
+
+
+def _drawn(windows: FloatArray, samples: Indices) -> FloatArray:
+    """Windows aligned at half maximum, at the samples that are drawn."""
+    before = -int(samples[0])
+    aligned = align_half_maximum(windows, before, int(samples[-1]) + 1)
+    return aligned[:, samples + before]
+
+
+def _of_runs(shown: Exploration, samples: Indices) -> dict[str, Any]:
+    """The translation and its numbers; of several runs their mean, spread, and the bands."""
+    drawn = np.stack([_drawn(windows, samples) for windows in shown.translated])
+    by_run = [_numbers(windows, shown) for windows in shown.translated]
+    wave = _packed(drawn.mean(axis=0))
+    if len(by_run) == 1:
+        return {"wave": wave, "numbers": _told(by_run[0])}
+    edge = int((samples < EDGE).sum())
+    current = np.stack([_current(waves[:, :edge]) for waves in drawn])
+    # a run without a value leaves the place without one
+    columns = {name: np.stack([numbers[name] for numbers in by_run]) for name in NUMBERS}
+    told: dict[str, Any] = {
+        "wave": wave,
+        "numbers": _told({name: values.mean(axis=0) for name, values in columns.items()}),
+        "spread": _told({n: values.std(axis=0, ddof=1) for n, values in columns.items()}, 2),
+    }
+    for name, values in (("band", drawn), ("current_band", current)):
+        told[name] = [_packed(values.min(axis=0)), _packed(values.max(axis=0))]
+    return told
+
+
+def _measured(shown: Exploration, samples: Indices) -> dict[str, Any] | None:
+    """The measured pulses that are nearest to some place, each once."""
+    if shown.measured is None or shown.nearest is None:
+        return None
+    rows, index = np.unique(shown.nearest.index, return_inverse=True)
+    pulses = shown.measured[rows]
+    return {
+        "wave": _packed(_drawn(pulses.waveforms, samples)),
+        "numbers": _told(_numbers(pulses.waveforms, shown)),
+        "energy_kev": _rounded(pulses.energy_kev, 1),
+        "event_number": pulses.event_number.tolist(),
+        "nearest": index.reshape(shown.nearest.index.shape).tolist(),
+        "rms": [_rounded(rms, 5) for rms in shown.nearest.rms],
+    }
+
+
+def _numbers(windows: FloatArray, shown: Exploration) -> Mapping[str, Values]:
+    pulses = Pulses.of(windows, dt_ns=shown.dt_ns)
+    values = all_parameters(pulses, shown.recipe.preparation, shown.recipe.scores)
+    return {name: values[name] for name in NUMBERS}
+
+
+def _told(numbers: Mapping[str, Values], more_digits: int = 0) -> dict[str, list[float | None]]:
+    return {
+        name: _rounded(numbers[name], digits + more_digits)
+        for name, (_, _, digits) in NUMBERS.items()
+    }
+
+
+def _smoothing() -> Values:
+    """The moving averages of the current amplitude, about the middle of a sample."""
+    weights = current_amplitude_kernel().astype(float)
+    lever = np.arange(weights.shape[1]) - weights.shape[1] // 2
+    return np.asarray(weights[np.abs(weights @ lever).argmin()])
+
+
+def _current(waves: FloatArray) -> FloatArray:
+    """Smoothed rise per sample, halfway between samples; shorter by the smoothing."""
+    kernel = _smoothing()[::-1]
+    rise = np.diff(waves.astype(float), axis=1)
+    return np.stack([np.convolve(one, kernel, "valid") for one in rise]).astype(np.float32)
+
+
+def _packed(values: FloatArray) -> dict[str, Any]:
+    """Samples as 16-bit numbers in base64; `_MISSING` stands for NaN."""
+    top = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+    numbers = np.where(np.isnan(values), _MISSING, np.round(values / top * _FULL))
+    return {
+        "shape": values.shape,
+        "scale": top / _FULL,
+        "data": base64.b64encode(numbers.astype("<i2").tobytes()).decode("ascii"),
+    }
+
+
+def _rounded(values: npt.NDArray[Any], digits: int) -> list[float | None]:
+    return [round(float(v), digits) if np.isfinite(v) else None for v in values]
+
+
+def _colour_map() -> list[str]:
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colour) for colour in colormaps["viridis"](np.linspace(0, 1, _MAP_COLOURS))]
+
+
+def _outlines(detector: Detector) -> dict[str, Any]:
+    """Closed lines (r, z in mm) about crystal, active germanium and point contact."""
+    from matplotlib.figure import Figure
+
+    length, radius = detector.crystal_length, detector.crystal_radius
+    step = max(length, radius) / _OUTLINE_POINTS
+    # nodes half a step off the axis and the face, so that lines run along these
+    r, z = (np.arange(-0.5, side / step + 2) * step for side in (radius, length))
+    rr, zz = np.meshgrid(r, z)
+    within = (rr > 0) & (zz > 0)
+    masks = {
+        "crystal": within & detector.inside(rr, zz),
+        "active": within & detector.active(rr, zz),
+        "contact": within & (detector.region(rr, zz) == POINT_CONTACT),
+    }
+    axes = Figure().subplots()
+    lines = {
+        name: [
+            np.round(line, 2).tolist()
+            for line in axes.contour(r, z, mask.astype(float), [0.5]).allsegs[0]
+        ]
+        for name, mask in masks.items()
+        if mask.any()
+    }
+    return {"radius": radius, "length": length, **lines}

@@ -1,0 +1,258 @@
+"""Whether a translation adds: the translated sum of two pulses against the sum of theirs.
+
+A readout is linear, so the response to an event with two sites is the sum of those to the
+sites.  A network need not be, and a validation on single distributions does not tell.
+
+Two prepared pulses are summed with weights w and 1 − w as they are, aligned at the same
+sample, and the sum is translated.  A translation moves its result to where its maximum
+is, and scales it by its tail: neither move nor height is known.  So the sum's translation
+is compared with ``a T(x1)(t − d1) + b T(x2)(t − d2)`` where the two moves and the two
+heights are those that leave the least squares.  What is left no move or height explains:
+it is 0 for a linear response, and a lower limit for any other, as heights may hide a part
+of what does not add.  With heights in the ratio of w and 1 − w (``shared``) they cannot;
+what is left then includes that a pulse whose charge comes later has decayed less, which
+is linear too: an upper limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.interpolate
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+Translate = Callable[[FloatArray], FloatArray]
+
+PAIRS = 200
+WEIGHTS = (0.2, 0.8)
+EDGE_SAMPLES = 100
+REACH = 32  # samples: the largest move of each part that is tried
+STEPS = 12  # of Gauss and Newton
+SMALLEST = 1e-7  # of a sample: the last step
+
+
+class _Fit(NamedTuple):
+    """One pair: RMS of the residuals, size of the moves, and how well they are known."""
+
+    rms: float
+    edge_rms: float
+    shared_rms: float
+    shared_edge_rms: float
+    move_samples: float
+    ambiguity_samples: float
+
+
+class _Match(NamedTuple):
+    """Moves of the parts, what they leave of the whole, and its derivatives."""
+
+    moves: Values
+    residual: Values
+    jacobian: Values
+
+
+def linearity_residual(
+    translate: Translate,
+    windows: FloatArray,
+    rng: np.random.Generator,
+    pairs: int = PAIRS,
+    *,
+    edge_samples: int = EDGE_SAMPLES,
+) -> dict[str, Any]:
+    """Compare translated sums of pulses with sums of translated pulses.
+
+    Parameters
+    ----------
+    translate
+        Prepared windows ``(n, length)`` to windows of that shape without noise; rows of NaN
+        where it cannot be done.
+    windows
+        Prepared simulated pulses.
+    rng
+        Draws the pairs, of different pulses, and the weights, uniform in 0.2 … 0.8.
+    pairs
+        How many.
+    edge_samples
+        Half-width of the window around the crossing of half the maximum for ``edge_rms``.
+
+    Returns
+    -------
+    dict
+        JSON-ready:
+
+        ``pairs``, ``not_translated``, ``unmatched``
+            pairs compared; left out because a pulse or the sum could not be translated; left
+            out because no move up to 32 samples matches.
+        ``rms``, ``edge_rms``
+            of the residual in units of full charge, over the window and over the edge.
+        ``shared_rms``, ``shared_edge_rms``
+            the same with heights in the ratio of the weights.
+        ``move_samples``
+            size of the moves of the parts (the larger of the two), in samples.
+        ``ambiguity_samples``
+            error of the difference of the two moves if each sample were off by the residual's
+            RMS at random, 64 at most: with parts alike in shape it is large, and harmless.
+
+        The last six are ``{"median": …, "q90": …}`` over pairs.  If no pair is left
+        there is ``missing`` with the reason instead.
+
+    Raises
+    ------
+    CpunetError
+        If there are fewer than 2 pulses, no pair is asked for, or the translation has
+        another shape.
+    """
+    if windows.ndim != 2 or len(windows) < 2 or pairs < 1:
+        raise CpunetError(
+            f"{pairs} pairs of waveforms of shape {windows.shape}; give 2 pulses and a pair "
+            "or more"
+        )
+    first = rng.integers(len(windows), size=pairs)
+    second = (first + rng.integers(1, len(windows), size=pairs)) % len(windows)
+    weight = rng.uniform(*WEIGHTS, size=pairs)[:, np.newaxis]
+    sums = (weight * windows[first] + (1 - weight) * windows[second]).astype(np.float32)
+    parts = _translated(translate, windows[np.union1d(first, second)])
+    where = {int(row): i for i, row in enumerate(np.union1d(first, second))}
+    of_sums = _translated(translate, sums)
+
+    fits: list[_Fit] = []
+    not_translated = unmatched = 0
+    for total, i, j, w in zip(of_sums, first, second, weight[:, 0], strict=True):
+        one, other = parts[where[int(i)]], parts[where[int(j)]]
+        if not all(np.isfinite(pulse).all() for pulse in (total, one, other)):
+            not_translated += 1
+            continue
+        fit = _compare(total, one, other, float(w), edge_samples)
+        if fit is None:
+            unmatched += 1
+        else:
+            fits.append(fit)
+    return _summary(fits, not_translated, unmatched)
+
+
+def _translated(translate: Translate, windows: FloatArray) -> Values:
+    result = np.asarray(translate(windows), float)
+    if result.shape != windows.shape:
+        raise CpunetError(
+            f"the translation has shape {result.shape} for windows of {windows.shape}; "
+            "return a row for each"
+        )
+    return result
+
+
+def _compare(
+    total: Values, one: Values, other: Values, weight: float, edge_samples: int
+) -> _Fit | None:
+    """Fit moves and heights of both parts to the whole."""
+    inner = np.arange(REACH + 2, len(total) - REACH - 2)  # known whatever the move
+    if len(inner) < 8:
+        return None
+    target = total[inner]
+    start = _best_whole_moves(target, one, other, inner)
+    curves = [scipy.interpolate.CubicSpline(np.arange(len(p)), p) for p in (one, other)]
+    free = _matched(curves, start, np.eye(2), inner, target)
+    if free is None:
+        return None
+    shared = _matched(curves, free.moves, np.array([[weight], [1 - weight]]), inner, target)
+    if shared is None:
+        return None
+    middle = int((target >= 0.5 * target.max()).argmax())
+    near = slice(max(middle - edge_samples, 0), middle + edge_samples + 1)
+    return _Fit(
+        _rms(free.residual),
+        _rms(free.residual[near]),
+        _rms(shared.residual),
+        _rms(shared.residual[near]),
+        float(np.abs(free.moves).max()),
+        _ambiguity(free.jacobian, _rms(free.residual)),
+    )
+
+
+def _matched(
+    curves: list[Any],
+    moves: Values,
+    mixing: Values,
+    inner: npt.NDArray[np.int64],
+    target: Values,
+) -> _Match | None:
+    """Least squares in the moves and in the heights, of which `mixing` makes the parts'."""
+    for _ in range(STEPS):
+        parts, heights, residual = _at(curves, moves, mixing, inner, target)
+        slopes = np.stack(
+            [-c(inner - d, 1) for c, d in zip(curves, moves, strict=True)], axis=1
+        )
+        jacobian = np.hstack([parts @ mixing, slopes * (mixing @ heights)])
+        step = np.linalg.lstsq(jacobian, residual, rcond=1e-9)[0][-2:]
+        trial = moves + np.clip(step, -1, 1)
+        if (np.abs(trial) > REACH).any():
+            return None
+        left = _at(curves, trial, mixing, inner, target)[2]
+        # near a kink of the pulse the spline's slope misleads
+        if left @ left > residual @ residual:
+            break
+        moves = trial
+        if np.abs(step).max() < SMALLEST:
+            break
+    return _Match(moves, _at(curves, moves, mixing, inner, target)[2], jacobian)
+
+
+def _best_whole_moves(
+    target: Values, one: Values, other: Values, inner: npt.NDArray[np.int64]
+) -> Values:
+    """The whole samples by which the parts are to be moved, of all within reach."""
+    moves = np.arange(-REACH, REACH + 1)
+    a, b = (pulse[inner - moves[:, np.newaxis]] for pulse in (one, other))
+    aa, bb = (a * a).sum(axis=1)[:, np.newaxis], (b * b).sum(axis=1)[np.newaxis]
+    ab, at, bt = a @ b.T, (a @ target)[:, np.newaxis], (b @ target)[np.newaxis]
+    determinant = aa * bb - ab**2
+    alike = determinant <= 1e-12 * aa * bb  # two equal parts: one of them is enough
+    safe = np.where(alike, 1, determinant)
+    explained = (bb * at**2 - 2 * ab * at * bt + aa * bt**2) / safe
+    explained = np.where(alike, at**2 / aa, explained)
+    i, j = np.unravel_index(int(explained.argmax()), explained.shape)
+    return np.array([moves[i], moves[j]], float)
+
+
+def _at(
+    curves: list[Any],
+    moves: Values,
+    mixing: Values,
+    inner: npt.NDArray[np.int64],
+    target: Values,
+) -> tuple[Values, Values, Values]:
+    """The moved parts, the best heights and what is left of the whole."""
+    columns = [c(inner - d) for c, d in zip(curves, moves, strict=True)]
+    parts: Values = np.stack(columns, axis=1)
+    heights = np.asarray(np.linalg.lstsq(parts @ mixing, target, rcond=1e-9)[0], float)
+    return parts, heights, target - parts @ (mixing @ heights)
+
+
+def _rms(values: Values) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _ambiguity(jacobian: Values, rms: float) -> float:
+    """Error of the difference of the moves, heights and common move being free."""
+    columns = np.column_stack(
+        [jacobian[:, :2], jacobian[:, 2:].sum(axis=1), jacobian[:, 2] - jacobian[:, 3]]
+    )
+    others, wanted = columns[:, :3], 0.5 * columns[:, 3]
+    left = wanted - others @ np.linalg.lstsq(others, wanted, rcond=1e-9)[0]
+    # more than the moves tried would mean nothing
+    return float(min(rms / max(np.sqrt(left @ left), 1e-12), 2 * REACH))
+
+
+def _summary(fits: list[_Fit], not_translated: int, unmatched: int) -> dict[str, Any]:
+    counts = {"pairs": len(fits), "not_translated": not_translated, "unmatched": unmatched}
+    if not fits:
+        return counts | {"missing": "no pair of pulses could be translated and matched"}
+    columns = dict(zip(_Fit._fields, np.array(fits).T, strict=True))
+    return counts | {
+        name: {"median": float(np.median(v)), "q90": float(np.quantile(v, 0.9))}
+        for name, v in columns.items()
+    }

@@ -1,0 +1,166 @@
+"""Tables of the report's page, and any nesting of values as such."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from cpunet.analysis.style import LABELS, NO_NOISE, label
+
+NO_VALUE = "–"
+STD = "_std"  # end of the name of an error
+MOST_DIGITS = 9  # after the decimal point
+LONG = 12  # values, from which on a list is summarised
+BROAD = 6  # columns, from which on a table is turned if it has fewer rows
+
+
+def html_table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    words: frozenset[int] | set[int] = frozenset(),
+) -> str:
+    """Return a table in which the columns `words` are aligned as words, others as numbers."""
+
+    def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
+        # the page aligns the first column as words already
+        return "".join(
+            f"<{tag}{attribute}"
+            + (' style="text-align: left"' if i in words and i else "")
+            + f">{escape(cell)}</{tag}>"
+            for i, cell in enumerate(row)
+        )
+
+    top = cells("th", head, ' scope="col"')
+    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return (
+        f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody>\n</table></div>"
+    )
+
+
+def nested_html(value: Any, level: int = 4) -> str:
+    """Return any nesting of mappings, lists and values as tables under headings.
+
+    A value's error, of the same name with ``_std``, stands beside it; ``missing`` with a
+    text becomes a sentence; long lists are summarised, `metrics.json` has them in full.
+
+    Parameters
+    ----------
+    value
+        As it comes from ``metrics.json``.
+    level
+        Of the headings, 1 … 6.
+    """
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if value and all(isinstance(item, Mapping) for item in value):
+            return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
+        return f"<p>{escape(_cell(value))}</p>"
+    if not isinstance(value, Mapping):
+        return f"<p>{escape(_cell(value))}</p>"
+    parts = []
+    if isinstance(value.get("missing"), str):
+        parts.append(f"<p>Missing: {escape(value['missing'])}.</p>")
+        value = {name: item for name, item in value.items() if name != "missing"}
+    value = _with_errors(value)
+    plain = {name: item for name, item in value.items() if not _nests(item)}
+    if plain:
+        rows = [[words_of(name), _cell(item)] for name, item in plain.items()]
+        parts.append(html_table(["Quantity", "Value"], rows))
+    deeper = {name: item for name, item in value.items() if name not in plain}
+    flat = {name: item for name, item in deeper.items() if _is_row(item)}
+    if len(flat) > 1:
+        parts.append(_matrix(flat, "Quantity"))
+        deeper = {name: item for name, item in deeper.items() if name not in flat}
+    for name, item in deeper.items():
+        parts.append(f"<h{level}>{escape(words_of(name))}</h{level}>")
+        parts.append(nested_html(item, min(level + 1, 6)))
+    return "\n".join(parts)
+
+
+def number(value: Any) -> str:
+    """Write a value as the page shows it: four digits are enough to compare two scores."""
+    if value is None:
+        return NO_VALUE
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def with_std(value: Any, error: Any) -> str:
+    """Write a value with its error, if it has one, to two digits of that.
+
+    Examples
+    --------
+    >>> with_std(0.52094, 0.0171), with_std(1327.2, 41.0), with_std(0.1, None)
+    ('0.521 ± 0.017', '1327 ± 41', '0.1')
+    """
+    if value is None or error is None:
+        return number(value)
+    digits = max(1 - math.floor(math.log10(error)), 0) if error > 0 else MOST_DIGITS
+    if digits >= MOST_DIGITS:
+        return f"{number(value)} ± {error:.2g}"
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> str:
+    """Return mappings of values side by side: one row each, or one column if that is less."""
+    rows = {name: _with_errors(row) for name, row in rows.items()}
+    names = list(dict.fromkeys(column for row in rows.values() for column in row))
+    if len(names) > BROAD and len(names) > len(rows):
+        turned = {
+            name: {r: row[name] for r, row in rows.items() if name in row} for name in names
+        }
+        rows, names = turned, list(rows)
+    body = [
+        [words_of(name), *(_cell(row[n]) if n in row else NO_VALUE for n in names)]
+        for name, row in rows.items()
+    ]
+    return html_table([corner, *map(words_of, names)], body)
+
+
+def _with_errors(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Join each value with the error of its name, also where both are mappings."""
+    joined: dict[str, Any] = {}
+    for name, value in values.items():
+        if name.endswith(STD) and name.removesuffix(STD) in values:
+            continue
+        error = values.get(name + STD)
+        if isinstance(error, Mapping) and _is_row(value):
+            joined[name] = {k: _join(v, error.get(k)) for k, v in value.items()}
+        else:
+            joined[name] = _join(value, error)
+    return joined
+
+
+def _join(value: Any, error: Any) -> Any:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return with_std(value, error) if number and isinstance(error, (int, float)) else value
+
+
+def _nests(value: Any) -> bool:
+    of_mappings = isinstance(value, list) and any(isinstance(item, Mapping) for item in value)
+    return isinstance(value, Mapping) or of_mappings
+
+
+def _is_row(value: Any) -> bool:
+    return isinstance(value, Mapping) and bool(value) and not any(map(_nests, value.values()))
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        if any(isinstance(item, list) for item in value):
+            return f"{len(value)} rows of values"
+        known = [v for v in value if isinstance(v, (int, float))]
+        if len(value) > LONG and known:
+            return f"{len(value)} values from {number(min(known))} to {number(max(known))}"
+        return ", ".join(map(_cell, value)) or NO_VALUE
+    return number(value)
+
+
+def words_of(name: str) -> str:
+    """Return a key of the metrics as the page writes it."""
+    if name.removesuffix(NO_NOISE) in LABELS:
+        return label(name)
+    return name.replace("_", " ")

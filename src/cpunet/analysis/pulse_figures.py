@@ -1,0 +1,262 @@
+"""Figures of energies and of single pulses, as in the paper (Bhimani et al. 2026).
+
+Which simulated and which measured pulse come from the same place nobody knows; a simulated
+pulse is shown beside the measured one that is nearest to its translation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.style import DATA_FILL, colours, label, styled
+from cpunet.electronics.rivals.superpulses import fitted_tail_slope, without_decay
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+
+BIN_KEV = 2.0
+MOST_BINS = 2000
+BEFORE, AFTER = 100, 150  # samples around the crossing by which the nearest pulse is sought
+LINEAR = 1.0  # percent of full charge, up to which the scale of differences is linear
+ZOOM_NS = (-600.0, 800.0)
+UNDECAYED = "raw"  # the method that has no decay to be corrected for
+TARGETS = ("ren", "truth", "raw")  # to which the measured pulse is to be near, best first
+
+
+@styled
+def spectrum_figure(
+    energy_kev: Mapping[str, Values], peaks: Mapping[str, float], bin_kev: float = BIN_KEV
+) -> Figure:
+    """Energy spectra of both sides, each normalised to one, with the gamma lines marked.
+
+    Parameters
+    ----------
+    energy_kev
+        By method, the measured ones under ``"data"``; ``"raw"`` is the simulation.
+    peaks
+        Energy of each line in keV, by name.
+    bin_kev
+        Width of the bins; wider ones are taken if there would be more than 2000.
+
+    Raises
+    ------
+    CpunetError
+        If no energy is finite, or the width is not above 0.
+    """
+    finite = {m: values[np.isfinite(values)] for m, values in energy_kev.items()}
+    everything = np.concatenate([np.empty(0), *finite.values()])
+    if not everything.size:
+        raise CpunetError("no pulse has an energy to draw; give a calibration")
+    if not bin_kev > 0:
+        raise CpunetError(f"bins of {bin_kev:g} keV; give more than 0")
+    low, high = np.quantile(everything, [0, 1])
+    width = max(bin_kev, (high - low) / MOST_BINS)
+    edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
+    palette = colours(finite)
+    figure = Figure(figsize=(7.5, 4.0))
+    axes = figure.subplots()
+    for method, values in finite.items():
+        is_data = method == "data"
+        counts = np.histogram(values, edges)[0] / max(len(values), 1) / width
+        unknown = len(energy_kev[method]) - len(values)
+        axes.stairs(
+            counts,
+            edges,
+            fill=is_data,
+            facecolor=DATA_FILL if is_data else None,
+            edgecolor="0.5" if is_data else palette[method],
+            linewidth=0.5 if is_data else 1.0,
+            label=f"{label(method)}, n = {len(values)}"
+            + (f", {unknown} without energy" if unknown else ""),
+        )
+    axes.set(yscale="log", xlabel="Energy [keV]", ylabel="Fraction of events per keV")
+    _mark_peaks(axes, peaks, (float(edges[0]), float(edges[-1])))
+    figure.legend(loc="outside upper left", ncols=len(finite))
+    return figure
+
+
+def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
+    """The pulse most like another: least RMS difference, both aligned at half maximum.
+
+    Parameters
+    ----------
+    windows
+        Pulses of shape ``(n, length)`` to choose from.
+    target
+        One pulse, shape ``(length,)``.
+
+    Returns
+    -------
+    tuple
+        Its row, and the RMS difference from 100 samples before the crossing to 150 after, in
+        pulse heights.
+
+    Raises
+    ------
+    CpunetError
+        If the target or all pulses lack a crossing of half the maximum.
+
+    Examples
+    --------
+    >>> time = np.arange(400.0)
+    >>> pulses = np.array([1 / (1 + np.exp((200 - time) / width)) for width in (2, 5, 9)])
+    >>> nearest(pulses, pulses[1])[0]
+    1
+    """
+    wanted = align_half_maximum(target[np.newaxis], BEFORE, AFTER)
+    if not np.isfinite(wanted).any():
+        raise CpunetError("the pulse to compare with never crosses half of its maximum")
+    difference = align_half_maximum(windows, BEFORE, AFTER) - wanted
+    known = np.isfinite(difference)
+    # a pulse of which but a part is in the record would be compared on that part only
+    known[known.sum(axis=1) < np.isfinite(wanted).sum() // 2] = False
+    count = known.sum(axis=1)
+    if not count.any():
+        raise CpunetError("no measured pulse crosses half of its maximum; check the file")
+    squares = np.where(known, difference, 0.0).astype(float) ** 2
+    mean = np.where(count > 0, squares.sum(axis=1) / np.maximum(count, 1), np.inf)
+    row = int(mean.argmin())
+    return row, float(np.sqrt(mean[row]))
+
+
+@styled
+def single_pulse_figure(
+    pulses: Mapping[str, FloatArray],
+    data: FloatArray,
+    dt_ns: float,
+    samples_before: int,
+    title: str = "",
+) -> Figure:
+    """One simulated pulse by every method beside the nearest measured pulse.
+
+    Above as prepared; below corrected for the decay (pole-zero) with the median slope
+    of the measured tails, at unit height, and the differences from the measured pulse, with
+    its noise.  The simulation without electronics has no decay, and is not corrected.
+    All are aligned at half maximum; on the right their edges.
+
+    Parameters
+    ----------
+    pulses
+        The pulse by method, each of shape ``(length,)``: ``"raw"``, ``"rc"``, ``"ren"``, ….
+        Without noise, if it is to be told from the electronics.
+    data
+        Measured windows of shape ``(n, length)``; the one nearest to the ``"ren"`` pulse, or
+        else the ``"truth"`` or the first, is drawn.
+    dt_ns
+        Sampling period in ns.
+    samples_before
+        Sample of the windows' alignment, after which the tail begins.
+    title
+        Above the figure, ``"SEP, event 12"``.
+
+    Raises
+    ------
+    CpunetError
+        If there are no pulses, or one of them or all of the data have no edge or no tail.
+    """
+    if not pulses:
+        raise CpunetError("no pulse to draw; give one by method")
+    target = next((name for name in TARGETS if name in pulses), next(iter(pulses)))
+    row, rms = nearest(data, pulses[target])
+    shown = {"data": data[row]} | dict(pulses)
+    slope = fitted_tail_slope(data, dt_ns, samples_before)
+    windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
+    figure = Figure(figsize=(9.5, 7.6))
+    grid = figure.subplots(3, 2, sharey="row", sharex="col", height_ratios=(4, 4, 3))
+    _draw(list(grid[0]), windows, dt_ns)  # refuses a pulse without an edge
+    corrected = {
+        m: without_decay(w, 0.0 if m == UNDECAYED else slope, dt_ns, samples_before).astype(
+            np.float32
+        )
+        for m, w in windows.items()
+    }
+    _draw(list(grid[1]), corrected, dt_ns)
+    _draw_differences(list(grid[2]), corrected, dt_ns)
+    grid[0, 0].set(ylabel="Pulse height", title="As prepared")
+    grid[0, 1].set(title="Edge", xlim=ZOOM_NS)
+    grid[1, 0].set(ylabel="Pulse height,\nplateau = 1")
+    grid[1, 0].set_title(f"Corrected for a decay of {_decay(slope)}")
+    grid[1, 1].set_title("Edge, corrected")
+    grid[2, 0].set_ylabel("Corrected: method −\ndata pulse [%]")
+    for axes in grid[2]:
+        axes.set_xlabel("Time from half maximum [ns]")
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=len(shown),
+        title=f"{title + ': ' if title else ''}data pulse {row} is nearest to "
+        f"“{label(target)}”, RMS {rms:.4f}",
+        alignment="left",
+    )
+    return figure
+
+
+def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float]) -> None:
+    from matplotlib.transforms import blended_transform_factory
+
+    place = blended_transform_factory(axes.transData, axes.transAxes)
+    inside = sorted((e, name) for name, e in peaks.items() if span[0] <= e <= span[1])
+    previous, level = -np.inf, 0
+    for energy, name in inside:
+        # the names of neighbouring lines are put above each other
+        close = energy - previous < 0.06 * (span[1] - span[0])
+        previous, level = energy, (level + 1) % 3 if close else 0
+        axes.axvline(energy, color="0.5", linewidth=0.9, linestyle=":", zorder=0)
+        axes.text(energy, 1.01 + 0.05 * level, name, transform=place, ha="center", size=8.5)
+
+
+def _draw(panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float) -> None:
+    palette = colours(windows)
+    for method, window in windows.items():
+        time_ns, pulse = _aligned(method, window, dt_ns)
+        # a broad grey line, so that a method which agrees does not hide the data
+        look: dict[str, Any] = (
+            {"color": "0.65", "linewidth": 3.5}
+            if method == "data"
+            else {"color": palette[method], "linewidth": 1.2}
+        )
+        if method == "truth":  # on what agrees with it
+            look["linestyle"] = "--"
+        for axes in panels:
+            axes.plot(time_ns, pulse, label=label(method), **look)
+
+
+def _draw_differences(
+    panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float
+) -> None:
+    palette = colours(windows)
+    time_ns, data = _aligned("data", windows["data"], dt_ns)
+    for method, window in windows.items():
+        if method == "data":
+            continue
+        difference = 100 * (_aligned(method, window, dt_ns)[1] - data)
+        for axes in panels:
+            axes.plot(time_ns, difference, color=palette[method], linewidth=1.0)
+    for axes in panels:
+        axes.axhline(0, color="black", linewidth=0.8)
+    # so that small differences show beside those of an untranslated simulation
+    panels[0].set_yscale("symlog", linthresh=LINEAR)
+    panels[0].yaxis.set_major_formatter("{x:g}")
+
+
+def _aligned(method: str, window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:
+    """Time from the crossing in ns and the pulse, NaN outside its record."""
+    length = window.shape[1]
+    pulse = align_half_maximum(window, length, length)[0]
+    if not np.isfinite(pulse).any():
+        raise CpunetError(
+            f"the pulse of “{label(method)}” never crosses half of its maximum; choose another"
+        )
+    return (np.arange(2 * length) - length) * dt_ns, pulse
+
+
+def _decay(slope_per_ms: float) -> str:
+    return f"{-1e3 / slope_per_ms:.3g} µs" if slope_per_ms else "none"

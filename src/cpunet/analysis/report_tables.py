@@ -1,0 +1,204 @@
+"""Scores as tables of the report's page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from html import escape
+from typing import Any
+
+from cpunet.analysis.nested_tables import NO_VALUE, html_table, number, with_std, words_of
+from cpunet.analysis.style import NO_NOISE, label
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+
+
+def gap(reason: str) -> str:
+    """Return a sentence that says why something is not there."""
+    return f'<p class="gap">None recorded: {escape(reason)}.</p>'
+
+
+def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
+    """Return what the scores say in plain words; nothing if that was not worked out."""
+    if not verdicts:
+        return ""
+    parts = []
+    if verdicts.get("summary"):
+        points = "\n".join(f"<li>{escape(text)}</li>" for text in _texts(verdicts["summary"]))
+        parts.append(f'<ul class="verdicts">\n{points}\n</ul>')
+    if "missing" in verdicts:
+        parts.append(gap(str(verdicts["missing"])))
+    rows = []
+    for peak, methods in verdicts.get("table", {}).items():
+        for method, quantities in methods.items():
+            for quantity, found in quantities.items():
+                sigma = _sigma(found.get("sigma"))
+                rows.append(
+                    [peak, label(method), words_of(quantity), sigma, found.get("words", "")]
+                )
+    if rows:
+        head = ["Peak", "Method", "Quantity", "σ", "In words"]
+        table = html_table(head, rows, words={0, 1, 2, 4})
+        parts.append(f"<details><summary>Each verdict</summary>\n{table}\n</details>")
+    return "\n".join(parts)
+
+
+def peak_html(
+    peak: str, scores: Mapping[str, Any], verdicts: Mapping[str, Any] | None = None
+) -> str:
+    """Return one peak: its numbers of events and its tables.
+
+    `verdicts` are the peak's own, by method and parameter, see `verdicts.verdict_table`.
+    """
+    parameters = scores.get("parameters", {})
+    chief = {name: found for name, found in parameters.items() if name in PARAMETERS}
+    others = {name: found for name, found in parameters.items() if name not in PARAMETERS}
+    others |= scores.get("further", {})
+    parts = [
+        f"<h3>{escape(peak)}: {number(scores.get('n_sim'))} simulated, "
+        f"{number(scores.get('n_data'))} measured pulses</h3>",
+        f"<p>Not scored: {escape(scores['missing'])}.</p>"
+        if "missing" in scores
+        else _parameter_table(chief, _noisy, verdicts),
+    ]
+    if others:
+        parts.append(
+            f"<details><summary>Further parameters: {len(others)}</summary>\n"
+            f"{_parameter_table(others, _noisy, verdicts)}\n</details>"
+        )
+    if any(not _noisy(m) for found in chief.values() for m in found["wasserstein"]):
+        parts.append(
+            "<details><summary>The same without noise</summary>\n"
+            f"{_parameter_table(chief, lambda m: not _noisy(m))}\n</details>"
+        )
+    if scores.get("not_prepared"):
+        counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
+        parts.append(
+            "<p>Simulated pulses left out because they cannot be prepared as data are once "
+            f"they are translated: {escape('; '.join(counts))}.</p>"
+        )
+    if scores.get("two_sample"):
+        parts.append(_two_sample_table(scores["two_sample"]))
+    if scores.get("paired"):
+        parts.append(_paired_table(scores["paired"]))
+    return "\n".join(parts)
+
+
+def survival_html(survival: Mapping[str, Any]) -> str:
+    """Return the survival of A/E cuts by peak and method."""
+    if not survival:
+        return "<p>None recorded.</p>"
+    if "missing" in survival:
+        return f"<p>Not scored: {escape(survival['missing'])}.</p>"
+    rows = []
+    for peak, found in survival.items():
+        title = peak
+        for method, value in found.get("survival", {}).items():
+            if not _noisy(method):
+                continue  # in metrics.json
+            rows.append(
+                [
+                    title,
+                    label(method),
+                    _percent(value, found["survival_std"].get(method)),
+                    _percent(
+                        found["difference"].get(method), found["difference_std"].get(method)
+                    ),
+                    _sigma(found["sigma"].get(method)),
+                ]
+            )
+            title = ""
+    head = ["Peak", "Method", "Survival [%]", "Less data [points]", "In sigma"]
+    return html_table(head, rows, words={0, 1})
+
+
+def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> str:
+    """Return names and values; nested names are joined: ``data: saturated``."""
+    rows = [[name, number(value)] for name, value in _flat(values)]
+    return html_table(list(head), rows) if rows else "<p>None recorded.</p>"
+
+
+def _noisy(method: str) -> bool:
+    return not method.endswith(NO_NOISE)
+
+
+def _parameter_table(
+    parameters: Mapping[str, Any],
+    shown: Callable[[str], bool],
+    verdicts: Mapping[str, Any] | None = None,
+) -> str:
+    """One row per parameter and method shown, and one with the ceiling."""
+    rows = []
+    for name, values in parameters.items():
+        unit = SHAPE_PARAMETERS[name].unit if name in SHAPE_PARAMETERS else ""
+        iou, error = values["iou"], values.get("iou_std", {})
+        title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
+        for method, distance in values["wasserstein"].items():
+            if not shown(method):
+                continue
+            moved = with_std(distance, values.get("wasserstein_std", {}).get(method))
+            apart = with_std(values["ks"].get(method), values.get("ks_std", {}).get(method))
+            score = _percent(iou.get(method), error.get(method))
+            words = (verdicts or {}).get(method, {}).get(name, {}).get("words", "")
+            rows.append([title, label(method), score, moved, apart, words])
+            title = ""
+        ceiling = _percent(iou.get("ceiling"), error.get("ceiling"))
+        moved, apart = (
+            with_std(values[f"{kind}_null"], values.get(f"{kind}_null_std"))
+            if values.get(f"{kind}_null") is not None
+            else ""
+            for kind in ("wasserstein", "ks")
+        )
+        rows.append([title, "Ceiling", ceiling, moved, apart, ""])
+    head = ["Parameter", "Method", "IoU [%]", "W₁", "KS", "Overlap"]
+    if not verdicts:
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    return html_table(head, rows, words={0, 1, 5})
+
+
+def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
+    head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
+    rows = []
+    for method, found in tested.items():
+        if "missing" in found:
+            rows.append([label(method), NO_VALUE, found["missing"]])
+        else:
+            null = with_std(found["null_mean"], found["null_std"])
+            rows.append([label(method), with_std(found["auc"], found["auc_std"]), null])
+    return html_table(head, rows)
+
+
+def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
+    head = ["Against the true shapes", "RMSE", "RMSE of the edge"]
+    rows = [
+        [label(method), number(scores.get("rmse")), number(scores.get("edge_rmse"))]
+        for method, scores in paired.items()
+    ]
+    return html_table(head, rows)
+
+
+def _texts(value: Any) -> list[str]:
+    """Return all texts of a nesting of lists and mappings, in order."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    return (
+        [t for item in value for t in _texts(item)] if isinstance(value, list) else [str(value)]
+    )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for name, value in values.items():
+        nested = isinstance(value, Mapping)
+        rows += _flat(value, f"{prefix}{name}: ") if nested else [(f"{prefix}{name}", value)]
+    return rows
+
+
+def _sigma(value: float | None) -> str:
+    return NO_VALUE if value is None else f"{round(value, 1) + 0.0:+.1f}"
+
+
+def _percent(value: float | None, error: float | None) -> str:
+    if value is None:
+        return NO_VALUE
+    value = round(value, 1) + 0.0  # no negative zero
+    return f"{value:.1f}" if error is None else f"{value:.1f} ± {error:.1f}"

@@ -1,0 +1,229 @@
+"""Scores of several validations as rows of one table, and whether they may be compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cpunet.analysis.verdicts import number, part
+from cpunet.errors import CpunetError
+
+Metrics = Mapping[str, Any]
+
+NO_VALUE = "–"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run's score: its error, and what chance gives with its spread.
+
+    Attributes
+    ----------
+    text
+        The score as it is shown, with error and ceiling.
+    value
+        None where a run has no such score.
+    """
+
+    text: str = NO_VALUE
+    value: float | None = None
+    error: float | None = None
+    expected: float | None = None
+    expected_std: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One score of every run.
+
+    Attributes
+    ----------
+    peak, score
+        Of which peak, and what it is.
+    cells
+        In the order of the runs.
+    best
+        Runs with the best score, by index; empty if fewer than two have one.
+    """
+
+    peak: str
+    score: str
+    cells: tuple[Cell, ...]
+    best: frozenset[int]
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Runs beside each other.
+
+    Attributes
+    ----------
+    names
+        Of the runs.
+    method
+        Whose scores they are.
+    rows
+        Peaks in their order, and the scores of each.
+    notes
+        What makes the comparison doubtful, one sentence each.
+    """
+
+    names: tuple[str, ...]
+    method: str
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+
+
+def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide:
+    """Put the scores of several runs beside each other.
+
+    Parameters
+    ----------
+    runs
+        Content of ``metrics.json`` by the run's name. What one lacks, as older files do,
+        has no value.
+    method
+        Whose scores: ``ren``, ``raw``, a rival, ``truth``.
+
+    Returns
+    -------
+    SideBySide
+        Best is the highest IoU, the AUC closest to that of shuffled labels, the lowest
+        RMSE of the edge, and the smallest difference of A/E survivals.
+
+    Raises
+    ------
+    CpunetError
+        If no run has a score of the method.
+
+    Examples
+    --------
+    >>> iou = lambda value: {"iou": {"ren": value, "ceiling": 90.0}}
+    >>> metrics = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
+    >>> table = side_by_side({"old": metrics(80.0), "new": metrics(85.0)})
+    >>> [cell.text for cell in table.rows[0].cells], table.rows[0].best
+    (['80.0 (90.0)', '85.0 (90.0)'], frozenset({1}))
+    """
+    rows = [
+        row
+        for peak in _union(part(metrics, "peaks") for metrics in runs.values())
+        for row in _peak_rows(peak, list(runs.values()), method)
+    ]
+    if not rows:
+        known = _union(_methods(metrics) for metrics in runs.values())
+        raise CpunetError(
+            f"{', '.join(runs)}: no score of the method {method}; "
+            + (f"there are {', '.join(known)}" if known else "nothing is scored there")
+        )
+    return SideBySide(tuple(runs), method, tuple(rows), tuple(_notes(runs)))
+
+
+def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
+    """Rows of one peak in which any run has a value."""
+    scores = [part(metrics, "peaks", peak) for metrics in runs]
+    rows = []
+    for name in _union(part(s, "parameters") for s in scores):
+        cells = [_overlap(part(s, "parameters", name), method) for s in scores]
+        title = f"{name.replace('_', ' ')}: IoU [%] (ceiling)"
+        rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
+    cells = [_auc(part(s, "two_sample", method)) for s in scores]
+    rows.append(_row(peak, "classifier: AUC", cells, _off))
+    cells = [_edge(part(s, "paired", method)) for s in scores]
+    rows.append(_row(peak, "edge RMSE [0.001]", cells, _off))
+    cells = [_survival(part(metrics, "ae_survival", peak), method) for metrics in runs]
+    rows.append(_row(peak, "A/E survival less data [points]", cells, _off))
+    return [row for row in rows if any(cell.value is not None for cell in row.cells)]
+
+
+def _row(peak: str, score: str, cells: Sequence[Cell], badness: Callable[[Cell], float]) -> Row:
+    known = {i: badness(cell) for i, cell in enumerate(cells) if cell.value is not None}
+    best = min(known.values(), default=0.0)
+    winners = frozenset(i for i, bad in known.items() if bad == best)
+    return Row(peak, score, tuple(cells), winners if len(known) > 1 else frozenset())
+
+
+def _off(cell: Cell) -> float:
+    return abs((cell.value or 0.0) - (cell.expected or 0.0))
+
+
+def _overlap(parameter: Metrics, method: str) -> Cell:
+    value, error = (number(parameter, key, method) for key in ("iou", "iou_std"))
+    ceiling, spread = (number(parameter, key, "ceiling") for key in ("iou", "iou_std"))
+    shown = f" ({ceiling:.1f})" if ceiling is not None else ""
+    return _cell(value, error, ceiling, spread, ".1f", shown)
+
+
+def _auc(tested: Metrics) -> Cell:
+    keys = ("auc", "auc_std", "null_mean", "null_std")
+    value, error, mean, spread = (number(tested, key) for key in keys)
+    return _cell(value, error, 0.5 if mean is None else mean, spread, ".3f")
+
+
+def _edge(paired: Metrics) -> Cell:
+    rmse = number(paired, "edge_rmse")
+    return _cell(None if rmse is None else 1e3 * rmse, None, None, None, ".3g")
+
+
+def _survival(survival: Metrics, method: str) -> Cell:
+    value, error = (number(survival, key, method) for key in ("difference", "difference_std"))
+    return _cell(value, error, 0.0, None, "+.2f")
+
+
+def _cell(
+    value: float | None,
+    error: float | None,
+    expected: float | None,
+    expected_std: float | None,
+    digits: str,
+    appended: str = "",
+) -> Cell:
+    if value is None:
+        return Cell()
+    of_error = f" ± {error:{digits.lstrip('+')}}" if error is not None else ""
+    return Cell(f"{value:{digits}}{of_error}{appended}", value, error, expected, expected_std)
+
+
+def _notes(runs: Mapping[str, Metrics]) -> list[str]:
+    """What says that the runs were not scored on the same pulses."""
+    first, *others = runs
+    notes = []
+    for other in others:
+        apart = _differences(runs[first], runs[other])
+        if apart:
+            notes.append(
+                f"{first} and {other} were scored on different pulses "
+                f"({', '.join(apart)}): their scores differ for that reason, too."
+            )
+    return notes
+
+
+def _differences(one: Metrics, other: Metrics) -> list[str]:
+    peaks = [part(metrics, "peaks") for metrics in (one, other)]
+    apart = ["peaks"] if peaks[0].keys() != peaks[1].keys() else []
+    for key, called in (("n_data", "measured"), ("n_sim", "simulated")):
+        for peak in peaks[0].keys() & peaks[1].keys():
+            counts = [part(p, peak).get(key) for p in peaks]
+            if counts[0] != counts[1]:
+                apart.append(f"number of {called} pulses")
+                break
+    for side, called in (("data", "measured"), ("sim", "simulated")):
+        lost = [part(metrics, "rejections").get(side) for metrics in (one, other)]
+        if lost[0] != lost[1]:
+            apart.append(f"rejections of {called} pulses")
+    return apart
+
+
+def _methods(metrics: Metrics) -> list[str]:
+    found = [
+        parameter_methods
+        for peak in part(metrics, "peaks")
+        for name in part(metrics, "peaks", peak, "parameters")
+        for parameter_methods in part(metrics, "peaks", peak, "parameters", name, "iou")
+    ]
+    return [method for method in dict.fromkeys(found) if method != "ceiling"]
+
+
+def _union(names: Any) -> list[str]:
+    """All names in the order in which they come first."""
+    return list(dict.fromkeys(name for some in names for name in some))

@@ -1,0 +1,92 @@
+"""The superpulses of slices in drift time, and how methods differ from the data in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.analysis.drift_slices import Slices, Values, slice_residuals
+from cpunet.analysis.style import colours, label, styled
+
+LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
+
+
+@styled
+def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
+    """Superpulses above, residuals with their error bands below, a column per slice.
+
+    Parameters
+    ----------
+    sets
+        By method, the measured ones under ``"data"``; drawn over each other in this order.
+    dt_ns
+        Sampling period in ns.
+    peak
+        Name of the gamma line, for the title.
+
+    Raises
+    ------
+    CpunetError
+        If the sets do not fit each other.
+    """
+    data = sets["data"]
+    n = len(data.pulses)
+    figure = Figure(figsize=(2.0 + 2.7 * n, 4.9))
+    grid = figure.subplots(2, n, sharex=True, sharey="row", height_ratios=(3, 2), squeeze=False)
+    time_ns: Values = dt_ns * np.arange(
+        -data.before, len(data.pulses[0].mean) - data.before, dtype=float
+    )
+    palette = colours(sets)
+    for i, axes in enumerate(grid[0]):
+        low, high = data.edges[i : i + 2]
+        axes.set_title(f"{low:.0f} … {high:.0f} ns")
+        for method, slices in sets.items():
+            look = (
+                {"color": "0.65", "linewidth": 4.0}
+                if method == "data"
+                else {"color": palette[method]}
+            )
+            if slices.pulses[i].n:
+                axes.plot(time_ns, slices.pulses[i].mean, label=label(method), **look)
+        counts = ", ".join(str(slices.pulses[i].n) for slices in sets.values())
+        axes.text(0.97, 0.03, f"n = {counts}", ha="right", transform=axes.transAxes, size=8)
+    for method, slices in sets.items():
+        if method != "data":
+            _bands(list(grid[1]), time_ns, data, slices, palette[method])
+    _label(figure, grid[0, 0], list(grid[1]), peak)
+    grid[0, 0].set_xlim(time_ns[0], time_ns[-1])
+    return figure
+
+
+def _bands(panels: list[Axes], time_ns: Values, data: Slices, own: Slices, colour: str) -> None:
+    for axes, residual in zip(panels, slice_residuals(data, own), strict=True):
+        if residual is None:
+            continue
+        middle, error = 100 * residual.difference, 100 * residual.error
+        axes.plot(time_ns, middle, color=colour, linewidth=1.0)
+        axes.fill_between(
+            time_ns, middle - error, middle + error, color=colour, alpha=0.3, linewidth=0
+        )
+
+
+def _label(figure: Figure, first: Axes, below: list[Axes], peak: str) -> None:
+    for axes in below:
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set_xlabel("Time from half maximum [ns]")
+    # so that small differences show beside those of an untranslated simulation
+    below[0].set_yscale("symlog", linthresh=LINEAR)
+    below[0].yaxis.set_major_formatter("{x:g}")
+    below[0].set_ylabel("Method − data\n[% of full charge]")
+    first.set_ylabel("Pulse height")
+    handles, names = first.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="outside upper left",
+        ncols=len(names),
+        title=f"{peak}: superpulses in slices of drift time; bands: ±1 standard error",
+        alignment="left",
+    )

@@ -1,0 +1,294 @@
+"""What the scores say in plain words: agrees with the data within errors, or off by N sigma.
+
+A score is compared with what two samples of one distribution would have: the IoU with
+its ceiling, the Wasserstein distance and the classifier's AUC with their nulls, the A/E
+survival with that of the data.  The question is whether chance alone explains a score, so
+the scale is the scatter that chance gives it, the *null's* spread.  The spread of the
+score itself under resampling says how well the score is known; a poor translation's
+would make it look closer to the ceiling than it is.
+
+Of IoU, Wasserstein distance and AUC only one side is worse than chance.  A score on the
+other side, such as an IoU above its ceiling, agrees.  Up to `AGREES` sigma is agreement.
+A perfect translation exceeds it in 2 … 5 % of IoU, 4 … 7 % of Wasserstein distances (which
+scatter with a tail upwards) and 8 % of parameters in either, so that of twenty parameters
+one or two are off by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from cpunet.analysis.style import NO_NOISE, label
+from cpunet.pulses.parameters import PARAMETERS
+
+AGREES = 2.0  # sigma
+TOO_CLOSE = 4.0  # sigma on the good side: no chance, but the same events twice
+LISTED = 5  # quantities that agree by name; more are counted
+BY_CHANCE = 0.08  # of the parameters of a perfect translation are off in IoU or distance
+WITHIN = "agrees within errors"
+
+Worse = Literal["lower", "higher", "both"]
+Words = dict[str, float | str | None]
+
+_SHORT = {"ren": "REN", "iren": "IREN"}
+_W1 = "_wasserstein"
+_AUC, _SURVIVAL = "auc", "ae_survival"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a score is what chance would give, and by how much it is not.
+
+    Attributes
+    ----------
+    sigma
+        Distance from the expected value in units of chance's spread, positive if worse
+        than expected (signed as score less expectation if both sides are); None if there
+        is none.
+    agrees
+        None if there is no value.
+    words
+        The same to be read: ``agrees within errors``, ``off by 3.1 sigma``, or why there
+        is no verdict.
+    """
+
+    sigma: float | None
+    agrees: bool | None
+    words: str
+
+
+def verdict(
+    value: float | None, expected: float | None, spread: float | None, worse: Worse
+) -> Verdict:
+    """Judge one score.
+
+    Parameters
+    ----------
+    value
+        The score.
+    expected, spread
+        Mean and standard deviation of the score for two samples of one distribution, as
+        the ceiling for an IoU.
+    worse
+        Which scores are worse than chance: ``"lower"`` (IoU), ``"higher"`` (a distance,
+        an AUC) or ``"both"`` (a difference).
+
+    Examples
+    --------
+    >>> verdict(83.1, 85.9, 0.9, "lower").words
+    'off by 3.1 sigma'
+    >>> verdict(86.5, 85.9, 0.9, "lower").words
+    'agrees within errors'
+    >>> verdict(None, 85.9, 0.9, "lower").words
+    'no value'
+    """
+    if value is None:
+        return Verdict(None, None, "no value")
+    if expected is None or spread is None:
+        return Verdict(None, None, "nothing to compare with")
+    apart = (expected - value) if worse == "lower" else (value - expected)
+    if spread <= 0:
+        # all events in one bin, say: chance would give one value and no other
+        off = abs(apart) if worse == "both" else apart
+        same = off <= 1e-9 * max(abs(expected), 1.0)
+        return Verdict(0.0, True, WITHIN) if same else Verdict(None, False, "off")
+    sigma = apart / spread
+    if (abs(sigma) if worse == "both" else sigma) > AGREES:
+        return Verdict(sigma, False, f"off by {abs(sigma):.1f} sigma")
+    if worse != "both" and sigma < -TOO_CLOSE:
+        words = f"closer than chance by {-sigma:.1f} sigma: are the same events on both sides?"
+        return Verdict(sigma, True, words)
+    return Verdict(sigma, True, WITHIN)
+
+
+def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[str, Verdict]:
+    """Verdicts on one method at one peak, by quantity.
+
+    Parameters
+    ----------
+    metrics
+        The content of ``metrics.json``; what older files lack is not judged, and the
+        verdict says so.
+
+    Returns
+    -------
+    dict
+        For each parameter, under its name, its IoU against the ceiling, and, with
+        ``_wasserstein`` after the name, its distance against the null; ``auc``: the
+        classifier against its null; ``ae_survival``: the difference to the data, of
+        peaks other than that from which the cut comes.
+    """
+    found: dict[str, Verdict] = {}
+    scores = part(metrics, "peaks", peak)
+    for name in part(scores, "parameters"):
+        one = part(scores, "parameters", name)
+        found[name] = verdict(
+            number(one, "iou", method),
+            number(one, "iou", "ceiling"),
+            number(one, "iou_std", "ceiling"),
+            "lower",
+        )
+        found[name + _W1] = verdict(
+            number(one, "wasserstein", method),
+            number(one, "wasserstein_null"),
+            number(one, "wasserstein_null_std"),
+            "higher",
+        )
+    tested = part(scores, "two_sample", method)
+    if tested:
+        auc, mean, std = (number(tested, key) for key in ("auc", "null_mean", "null_std"))
+        found[_AUC] = _with_reason(verdict(auc, mean, std, "higher"), tested.get("missing"))
+    survival = part(metrics, "ae_survival", peak)
+    if "difference" in survival:
+        off, std = (number(survival, k, method) for k in ("difference", "difference_std"))
+        reason = "too few events of the double-escape peak, or none of this one"
+        found[_SURVIVAL] = _with_reason(verdict(off, 0.0, std, "both"), reason)
+    return found
+
+
+def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Words]]]:
+    """Verdicts on all methods, ready for JSON.
+
+    Methods without noise are left out: the noise alone makes them differ.
+
+    Parameters
+    ----------
+    metrics
+        The content of ``metrics.json``.
+
+    Returns
+    -------
+    dict
+        ``{"sigma": …, "words": …}`` by peak, method and quantity, see `method_verdicts`;
+        a peak that is not scored has no methods.
+    """
+    return {
+        peak: {
+            method: {
+                quantity: {"sigma": v.sigma, "words": v.words}
+                for quantity, v in method_verdicts(metrics, peak, method).items()
+            }
+            for method in methods_of(metrics, peak)
+        }
+        for peak in part(metrics, "peaks")
+    }
+
+
+def summaries(metrics: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """One line in plain words by peak and method, see `summary`."""
+    return {
+        peak: {m: summary(metrics, peak, m) for m in methods_of(metrics, peak)}
+        for peak in part(metrics, "peaks")
+    }
+
+
+def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
+    """Say in one line what agrees with the data and what is off.
+
+    A parameter is off if its IoU or its Wasserstein distance is; the one further off
+    is quoted.
+
+    Returns
+    -------
+    str
+        For instance ``REN, SEP: current amplitude and tail slope agree with the data
+        within errors; drift time off by 3.1 sigma (IoU 83.1 of 85.9)``.
+    """
+    verdicts = method_verdicts(metrics, peak, method)
+    agreeing: list[str] = []
+    off: list[tuple[float, str]] = []
+    silent: list[str] = []
+    for name in [n for n in verdicts if not n.endswith(_W1)]:
+        pair = {n: verdicts[n] for n in (name, name + _W1) if n in verdicts}
+        known = {n: v for n, v in pair.items() if v.agrees is not None}
+        if not known:
+            silent.append(f"{_called(name)} not judged ({pair[name].words})")
+        elif all(v.agrees for v in known.values()):
+            agreeing.append(_called(name))
+        else:
+            worst = max(known, key=lambda n: _severity(known[n]))
+            quoted = _quoted(metrics, peak, method, worst)
+            text = f"{_called(name)} {known[worst].words}{quoted}"
+            off.append((_severity(known[worst]), text))
+    parts = [_agreement(agreeing, len(off))] if agreeing else []
+    parts += [text for _, text in sorted(off, key=lambda pair: -pair[0])]
+    head = f"{_SHORT.get(method, label(method))}, {peak}"
+    return f"{head}: {'; '.join(parts + silent) or 'not scored'}"
+
+
+def methods_of(metrics: Mapping[str, Any], peak: str) -> list[str]:
+    """Methods with noise that a peak's scores hold, in their order there."""
+    scores = part(metrics, "peaks", peak)
+    names = [
+        *(m for p in part(scores, "parameters") for m in part(scores, "parameters", p, "iou")),
+        *part(scores, "two_sample"),
+    ]
+    return [m for m in dict.fromkeys(names) if m != "ceiling" and not m.endswith(NO_NOISE)]
+
+
+def part(metrics: Any, *keys: str) -> Mapping[str, Any]:
+    """The mapping at `keys` of nested mappings; empty if there is none."""
+    for key in keys:
+        metrics = metrics.get(key) if isinstance(metrics, Mapping) else None
+    return metrics if isinstance(metrics, Mapping) else {}
+
+
+def number(metrics: Any, *keys: str) -> float | None:
+    """The finite number at `keys` of nested mappings; None if there is none."""
+    value = part(metrics, *keys[:-1]).get(keys[-1])
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    return float(value) if math.isfinite(value) else None
+
+
+def _with_reason(found: Verdict, reason: object) -> Verdict:
+    if found.agrees is not None or not isinstance(reason, str):
+        return found
+    return Verdict(None, None, reason)
+
+
+def _severity(found: Verdict) -> float:
+    if found.agrees:
+        return 0.0
+    return math.inf if found.sigma is None else abs(found.sigma)
+
+
+def _called(quantity: str) -> str:
+    named = {_AUC: "classifier", _SURVIVAL: "A/E survival"}
+    return named.get(quantity, quantity.replace("_", " "))
+
+
+def _agreement(agreeing: list[str], n_off: int) -> str:
+    """Name what agrees, or count it where a line would not hold the names."""
+    if len(agreeing) > LISTED:
+        total = len(agreeing) + n_off
+        count = f"{len(agreeing)} of {total}" if n_off else f"all {total}"
+        chance = f" (by chance about {BY_CHANCE * total:.0f} would not)" if n_off else ""
+        return f"{count} scores agree with the data within errors{chance}"
+    *first, last = agreeing
+    names = f"{', '.join(first)} and {last}" if first else last
+    return f"{names} {'agree' if first else 'agrees'} with the data within errors"
+
+
+def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -> str:
+    """The score behind a verdict, beside what chance gives."""
+    scores = part(metrics, "peaks", peak)
+    if quantity == _AUC:
+        tested = part(scores, "two_sample", method)
+        return (
+            f" (AUC {number(tested, 'auc'):.2f}, by chance {number(tested, 'null_mean'):.2f})"
+        )
+    if quantity == _SURVIVAL:
+        survival = part(metrics, "ae_survival", peak)
+        return f" ({number(survival, 'difference', method):+.1f} points)"
+    name = quantity.removesuffix(_W1)
+    one = part(scores, "parameters", name)
+    if name == quantity:
+        overlap, ceiling = number(one, "iou", method), number(one, "iou", "ceiling")
+        return f" (IoU {overlap:.1f} of {ceiling:.1f})"
+    unit = f" {PARAMETERS[name].unit}" if name in PARAMETERS else ""
+    distance, chance = number(one, "wasserstein", method), number(one, "wasserstein_null")
+    return f" (W₁ {distance:.3g}{unit}, by chance {chance:.3g}{unit})"

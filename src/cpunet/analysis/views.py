@@ -1,0 +1,300 @@
+"""Compact data of the report's interactive charts, ready for JSON.
+
+Each function makes one entry of the ``views`` that `report.write_report` takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import hist
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.comparisons import data_axis, histogram
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.style import NO_NOISE, colours, label
+from cpunet.analysis.view_parts import axis_info, packed
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import PARAMETERS, Parameter
+
+Values = npt.NDArray[np.float64]
+View = dict[str, Any]
+
+MAX_BINS = 49
+EVENTS = 20  # pulses to choose from, per peak
+BEFORE, AFTER = 160, 240  # samples around half maximum
+SEARCHED = 2000  # measured pulses among which the nearest is sought
+POINTS = 1500  # of a method in a scatter
+SCATTER = ("drift_time", "current_amplitude")
+HOME_QUANTILES = (0.005, 0.995)  # of the data, which the scatter shows at first
+HOME_MARGIN = 0.3
+
+
+def method_looks(methods: Iterable[str]) -> list[dict[str, Any]]:
+    """Name, label and colour of each method, one for the whole page.
+
+    A method without its noise has the colour of the method, is drawn dashed, and is hidden
+    until it is chosen.
+
+    Parameters
+    ----------
+    methods
+        All methods of the page, in the order of the legends; repetitions are left out.
+    """
+    methods = list(dict.fromkeys(methods))
+    palette = colours(dict.fromkeys(m.removesuffix(NO_NOISE) for m in methods))
+    return [
+        {
+            "name": method,
+            "label": label(method),
+            "colour": palette[method.removesuffix(NO_NOISE)],
+            "dashed": method.endswith(NO_NOISE),
+        }
+        for method in methods
+    ]
+
+
+def distributions(
+    values: Mapping[str, Mapping[str, Mapping[str, Values]]],
+    comparisons: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    parameters_info: Mapping[str, Parameter] = PARAMETERS,
+    max_bins: int = MAX_BINS,
+) -> View:
+    """Histograms of all parameters, in the bins in which they are compared.
+
+    Parameters
+    ----------
+    values
+        By peak, method and parameter; the measured ones are under ``"data"``.
+    comparisons
+        By peak, the result of `comparisons.compare`: bins, IoU and ceiling.  Without it the
+        bins are those of `comparisons.data_axis`.
+    parameters_info
+        Labels and units by parameter.
+    max_bins
+        The most bins where `comparisons` gives none.
+
+    Returns
+    -------
+    dict
+        By peak and parameter; ``missing`` and the reason where there is nothing to show.
+    """
+    return {
+        peak: _peak_distributions(found, comparisons.get(peak, {}), parameters_info, max_bins)
+        for peak, found in values.items()
+    }
+
+
+def superpulse_views(
+    superpulses: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    slices: Mapping[str, Sequence[str]] | Sequence[str],
+    dt_ns: float,
+    n_before: int = BEFORE,
+) -> View:
+    """Mean pulses of each slice of drift time.
+
+    Parameters
+    ----------
+    superpulses
+        By peak and method: ``n``, the number of pulses of each slice, and ``mean`` and
+        ``error`` of shape ``(slices, samples)``, in units of the full charge, all aligned.
+    slices
+        What each slice is called, by peak or for all peaks alike.
+    dt_ns
+        Sampling period in ns.
+    n_before
+        The sample at which the pulses are aligned.
+    """
+    peaks: View = {}
+    for peak, methods in superpulses.items():
+        if not methods:
+            peaks[peak] = {"missing": "no pulses to average"}
+            continue
+        names = slices.get(peak, ()) if isinstance(slices, Mapping) else slices
+        peaks[peak] = {
+            "slices": list(names),
+            "methods": {
+                method: {
+                    "n": [int(count) for count in found["n"]],
+                    # residuals to data are far below the 16 bits of a pulse's height
+                    "mean": packed(found["mean"], bits=32),
+                    "error": packed(found["error"]),
+                }
+                for method, found in methods.items()
+            },
+        }
+    return {"dt_ns": float(dt_ns), "before": int(n_before), "peaks": peaks}
+
+
+def pulse_views(
+    pulses: Mapping[str, Mapping[str, FloatArray]],
+    dt_ns: float,
+    measured: Mapping[str, FloatArray] | None = None,
+    *,
+    events: int = EVENTS,
+    n_before: int = BEFORE,
+    n_after: int = AFTER,
+) -> View:
+    """Single events: the same one by every method, and the nearest measured pulse.
+
+    Parameters
+    ----------
+    pulses
+        By peak and method, noise-free pulses of shape ``(n, samples)``, row by row of the
+        same simulated event.
+    dt_ns
+        Sampling period in ns.
+    measured
+        Measured pulses by peak.  The nearest to an event is the one with the smallest
+        root-mean-square difference from its truth, or else its REN translation, among
+        `SEARCHED` of them.
+    events
+        How many events there are to choose from; they are spread evenly over the rows.
+    n_before, n_after
+        Samples before the crossing of half the maximum, at which all are aligned, and
+        from it on.
+
+    Raises
+    ------
+    CpunetError
+        If the methods of a peak have not equally many pulses.
+    """
+    window = (n_before, n_after)
+    peaks: View = {}
+    for peak, methods in pulses.items():
+        clean = {method.removesuffix(NO_NOISE): found for method, found in methods.items()}
+        sizes = {method: len(found) for method, found in clean.items()}
+        if len(set(sizes.values())) > 1:
+            raise CpunetError(f"{peak}: not the same events by all methods: {sizes}")
+        finite = [np.isfinite(found).all(axis=1) for found in clean.values()]
+        usable = np.flatnonzero(np.logical_and.reduce(finite)) if finite else np.array([])
+        if not len(usable):
+            peaks[peak] = {"missing": "no event that every method can translate"}
+            continue
+        rows = usable[np.linspace(0, len(usable) - 1, min(events, len(usable))).astype(int)]
+        shown = {m: align_half_maximum(w[rows], *window) for m, w in clean.items()}
+        found = {"rows": rows.tolist(), "usable": len(usable), "n": max(sizes.values())}
+        if measured is not None and len(measured.get(peak, ())):
+            found |= _nearest(shown, measured[peak], window)
+        found["methods"] = {method: packed(aligned) for method, aligned in shown.items()}
+        peaks[peak] = found
+    return {"dt_ns": float(dt_ns), "before": n_before, "peaks": peaks}
+
+
+def scatter_views(
+    values: Mapping[str, Mapping[str, Mapping[str, Values]]],
+    parameters_info: Mapping[str, Parameter] = PARAMETERS,
+    *,
+    axes: tuple[str, str] = SCATTER,
+    seed: int = 0,
+) -> View:
+    """Two parameters of the same pulses, at most `POINTS` pulses of a method.
+
+    Parameters
+    ----------
+    values
+        By peak, method and parameter.
+    parameters_info
+        Labels and units by parameter.
+    axes
+        The parameters of the horizontal and of the vertical axis.
+    seed
+        Of the choice of pulses.
+    """
+    rng = np.random.default_rng(seed)
+    peaks: View = {}
+    for peak, methods in values.items():
+        pairs = {
+            method: np.array([found[axis] for axis in axes], dtype=float)
+            for method, found in methods.items()
+            if all(axis in found for axis in axes)
+        }
+        if not pairs:
+            peaks[peak] = {"missing": "no pulses with both parameters"}
+            continue
+        found: View = {"methods": {}}
+        for method, pair in pairs.items():
+            known = pair[:, np.isfinite(pair).all(axis=0)]
+            size = known.shape[1]
+            few = rng.choice(size, POINTS, replace=False) if size > POINTS else slice(None)
+            chosen = known[:, few]
+            found["methods"][method] = {
+                "n": size,
+                "missing": pair.shape[1] - size,
+                "x": packed(chosen[0]),
+                "y": packed(chosen[1]),
+            }
+        reference = pairs.get("data", next(iter(pairs.values())))
+        found["home"] = [_home(row) for row in reference]
+        peaks[peak] = found
+    return {"axes": [axis_info(name, parameters_info) for name in axes], "peaks": peaks}
+
+
+def _peak_distributions(
+    methods: Mapping[str, Mapping[str, Values]],
+    comparisons: Mapping[str, Mapping[str, Any]],
+    parameters_info: Mapping[str, Parameter],
+    max_bins: int,
+) -> View:
+    if not methods.get("data"):
+        return {"missing": "no measured pulses were scored"}
+    found: View = {}
+    for name, data in methods["data"].items():
+        info = axis_info(name, parameters_info)
+        if not np.isfinite(data).any():
+            found[name] = info | {"missing": "no measured pulse has a value"}
+            continue
+        comparison = comparisons.get(name, {})
+        axis = _binning(data, comparison.get("axis", {}), max_bins)
+        counts = {
+            method: histogram(np.asarray(values[name], dtype=float), axis).astype(int).tolist()
+            for method, values in methods.items()
+            if name in values
+        }
+        iou, errors = comparison.get("iou", {}), comparison.get("iou_std", {})
+        found[name] = info | {
+            "low": float(axis.edges[0]),
+            "high": float(axis.edges[-1]),
+            "counts": counts,
+            "iou": {method: [score, errors.get(method)] for method, score in iou.items()},
+        }
+    return found
+
+
+def _binning(data: Values, axis: Mapping[str, Any], max_bins: int) -> hist.axis.Regular:
+    """Return the bins of the comparison, or else those that it would have."""
+    if axis.get("bins"):
+        return hist.axis.Regular(int(axis["bins"]), axis["low"], axis["high"])
+    return data_axis(data, max_bins)
+
+
+def _nearest(
+    shown: Mapping[str, FloatArray], measured: FloatArray, window: tuple[int, int]
+) -> View:
+    """Return for each event the measured pulse that differs least from it."""
+    to = next((m for m in ("truth", "ren") if m in shown), list(shown)[-1])
+    every = measured[:: -(-len(measured) // SEARCHED)]
+    aligned = align_half_maximum(every, *window)
+    aligned = aligned[np.isfinite(aligned).any(axis=1)]
+    if not len(aligned):
+        return {}
+    nearest = []
+    for pulse in shown[to]:
+        square = (aligned - pulse) ** 2
+        known = np.isfinite(square)
+        mean = np.where(known, square, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        nearest.append(aligned[np.where(known.any(axis=1), mean, np.inf).argmin()])
+    return {"nearest": packed(nearest), "nearest_to": to, "searched": len(aligned)}
+
+
+def _home(values: Values) -> list[float]:
+    """Where the bulk of the data lies, with a margin."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return [0.0, 1.0]
+    low, high = np.quantile(known, HOME_QUANTILES)
+    margin = HOME_MARGIN * (high - low) or 0.5 * abs(high) or 1.0
+    return [float(low - margin), float(high + margin)]

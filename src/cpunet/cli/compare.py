@@ -1,0 +1,76 @@
+"""``cpunet compare``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cpunet.cli import options
+from cpunet.cli.messages import out
+
+if TYPE_CHECKING:
+    from cpunet.analysis.side_by_side import SideBySide
+
+Reports = Annotated[
+    list[Path], typer.Argument(help="Folders of cpunet validate or demo, or metrics.json.")
+]
+Out = Annotated[Path | None, typer.Option("--out", help="Page to write, such as compare.html.")]
+Method = Annotated[
+    str, typer.Option(help="Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.")
+]
+
+_WIDEST = 10_000  # columns
+
+
+def compare(
+    reports: Reports,
+    out_file: Out = None,
+    method: Method = "ren",
+    force: options.Force = False,
+) -> None:
+    """Put the scores of several validations beside each other, best in bold.
+
+    Example: cpunet compare report1 report2 --out compare.html
+    """
+    from cpunet.jobs.compare import compare_reports
+
+    compared = compare_reports(reports, method=method, out=out_file, force=force)
+    table = comparison_table(compared)
+    # whole, also where it is wider than a terminal or a log's 80 columns
+    width = out.measure(table, options=out.options.update(max_width=_WIDEST)).maximum
+    Console(file=out.file, width=max(out.width, width)).print(table)
+    for note in compared.notes:
+        out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    if out_file is not None:
+        out.print(str(out_file), markup=False, highlight=False, soft_wrap=True)
+
+
+def comparison_table(compared: SideBySide) -> Table:
+    """Draw a row per peak and score, a column per run.
+
+    Parameters
+    ----------
+    compared
+        See `cpunet.analysis.side_by_side.side_by_side`.
+    """
+    title = f"Scores of {escape(compared.method)}"
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("peak", "score"):
+        table.add_column(column, no_wrap=True)
+    for name in compared.names:
+        table.add_column(escape(name), justify="right", no_wrap=True)
+    peak = None
+    for row in compared.rows:
+        cells = [
+            f"[bold]{cell.text}[/]" if i in row.best else cell.text
+            for i, cell in enumerate(row.cells)
+        ]
+        table.add_row("" if row.peak == peak else escape(row.peak), escape(row.score), *cells)
+        peak = row.peak
+    return table

@@ -1,0 +1,84 @@
+"""``cpunet explore``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+
+Runs = Annotated[
+    list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
+]
+DetectorFile = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
+    ),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+]
+Out = Annotated[Path, typer.Option("--out", help="HTML file to write.")]
+Data = Annotated[
+    Path | None, typer.Option("--data", help="File of measured pulses to find the nearest in.")
+]
+Points = Annotated[int, typer.Option(help="Places in the crystal, about; 20 to 600.")]
+SettingsFile = Annotated[
+    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
+]
+
+
+def explore(
+    runs: Runs,
+    detector: DetectorFile,
+    out_file: Out,
+    data: Data = None,
+    points: Points = 400,
+    set_values: Set = None,
+    settings_file: SettingsFile = None,
+    data_table: options.DataTable = None,
+    data_energy: options.DataEnergy = None,
+    kev_per_adc: options.KevPerAdc = None,
+    dt: options.Dt = None,
+    device: options.Device = "auto",
+    force: options.Force = False,
+) -> None:
+    """Make a page to click on places in the crystal and see their pulses.
+
+    Example: cpunet explore run --detector icpc --data raw.lh5 --out explorer.html
+    """
+    from cpunet.jobs.explore import explore_runs
+    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.simulation.geometry_readers import read_detector
+
+    measured = None
+    if data is not None:
+        measured = InputFile(data, data_table, data_energy, kev_per_adc, dt)
+    told = explore_runs(
+        runs,
+        read_detector(detector, set_values or ()),
+        out_file,
+        data=measured,
+        points=points,
+        settings=None if settings_file is None else load_settings(settings_file),
+        device=device,
+        force=force,
+        monitor=monitor(),
+    )
+    left_out = ", ".join(f"{n} {why}" for why, n in told["left_out"].items())
+    out.print(
+        f"{out_file}: pulses of {told['shown']} of {told['places']} places"
+        + (f" (none: {left_out})" if left_out else "")
+        + (f", {told['drawn']} measured ones beside them" if "drawn" in told else "")
+        + f"; {told['bytes'] / 1e6:.1f} MB",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )

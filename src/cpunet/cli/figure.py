@@ -1,0 +1,74 @@
+"""``cpunet figure``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+
+Names = Annotated[
+    list[str],
+    typer.Argument(
+        help="Figures by name, or part of it: spectrum, cycle, 'single pulse', 'SEP drift_time', "
+        "superpulses, 'A over E', noise, losses.",
+        metavar="NAME…",
+    ),
+]
+Sim = Annotated[Path | None, typer.Option("--sim", help="File of simulated pulses.")]
+Data = Annotated[Path | None, typer.Option("--data", help="File of measured pulses.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the files.")]
+Suffix = Annotated[str, typer.Option("--format", help="png, pdf or svg.")]
+Truth = Annotated[
+    Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
+]
+Rivals = Annotated[
+    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
+]
+
+
+def figure(
+    run: options.Run,
+    names: Names,
+    sim: Sim = None,
+    data: Data = None,
+    out_folder: Out = Path(),
+    suffix: Suffix = "png",
+    truth: Truth = None,
+    rivals: Rivals = True,
+    seed: options.Seed = 0,
+    sim_table: options.SimTable = None,
+    sim_energy: options.SimEnergy = None,
+    data_table: options.DataTable = None,
+    data_energy: options.DataEnergy = None,
+    kev_per_adc: options.KevPerAdc = None,
+    dt: options.Dt = None,
+    device: options.Device = "auto",
+    force: options.Force = False,
+) -> None:
+    """Draw single figures of a validation, for a paper or a talk.
+
+    Example: cpunet figure run "single pulse" spectrum --sim sim.lh5 --data raw.lh5 --format pdf
+    """
+    from cpunet.jobs.figure_files import draw_figures
+    from cpunet.jobs.inputs import InputFile
+
+    files = draw_figures(
+        run,
+        names,
+        None if sim is None else InputFile(sim, sim_table, sim_energy, dt_ns=dt),
+        None if data is None else InputFile(data, data_table, data_energy, kev_per_adc, dt),
+        out_folder,
+        suffix=f".{suffix.removeprefix('.')}",
+        truth=truth,
+        rivals=rivals,
+        seed=seed,
+        device=device,
+        force=force,
+        monitor=monitor(),
+    )
+    for file in files:
+        out.print(str(file), soft_wrap=True)

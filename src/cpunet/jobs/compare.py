@@ -1,0 +1,108 @@
+"""Reports of several validations read, and put beside each other."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cpunet.analysis.report import METRICS
+from cpunet.analysis.side_by_side import SideBySide, side_by_side
+from cpunet.analysis.side_by_side_page import side_by_side_page
+from cpunet.errors import CpunetError
+from cpunet.files import refuse_existing, written_aside
+
+REPORT = "report"  # folder of a demonstration that holds the metrics
+
+
+def compare_reports(
+    reports: Sequence[Path],
+    *,
+    method: str = "ren",
+    out: Path | None = None,
+    force: bool = False,
+) -> SideBySide:
+    """Compare the scores of several validations.
+
+    Parameters
+    ----------
+    reports
+        Folders of `cpunet validate` or `cpunet demo`, or their ``metrics.json``.
+    method
+        Whose scores.
+    out
+        Page to write, if any.
+    force
+        Replace an existing page.
+
+    Returns
+    -------
+    SideBySide
+        The runs under the names of their folders, made unique.
+
+    Raises
+    ------
+    CpunetError
+        If a report cannot be read, none has a score of `method`, or `out` exists or
+        cannot be written to.
+    """
+    if out is not None:
+        if out.is_dir():
+            raise CpunetError(f"{out}: is a folder; give the name of a page, as compare.html")
+        refuse_existing(out, force=force)
+    files = [_metrics_file(report) for report in reports]
+    runs = dict(zip(_names(reports), map(read_metrics, files), strict=True))
+    table = side_by_side(runs, method)
+    if out is not None:
+        with written_aside(out) as aside:
+            aside.write_text(side_by_side_page(table), encoding="utf-8")
+    return table
+
+
+def read_metrics(file: Path) -> dict[str, Any]:
+    """Read a ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If it cannot be read, or holds no scores of a validation.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise CpunetError(
+            f"{file}: cannot be read ({reason}); validate the run again"
+        ) from error
+    if not isinstance(content, dict) or not isinstance(content.get("peaks"), dict):
+        raise CpunetError(f"{file}: holds no scores by peak; give a report of cpunet validate")
+    return content
+
+
+def _metrics_file(report: Path) -> Path:
+    """Find the metrics that a folder or file stands for."""
+    if report.is_dir():
+        for file in (report / METRICS, report / REPORT / METRICS):
+            if file.is_file():
+                return file
+        raise CpunetError(
+            f"{report}: no {METRICS} in it; give a folder of cpunet validate or cpunet demo"
+        )
+    if not report.exists():
+        raise CpunetError(f"{report}: no such folder or file; give a folder of cpunet validate")
+    return report
+
+
+def _names(reports: Sequence[Path]) -> list[str]:
+    """Call each report by its folder, with as many folders above as make it unique."""
+    given = [report.resolve() for report in reports]
+    parts = [(path if path.is_dir() else path.parent).parts for path in given]
+    longest = max(map(len, parts), default=1)
+    names: list[str] = []
+    for depth in range(1, longest + 1):
+        names = [str(Path(*part[-depth:])) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    # what is still the same is the same report twice
+    return [f"{Path(name).name} ({i})" for i, name in enumerate(names, start=1)]

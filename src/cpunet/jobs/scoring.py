@@ -1,0 +1,92 @@
+"""Scores of one peak: distributions, single pulses, noise, and what tells them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cpunet.analysis.baseline_spectra import baseline_spectra
+from cpunet.analysis.comparisons import compare
+from cpunet.analysis.paired import paired_scores
+from cpunet.analysis.style import NO_NOISE
+from cpunet.jobs.peak_sets import PeakSets
+from cpunet.jobs.pulse_tests import told_apart
+from cpunet.pulses.parameters import PARAMETERS, Values, pulse_parameters
+from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.recipes.schema import Recipe
+
+ByMethod = dict[str, dict[str, Values]]
+
+
+def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:
+    """Compare the pulses of a peak, method by method.
+
+    Parameters
+    ----------
+    peak
+        Its pulses.
+    recipe
+        The run's settings.
+    seed
+        Of bootstraps and folds.
+
+    Returns
+    -------
+    values
+        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, but only those
+        of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
+    scores
+        The peak's entry in ``metrics.json``, ready for JSON.
+    """
+    scores: dict[str, Any] = {
+        "n_sim": len(peak.raw),
+        "n_data": len(peak.data),
+        "not_prepared": peak.not_prepared(),
+    }
+    missing = peak.missing()
+    if missing is not None:
+        return {}, scores | {"parameters": {}, "missing": missing}
+    pulses = peak.by_method()
+    values = {
+        method: (pulse_parameters if method.endswith(NO_NOISE) else all_parameters)(
+            of_method, recipe.preparation, recipe.scores
+        )
+        for method, of_method in pulses.items()
+    }
+    windows = {method: of_method.waveforms for method, of_method in pulses.items()}
+    chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
+    scores["two_sample"] = told_apart(windows, chief, seed)
+    scores["parameters"] = _compared(chief, recipe, seed)
+    further = {
+        method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
+        for method, of_method in values.items()
+        if not method.endswith(NO_NOISE)
+    }
+    scores["further"] = _compared(further, recipe, seed)
+    noisy = {method: w for method, w in windows.items() if not method.endswith(NO_NOISE)}
+    scores["noise"] = baseline_spectra(
+        noisy, recipe.preparation.baseline_samples, peak.raw.dt_ns
+    )
+    if peak.truth is not None:
+        scores["paired"] = _paired(peak, recipe.scores.edge_samples)
+    return values, scores
+
+
+def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Any]:
+    methods: Mapping[str, Mapping[str, Values]] = {
+        method: of_method for method, of_method in values.items() if method != "data"
+    }
+    return dict(compare(values["data"], methods, recipe.scores, seed))
+
+
+def _paired(peak: PeakSets, edge_samples: int) -> dict[str, Any]:
+    assert peak.truth is not None
+    known = np.isfinite(peak.truth).all(axis=1)
+    for windows in peak.clean.values():
+        known &= np.isfinite(windows).all(axis=1)
+    return {
+        method: paired_scores(waveforms[known], peak.truth[known], edge_samples)
+        for method, waveforms in peak.clean.items()
+    }

@@ -1,0 +1,161 @@
+"""Figures of energies, of single pulses and of seeds show what they are given."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.pulse_figures import nearest, single_pulse_figure, spectrum_figure
+from cpunet.analysis.seed_figure import seed_distributions, seed_figure
+from cpunet.errors import CpunetError
+
+DT, ALIGN = 16.0, 300
+TAU_US = 50.0
+
+
+def edges(widths, centre=250.0, decay=True):
+    time = np.arange(600) - centre
+    pulses = ndtr(time / np.asarray(widths)[:, np.newaxis])
+    if decay:
+        pulses = pulses * np.exp(-np.clip(time, 0, None) * DT * 1e-3 / TAU_US)
+    return pulses.astype(np.float32)
+
+
+def test_the_nearest_pulse_is_that_of_a_plain_loop():
+    rng = np.random.default_rng(0)
+    windows = edges(rng.uniform(4, 20, 50)) + rng.normal(0, 0.003, (50, 600)).astype("f4")
+    target = edges([9.0], centre=270.3)[0]
+    wanted = align_half_maximum(target[np.newaxis], 100, 150)[0]
+    rms = [
+        np.sqrt(np.mean((align_half_maximum(w[np.newaxis], 100, 150)[0] - wanted) ** 2))
+        for w in windows
+    ]
+    row, found = nearest(windows, target)
+    assert row == int(np.argmin(rms))
+    assert found == pytest.approx(min(rms), rel=1e-4)
+
+
+def test_pulses_without_a_crossing_are_never_nearest():
+    windows = edges([5.0, 6.0, 7.0])
+    windows[1] = np.nan
+    windows[0] = 0
+    assert nearest(windows, edges([5.0])[0])[0] == 2
+    with pytest.raises(CpunetError, match="no measured pulse crosses"):
+        nearest(windows[:2], edges([5.0])[0])
+    with pytest.raises(CpunetError, match="to compare with never crosses"):
+        nearest(windows, np.zeros(600, np.float32))
+
+
+def test_a_pulse_of_which_little_is_in_the_record_is_not_compared():
+    windows = np.concatenate([edges([9.0], centre=595.0), edges([5.0])])
+    assert nearest(windows, edges([9.0])[0])[0] == 1
+
+
+def test_single_pulses_lose_their_decay_below():
+    data = edges([4.0, 8.0, 16.0])
+    pulses = {"raw": edges([3.0], decay=False)[0], "ren": edges([8.0])[0]}
+    figure = single_pulse_figure(pulses, data, DT, ALIGN, "SEP")
+    render(figure)
+    assert len(figure.axes) == 6
+    title = figure.legends[0].get_title().get_text()
+    assert "data pulse 1 is nearest to “REN translation”" in title
+    below = figure.axes[2]
+    assert "50 µs" in below.get_title()
+    for line in below.lines:  # data, raw and REN
+        plateau = line.get_ydata()[line.get_xdata() > 2000]
+        assert np.nanmax(np.abs(plateau - 1)) < 2e-3
+    above = figure.axes[0].lines[2].get_ydata()
+    assert np.nanmin(above[700:]) < 0.95
+    differences = figure.axes[4].lines[1].get_ydata()
+    assert np.nanmax(np.abs(differences)) < 0.01
+
+
+def test_single_pulses_need_an_edge():
+    data = edges([4.0])
+    with pytest.raises(CpunetError, match="no pulse to draw"):
+        single_pulse_figure({}, data, DT, ALIGN)
+    with pytest.raises(CpunetError, match="Simulation” never crosses"):
+        single_pulse_figure({"ren": data[0], "raw": np.zeros(600, np.float32)}, data, DT, ALIGN)
+
+
+def test_spectra_hold_all_events_and_name_the_peaks():
+    rng = np.random.default_rng(1)
+    energies = {
+        "data": np.append(rng.normal(2614.5, 2, 500), [np.nan, 100.0]),
+        "raw": rng.normal(2614.5, 0.3, 900),
+    }
+    figure = spectrum_figure(energies, {"FEP": 2614.5, "far": 9000.0}, bin_kev=2)
+    render(figure)
+    axes = figure.axes[0]
+    for patch, n in zip(axes.patches, (501, 900), strict=True):
+        data = patch.get_data()
+        assert (data.values * np.diff(data.edges)).sum() == pytest.approx(1)
+        assert np.diff(data.edges) == pytest.approx(2)
+        assert f"n = {n}" in patch.get_label()
+    assert "1 without energy" in axes.patches[0].get_label()
+    assert [text.get_text() for text in axes.texts] == ["FEP"]
+
+
+def test_spectra_of_any_width_are_drawn_in_so_many_bins():
+    render(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}, bin_kev=1))
+    assert len(figure.axes[0].patches[0].get_data().values) < 2100
+    render(spectrum_figure({"data": np.full(3, 2614.5)}, {}))
+
+
+def test_spectra_without_energies_are_refused():
+    with pytest.raises(CpunetError, match="no pulse has an energy"):
+        spectrum_figure({"data": np.full(3, np.nan)}, {})
+    with pytest.raises(CpunetError, match="more than 0"):
+        spectrum_figure({"data": np.ones(3)}, {}, bin_kev=0)
+
+
+def run(ren, ceiling=85.0, peak="SEP"):
+    scores = {"iou": {"ren": ren, "ceiling": ceiling}, "iou_std": {"ceiling": 2.0}}
+    return {"peaks": {peak: {"parameters": {"drift_time": scores}}}}
+
+
+def test_seeds_are_summed_up():
+    runs = [run(80.0), run(84.0), run(None), {"peaks": {"SEP": {"parameters": {}}}}, run(85.0)]
+    found = seed_distributions(runs)
+    row = found["SEP"]["drift_time"]
+    assert row["iou"] == [80, 84, 85]
+    assert row["missing"] == 2
+    assert (row["median"], row["low"], row["high"]) == (84, 80, 85)
+    assert row["mean"] == 83
+    assert row["std"] == pytest.approx(np.sqrt(7))
+    assert (row["ceiling"], row["ceiling_std"]) == (85, 2)
+    json.dumps(found, allow_nan=False)
+    render(seed_figure(found, marked=runs[0]))
+
+
+def test_one_seed_has_no_spread_and_none_no_scores():
+    assert seed_distributions([run(80.0)])["SEP"]["drift_time"]["std"] is None
+    nothing = seed_distributions([run(None, ceiling=None)])["SEP"]["drift_time"]
+    assert nothing["median"] is None
+    assert nothing["ceiling"] is None
+    figure = seed_figure({"SEP": {"drift_time": nothing}})
+    render(figure)
+    assert figure.axes[0].texts[0].get_text() == "no scores"
+
+
+def test_peaks_may_differ_between_trainings():
+    found = seed_distributions([run(80.0), run(81.0, peak="DEP")])
+    assert [found[p]["drift_time"]["missing"] for p in ("SEP", "DEP")] == [1, 1]
+    render(seed_figure(found))
+
+
+@pytest.mark.parametrize("runs", [[], [{"peaks": {"SEP": {"parameters": {}}}}]])
+def test_without_scores_seeds_are_refused(runs):
+    with pytest.raises(CpunetError, match="train"):
+        seed_distributions(runs)
+
+
+def render(figure) -> None:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=40)
+    assert stream.tell() > 1000

@@ -1,0 +1,140 @@
+"""Validation with parts missing: each section says what is missing, and the rest stands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.energy_ranges import validation_selection
+from cpunet.jobs.evaluation import Evaluation, evaluate
+from cpunet.jobs.figures import figure_makers
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.train import train_run
+from cpunet.jobs.validate import validate_run
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+
+RECIPE = load_recipe(
+    "fast",
+    [
+        "scores.bootstraps=10",
+        "training.steps=2",
+        "training.components=4",
+        "training.squares=2",
+        "training.start_factors=[1]",
+        "training.ringing_mhz=[]",
+        "training.noise_sets=1",
+    ],
+)
+KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
+
+
+def records(n: int, rng: np.random.Generator, tau: float | None) -> np.ndarray:
+    """Edges of various widths at sample 450 of 1100, behind a pole and a decay if measured."""
+    time = np.arange(1100.0)
+    width = rng.uniform(1.0, 6.0, (n, 1))
+    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
+    if tau is not None:
+        since = np.clip(time - 450, 0, None)
+        kernel = np.exp(-np.arange(60) / 4.0)
+        smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())
+        pulses = smooth[:, :1100] * np.exp(-since / tau)
+    return pulses
+
+
+def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> InputFile:
+    rng = np.random.default_rng(seed)
+    kev = np.repeat(list(counts), list(counts.values())).astype(float)
+    waveforms = records(len(kev), rng, 4000.0 if measured else None)
+    if measured:
+        noise = rng.normal(0, 2.0, waveforms.shape)
+        waveforms = np.round(1000 + 10 * kev[:, None] * waveforms + 10 * noise)
+    write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=kev), table="geds/raw")
+    return InputFile(path)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, InputFile]:
+    folder = tmp_path_factory.mktemp("evaluation")
+    full = {KEV["FEP"]: 260, KEV["SEP"]: 60, 2030.0: 25, KEV["SEP"] + 15: 5}
+    return {
+        "sim": write(folder / "sim.lh5", full | {KEV["DEP"]: 30}, 1, measured=False),
+        "data": write(folder / "data.lh5", full | {KEV["DEP"]: 30}, 2, measured=True),
+        "no DEP": write(folder / "no_dep.lh5", full, 3, measured=True),
+    }
+
+
+@pytest.fixture(scope="module")
+def run(files, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "run"
+    train_run(files["sim"], files["data"], out, RECIPE, seed=0, device="cpu")
+    return out
+
+
+def evaluated(run: Path, sim: InputFile, data: InputFile) -> Evaluation:
+    return evaluate(
+        run, sim, data, truth=None, rivals=False, seed=0, device="cpu", monitor=Monitor()
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(run, files) -> Evaluation:
+    return evaluated(run, files["sim"], files["data"])
+
+
+def test_peaks_sidebands_and_continua_are_loaded() -> None:
+    selection = validation_selection(["SEP"], RECIPE)
+    chosen = selection.select([KEV["SEP"], KEV["SEP"] + 7, KEV["SEP"] + 15, 2030.0, 1800.0])
+    assert chosen.tolist() == [True, False, True, True, False]
+
+
+def test_what_is_compared(whole) -> None:
+    json.dumps(whole.metrics, allow_nan=True)
+    ranges = whole.metrics["ae_details"]["survival by energy range"]
+    assert ranges["Qbb"]["ren"]["peak"] == 25
+    assert ranges["SEP"]["data"]["sideband"] == 5
+    assert ranges["FEP"]["data"]["sideband"] == 0
+    assert whole.metrics["linearity"]["edge_rms"]["median"] < 1e-4  # the chain is linear
+    assert set(whole.metrics["drift_slices"]) == {"FEP", "SEP", "DEP"}
+    assert [line.split(":")[0] for line in whole.metrics["verdicts"]["summary"]] == [
+        "REN, FEP",
+        "REN, SEP",
+        "REN, DEP",
+    ]
+    # energies of all pulses of the file are there, for its spectrum
+    assert len(whole.data.energies_kev) == 380
+
+
+def test_every_figure_can_be_drawn(whole) -> None:
+    makers = figure_makers(whole)
+    assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(makers)
+    for make in makers.values():
+        assert make().axes
+
+
+def test_a_missing_peak_is_told_and_the_rest_stands(
+    run, files, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("cpunet.jobs.validate.figure_makers", lambda found: {})  # drawn above
+    metrics = validate_run(
+        run, files["sim"], files["no DEP"], tmp_path / "report", rivals=False, device="cpu"
+    )
+    assert metrics["peaks"]["DEP"]["missing"].startswith("no measured pulses")
+    assert "DEP" in metrics["ae_survival"]["missing"]
+    assert "no A/E cut" in metrics["ae_details"]["survival by energy range"]["missing"]
+    assert metrics["peaks"]["SEP"]["parameters"]["drift_time"]["iou"]["ren"] > 0
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "no measured pulses" in page
+    assert "REN, SEP" in page
+
+
+def test_nothing_to_score_is_an_error(run, files, tmp_path) -> None:
+    other = write(tmp_path / "other.lh5", {2030.0: 40}, 4, measured=True)
+    with pytest.raises(CpunetError, match="no peak has pulses on both sides"):
+        evaluated(run, files["sim"], other)
