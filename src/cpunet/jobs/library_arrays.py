@@ -1,0 +1,73 @@
+"""The arrays of a translated pulse-shape library, filled row by row of r."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.translation.library_mode import AFTER_NS, BEFORE_NS, aligned_currents
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """Where templates go, and for currents the times of the highest ones."""
+
+    waveforms: h5py.Dataset
+    times: h5py.Dataset | None = None
+
+    def put(self, rows: slice, charge: FloatArray, dt_ns: float) -> None:
+        """Write translated templates, shape (places, samples), of rows of r."""
+        values = charge
+        if self.times is not None:
+            values, times_ns = aligned_currents(charge, dt_ns)
+            self.times[rows] = times_ns.reshape(-1, self.times.shape[1])
+        self.waveforms[rows] = values.reshape(-1, *self.waveforms.shape[1:])
+
+
+def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
+    """An array of the same type, shape, chunks, filters and attributes."""
+    plain = given.id
+    name = f"waveform_{angle}".encode()
+    new = h5py.h5d.create(
+        made.id, name, plain.get_type(), plain.get_space(), plain.get_create_plist()
+    )
+    return Arrays(_with_attrs(h5py.Dataset(new), given))
+
+
+def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
+    """An array of currents, and one of the times of their highest samples in ns."""
+    dt = given.parent["dt"]
+    dt_ns = float(dt[()]) * TIME_UNITS[dt.attrs["units"]]
+    samples = round(BEFORE_NS / dt_ns) + round(AFTER_NS / dt_ns)
+    n_r, n_z, _ = given.shape
+    options: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    waveforms = made.create_dataset(
+        f"waveform_{angle}",
+        (n_r, n_z, samples),
+        given.dtype,
+        chunks=(1, n_z, samples),
+        **options,
+    )
+    _with_attrs(waveforms, given).attrs["units"] = "1/ns"
+    times = made.create_dataset(f"drift_time_{angle}", (n_r, n_z), np.float64)
+    times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
+    return Arrays(waveforms, times)
+
+
+def add_t0(dt: h5py.Dataset, made: h5py.Group, before_ns: float) -> None:
+    """Put the first sample at `before_ns` before time 0, in the units of dt."""
+    ns_per_unit = TIME_UNITS[dt.attrs["units"]]
+    dt_ns = float(dt[()]) * ns_per_unit
+    made["t0"] = -round(before_ns / dt_ns) * dt_ns / ns_per_unit
+    made["t0"].attrs.update({"datatype": "real", "units": dt.attrs["units"]})
+
+
+def _with_attrs(made: h5py.Dataset, given: h5py.Dataset) -> h5py.Dataset:
+    for key, value in given.attrs.items():
+        made.attrs[key] = value
+    return made

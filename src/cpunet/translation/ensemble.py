@@ -1,0 +1,180 @@
+"""Many trainings as one translator: their mean, their spread, or one of them per pulse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.preparation import Codes
+from cpunet.training.ensemble_folder import finished_members
+from cpunet.translation.backends import Backend, Energies
+from cpunet.translation.translator import BATCH, REN
+
+Values = npt.NDArray[np.float64]
+
+BISECTIONS = 30  # of one sample: 1e-9 of it
+
+
+class EnsembleREN(REN):
+    """RENs that differ in their seed.
+
+    It translates like a single `REN`, but draws one of them for each pulse, so that a
+    translated set carries the spread of the seeds; ``noise=False`` leaves the electronic noise
+    out, not that draw.  What is the same every time is `mean_and_spread`.
+
+    Parameters
+    ----------
+    members
+        Two RENs or more, of one preparation and sampling period.
+
+    Raises
+    ------
+    CpunetError
+        If there are fewer, or they do not go together.
+    """
+
+    def __init__(self, members: Sequence[REN]) -> None:
+        if len(members) < 2:
+            raise CpunetError(f"an ensemble has two members or more, not {len(members)}")
+        first = members[0]
+        for number, ren in enumerate(members):
+            same = ren.recipe.preparation == first.recipe.preparation
+            if not (same and np.isclose(ren.dt_ns, first.dt_ns)):
+                raise CpunetError(
+                    f"member {number} of the ensemble has another preparation or sampling "
+                    "period than the first; take seeds of one training"
+                )
+        super().__init__(_Draw([ren.backend for ren in members]), first.recipe, first.dt_ns)
+        self.members = tuple(members)
+
+    @classmethod
+    def load(cls, ensemble: str | Path, device: str = "cpu") -> Self:
+        """Load all finished seeds from the folder of `cpunet ensemble`.
+
+        Raises
+        ------
+        CpunetError
+            If fewer than two are finished, or a run cannot be loaded.
+        """
+        runs = finished_members(Path(ensemble))
+        if len(runs) < 2:
+            raise CpunetError(f"{ensemble}: one finished seed only; go on with --resume")
+        return cls([REN.load(run, device) for run in runs])
+
+    @property
+    def needs_energies(self) -> bool:
+        """Whether the noise goes by the energies."""
+        return self.members[0].needs_energies
+
+    def mean_and_spread(self, windows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean of the members' translations without noise, and how they scatter.
+
+        The preparation puts a translation at a whole sample, so two members of nearly the
+        same response may differ by one sample.  That is no difference of shape: each
+        translation is moved, by its cubic spline, to the mean time at which the members'
+        reach half of their maximum.  The spread there is 0 but for what the slopes differ;
+        what a seed does to the delay is not in it, as a training knows no delay.
+
+        Parameters
+        ----------
+        windows
+            Prepared simulated pulses, shape (n, samples).
+
+        Returns
+        -------
+        mean, spread
+            Float32, shape (n, samples): mean, and standard deviation over the members
+            (ddof = 1); rows of NaN where a member has no translation.
+        """
+        mean, spread = np.empty_like(windows), np.empty_like(windows)
+        for first in range(0, len(windows), BATCH):
+            rows = slice(first, first + BATCH)
+            each = [ren.apply(windows[rows], noise=False) for ren in self.members]
+            moved = _at_their_mean_time(np.stack(each).astype(float))
+            mean[rows], spread[rows] = moved.mean(axis=0), moved.std(axis=0, ddof=1)
+        return mean, spread
+
+
+class _Draw(Backend):
+    """One of several backends for each pulse, at random."""
+
+    def __init__(self, backends: Sequence[Backend]) -> None:
+        self.backends = backends
+        self.network = nn.ModuleList(backend.network for backend in backends)
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Share the pulses out, and translate each by its own."""
+        device = self.device if generator is None else generator.device
+        shape = (len(windows),)
+        drawn = torch.randint(len(self.backends), shape, generator=generator, device=device)
+        chosen = drawn.cpu().numpy()
+        result, codes = np.empty_like(windows), np.zeros(len(windows), np.uint8)
+        for number, backend in enumerate(self.backends):
+            rows = np.flatnonzero(chosen == number)
+            if rows.size:
+                energies = None if energy_kev is None else energy_kev[rows]
+                result[rows], codes[rows] = backend(windows[rows], energies, noise, generator)
+        return result, codes
+
+
+def _at_their_mean_time(translations: Values) -> Values:
+    """Move translations, shape (members, n, samples), to their mean half maximum.
+
+    What is moved in at an end is the end's value; rows of NaN where a pulse of any member has
+    no half maximum.
+    """
+    from scipy.interpolate import CubicSpline
+
+    members, n, samples = translations.shape
+    flat = translations.reshape(-1, samples)
+    usable, before = _last_below_half(flat)
+    usable = np.tile(usable.reshape(members, n).all(axis=0), members)
+    moved = np.full_like(flat, np.nan)
+    if not usable.any():
+        return moved.reshape(translations.shape)
+    whole = flat[usable]
+    pieces = CubicSpline(np.arange(samples), whole, axis=1).c  # (4, samples - 1, pulses)
+    pulse = np.arange(len(whole))
+
+    def at(piece: npt.NDArray[np.intp], fraction: Values) -> Values:
+        row = pulse.reshape(-1, *[1] * (piece.ndim - 1))
+        cubic, square, slope, value = pieces[:, piece, row]
+        return np.asarray(((cubic * fraction + square) * fraction + slope) * fraction + value)
+
+    start, level = before[usable], 0.5 * whole.max(axis=1)
+    low, high = np.zeros(len(whole)), np.ones(len(whole))
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        under = at(start, middle) < level
+        low, high = np.where(under, middle, low), np.where(under, high, middle)
+    time = (start + 0.5 * (low + high)).reshape(members, -1)
+    shift = (time - time.mean(axis=0)).reshape(-1, 1)
+    wanted = np.clip(np.arange(samples) + shift, 0, samples - 1)
+    piece = np.minimum(wanted.astype(int), samples - 2)
+    moved[usable] = at(piece, wanted - piece)
+    return moved.reshape(translations.shape)
+
+
+def _last_below_half(pulses: Values) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
+    """Which pulses cross half of their maximum, and their last sample below it before that."""
+    samples = pulses.shape[1]
+    finite = np.isfinite(pulses).all(axis=1)
+    top = np.where(finite, pulses.argmax(axis=1), 0)
+    height = pulses[np.arange(len(pulses)), top]
+    below = (pulses < 0.5 * height[:, None]) & (np.arange(samples) < top[:, None])
+    last = samples - 1 - below[:, ::-1].argmax(axis=1)
+    return finite & (height > 0) & below.any(axis=1), last

@@ -1,0 +1,273 @@
+"""A run's deterministic part as one file for other tools: ONNX, TorchScript or torch.export.
+
+Noise stays outside the graph: a network takes its latent draw as a second input, a readout
+chain's electronic noise is added to its records.  Preparation stays outside too.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import io
+import logging
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from cpunet.errors import CpunetError
+from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
+from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.translation.backends import NetworkBackend, ResponseBackend
+from cpunet.translation.translator import Translator
+
+Format = Literal["onnx", "torchscript", "torch-export"]
+FORMATS: tuple[Format, ...] = ("onnx", "torchscript", "torch-export")
+OPSET = 18
+TOLERANCE = 1e-4  # of any sample of a pulse of height 1, between the file and the run
+CHECKED = (1, 3)  # pulses in a batch
+TRACED = 2
+
+Arrays = list[npt.NDArray[np.float32]]
+
+
+class NetworkGraph(PositionalUNet):
+    """A Positional U-Net whose latent draw is an input."""
+
+    def __init__(self, network: PositionalUNet) -> None:
+        nn.Module.__init__(self)  # all that the base would make is taken over
+        self.__dict__.update(copy.deepcopy(network).__dict__)
+
+    def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:  # type: ignore[override]
+        """Windows (batch, samples) and epsilon (batch, channels, samples / 16) → windows."""
+        # what the base passes on to `_latent` as the source of the draw is the draw here
+        drawn = cast(torch.Generator, epsilon)
+        return super().forward(windows[:, None], generator=drawn)[:, 0]
+
+    def _latent(self, x: Tensor, generator: Any, mean: bool) -> Tensor:
+        del mean
+        centre: Tensor = self.latent_mean(x)
+        return centre + torch.exp(0.5 * self.latent_log_variance(x)) * cast(Tensor, generator)
+
+
+class ChainGraph(nn.Module):
+    """A readout chain as the matrix that it is, and a trained residual if there is one.
+
+    The chain is linear, so that a product with what it makes of each sample alone gives the
+    same records as its Fourier transforms, which few formats know.
+    """
+
+    matrix: Tensor
+
+    def __init__(self, chain: ResponseGenerator, length: int) -> None:
+        super().__init__()
+        with torch.inference_mode():
+            matrix = chain.response(torch.eye(length, device=chain.response.dt_ns.device))
+        self.register_buffer("matrix", matrix.clone().cpu())
+        self.residual: EdgeResidual | None = None
+        if isinstance(chain, HybridGenerator) and bool(chain.residual.used):
+            self.residual = copy.deepcopy(chain.residual)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
+        records = windows @ self.matrix
+        if self.residual is None:
+            return records
+        corrected: Tensor = self.residual.corrected(records)[0]
+        return corrected
+
+
+@dataclass(frozen=True)
+class Graph:
+    """What is exported: a module, its inputs and output by name, and inputs to check it."""
+
+    module: nn.Module
+    inputs: tuple[str, ...]
+    output: str
+    example: Callable[[int], tuple[Tensor, ...]]
+    expected: Callable[[tuple[Tensor, ...]], Tensor]
+
+
+def graph_of(translator: Translator) -> Graph:
+    """The part of a translator that can be exported.
+
+    Returns
+    -------
+    Graph
+        Inputs ``windows`` (batch, samples), prepared; for a network also ``epsilon``, of
+        zeros for the latent mean, or drawn from N(0, 1).  Output ``windows`` of a network,
+        ``records`` of a readout chain, still to be prepared, ``pulses`` of its inverse.
+    """
+    length = translator.recipe.preparation.length
+    windows = _windows(length)
+    backend = translator.backend
+    if isinstance(backend, NetworkBackend):
+        network = cast(PositionalUNet, backend.network)
+        shape = (network.latent_mean.out_channels, length // 16)
+
+        def with_epsilon(n: int) -> tuple[Tensor, ...]:
+            draw = torch.Generator().manual_seed(n)
+            return windows(n), torch.randn(n, *shape, generator=draw)
+
+        module = NetworkGraph(network).cpu().eval()
+        # a batch's draw is that of its generator
+        return Graph(
+            module,
+            ("windows", "epsilon"),
+            "translated",
+            with_epsilon,
+            lambda given: network.cpu()(
+                given[0][:, None], generator=torch.Generator().manual_seed(len(given[0]))
+            )[:, 0],
+        )
+    if isinstance(backend, ResponseBackend):
+        chain = backend.chain.cpu()
+        return Graph(
+            ChainGraph(chain, length).eval(),
+            ("windows",),
+            "records",
+            lambda n: (windows(n),),
+            lambda given: chain(given[0]),
+        )
+    inverse = cast(LinearInverse, backend.network).cpu()
+    return Graph(
+        inverse, ("windows",), "pulses", lambda n: (windows(n),), lambda g: inverse(*g)
+    )
+
+
+def export(graph: Graph, path: Path, form: Format) -> float:
+    """Write a graph and compare what the file gives with the run.
+
+    Parameters
+    ----------
+    graph
+        Of `graph_of`.
+    path
+        File to write.
+    form
+        ``"onnx"`` (opset 18), ``"torchscript"`` or ``"torch-export"``; all take any batch.
+
+    Returns
+    -------
+    float
+        Largest difference of a sample.
+
+    Raises
+    ------
+    CpunetError
+        If a package is missing or the file differs from the run by more than 1e-4.
+    """
+    if form not in FORMATS:
+        raise CpunetError(f"format {form!r} is not known; use {', '.join(FORMATS)}")
+    write, read = {
+        "onnx": (_write_onnx, _read_onnx),
+        "torchscript": (_write_torchscript, _read_torchscript),
+        "torch-export": (_write_export, _read_export),
+    }[form]
+    with torch.no_grad(), warnings.catch_warnings():
+        # exporters warn of their own future
+        warnings.simplefilter("ignore")
+        path.write_bytes(write(graph))
+        run = read(path)
+        worst = 0.0
+        for n in CHECKED:
+            given = graph.example(n)
+            found = run(graph, [values.numpy() for values in given])
+            worst = max(worst, float(np.abs(found - graph.expected(given).numpy()).max()))
+    if not worst <= TOLERANCE:
+        raise CpunetError(
+            f"{path}: the exported graph differs from the run by {worst:.1e}; choose another "
+            "format"
+        )
+    return worst
+
+
+def _windows(length: int) -> Callable[[int], Tensor]:
+    """Edges of several widths and places, as prepared pulses have them."""
+
+    def windows(n: int) -> Tensor:
+        rng = np.random.default_rng(n)
+        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+        return torch.from_numpy(charge.astype(np.float32))
+
+    return windows
+
+
+def _program(graph: Graph) -> torch.export.ExportedProgram:
+    batch = torch.export.Dim("batch", min=1)
+    shapes = tuple({0: batch} for _ in graph.inputs)
+    return torch.export.export(graph.module, graph.example(TRACED), dynamic_shapes=shapes)
+
+
+def _write_export(graph: Graph) -> bytes:
+    stream = io.BytesIO()
+    torch.export.save(_program(graph), stream)
+    return stream.getvalue()
+
+
+def _read_export(path: Path) -> Callable[[Graph, Arrays], npt.NDArray[np.float32]]:
+    # by content: it would insist on a name that ends in .pt2
+    module = torch.export.load(io.BytesIO(path.read_bytes())).module()
+    return lambda _graph, given: module(*map(torch.from_numpy, given)).numpy()
+
+
+def _write_torchscript(graph: Graph) -> bytes:
+    stream = io.BytesIO()
+    traced = cast(Any, torch.jit).trace(graph.module, graph.example(TRACED), check_trace=False)
+    torch.jit.save(traced, stream)
+    return stream.getvalue()
+
+
+def _read_torchscript(path: Path) -> Callable[[Graph, Arrays], npt.NDArray[np.float32]]:
+    module = cast(Any, torch.jit).load(str(path))
+    return lambda _graph, given: module(*map(torch.from_numpy, given)).numpy()
+
+
+def _write_onnx(graph: Graph) -> bytes:
+    for package in ("onnx", "onnxscript"):
+        _needed(package)
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # it tells each time that torchvision is not there
+    try:
+        program = torch.onnx.export(
+            _program(graph),
+            input_names=list(graph.inputs),
+            output_names=[graph.output],
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    finally:
+        logger.setLevel(level)
+    content: bytes = cast(Any, program).model_proto.SerializeToString()
+    return content
+
+
+def _read_onnx(path: Path) -> Callable[[Graph, Arrays], npt.NDArray[np.float32]]:
+    onnxruntime = _needed("onnxruntime")
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+    def run(graph: Graph, given: Arrays) -> npt.NDArray[np.float32]:
+        (found,) = session.run(None, dict(zip(graph.inputs, given, strict=True)))
+        return np.asarray(found)
+
+    return run
+
+
+def _needed(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise CpunetError(
+            f"the package {package} is needed for ONNX; pip install 'cpunet[onnx]'"
+        ) from error

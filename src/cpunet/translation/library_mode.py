@@ -1,0 +1,228 @@
+"""Templates of a pulse-shape library, translated without noise and left in their place in time.
+
+A template is the charge pulse of one place in the detector; whoever uses the library adds
+templates up, weighted with energies.  So nothing may be aligned or normalised on the way,
+as `Translator.translate` does: a readout chain acts on the template as it stands.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.networks.hybrid import HybridGenerator
+from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
+from cpunet.translation.backends import ResponseBackend
+from cpunet.translation.translator import BATCH, REN
+
+EVENTS = 200  # summed to say how linear a translation is
+SITES = 3  # of each
+# A current amplitude is measured on a current that was averaged so often over so long.
+WINDOW_NS, WINDOWS = 48.0, 3
+BEFORE_NS, AFTER_NS = 1000.0, 4000.0  # about the highest current
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """How far the sum of translated templates is from the translated sum.
+
+    Parameters
+    ----------
+    events
+        Sums of three templates that were compared.
+    largest, rms
+        Of the deviations of all samples, in units of the highest translated sample.
+    current_amplitude
+        Largest relative deviation of the steepest step from sample to sample.
+    """
+
+    events: int
+    largest: float
+    rms: float
+    current_amplitude: float
+
+
+class TemplateTranslator:
+    """Translates templates without noise; sample k of the result is at the time of sample k.
+
+    A readout chain responds to a template of any height: its poles and decays are times, so
+    the sampling may be another than that of the training.  A network knows only prepared
+    pulses of its own sampling: a template goes through it as one, is put back where it was
+    (sample of 99.9 % on sample of 99.9 %, since a network learns no delay) and multiplied by
+    its height.  Before the network's window stands 0, after it its last value.
+
+    Parameters
+    ----------
+    ren
+        A trained run.
+    dt_ns
+        Sampling period of the templates in ns.
+
+    Raises
+    ------
+    CpunetError
+        If the run has a network and the sampling is not that of its training.
+    """
+
+    def __init__(self, ren: REN, dt_ns: float) -> None:
+        self.ren = ren
+        self.dt_ns = dt_ns
+        self.chain: ResponseGenerator | None = None
+        same = bool(np.isclose(dt_ns, ren.dt_ns))
+        backend = ren.backend
+        network = not isinstance(backend, ResponseBackend)
+        if isinstance(backend, ResponseBackend):
+            self.chain = copy.deepcopy(backend.chain)
+            network = isinstance(self.chain, HybridGenerator) and bool(self.chain.residual.used)
+            self.chain.response.dt_ns.fill_(dt_ns)
+        if network and not same:
+            raise CpunetError(
+                f"templates sampled every {dt_ns:g} ns, but the run's network knows "
+                f"{ren.dt_ns:g} ns alone; give a run without a network (recipe fast), or "
+                "resample the library"
+            )
+
+    def __call__(self, templates: FloatArray) -> tuple[FloatArray, Codes]:
+        """Translate templates.
+
+        Parameters
+        ----------
+        templates
+            Charge, 0 before it moves, shape (n, samples).
+
+        Returns
+        -------
+        FloatArray
+            Of the same shape: per unit of charge for a readout chain, in units of prepared
+            pulses (tail at 0.80) for a network.  Rows of NaN where it cannot be done.
+        Codes
+            A `Rejection` for each row.
+        """
+        results = np.zeros_like(templates, np.float32)
+        codes = np.zeros(len(templates), np.uint8)
+        unknown = np.isnan(templates).any(axis=1)
+        results[unknown], codes[unknown] = np.nan, Rejection.NAN
+        # where no charge is seen there is no signal, and nothing to align
+        todo = np.flatnonzero(~unknown & templates.any(axis=1))
+        act = self._through_network if self.chain is None else self._respond
+        with torch.inference_mode():
+            for first in range(0, len(todo), BATCH):
+                rows = todo[first : first + BATCH]
+                results[rows], codes[rows] = act(np.asarray(templates[rows], np.float32))
+        return results, codes
+
+    def _respond(self, templates: FloatArray) -> tuple[FloatArray, Codes]:
+        assert self.chain is not None
+        records = self.chain(torch.from_numpy(templates).to(self.ren.backend.device))
+        inside = records[:, ROOM_BEFORE : ROOM_BEFORE + templates.shape[1]].cpu().numpy()
+        lost = ~np.isfinite(inside).all(axis=1)
+        inside[lost] = np.nan
+        return inside, np.where(lost, Rejection.NO_AMPLITUDE, Rejection.ACCEPTED).astype(
+            np.uint8
+        )
+
+    def _through_network(self, templates: FloatArray) -> tuple[FloatArray, Codes]:
+        config = self.ren.recipe.preparation
+        prepared = prepare(Pulses.of(templates, dt_ns=self.dt_ns), config, "simulated")
+        windows = self.ren.apply(prepared.pulses.waveforms, noise=False)
+        results = np.full_like(templates, np.nan)
+        results[prepared.index] = _put_back(windows, prepared, config.samples_before, templates)
+        return results, prepared.codes
+
+
+def _put_back(
+    windows: FloatArray, prepared: Prepared, samples_before: int, templates: FloatArray
+) -> FloatArray:
+    """Windows at the places of their templates, shape (accepted, samples)."""
+    time = np.arange(templates.shape[1])
+    source = time - prepared.align_sample[:, np.newaxis] + samples_before
+    inside = source.clip(0, windows.shape[1] - 1)
+    placed = np.take_along_axis(windows, inside, axis=1)
+    return np.where(source < 0, 0, placed * prepared.scale[:, np.newaxis]).astype(np.float32)
+
+
+def aligned_currents(
+    charge: FloatArray, dt_ns: float
+) -> tuple[FloatArray, npt.NDArray[np.float64]]:
+    """Currents of pulses, averaged as for a current amplitude, the highest sample in one place.
+
+    Parameters
+    ----------
+    charge
+        Translated templates, shape (n, samples); rows of NaN stay that.
+    dt_ns
+        Sampling period in ns.
+
+    Returns
+    -------
+    currents
+        In 1/ns, shape (n, samples from `BEFORE_NS` before to `AFTER_NS` after the highest).
+    times_ns
+        Time of the highest sample after the start of each template; NaN for rows of NaN.
+    """
+    known = ~np.isnan(charge).any(axis=1)
+    first = np.zeros_like(charge[:, :1])
+    current = np.diff(np.nan_to_num(charge), axis=1, prepend=first) / dt_ns
+    for _ in range(WINDOWS):
+        size = max(1, round(WINDOW_NS / dt_ns))
+        current = scipy.ndimage.uniform_filter1d(current, size, axis=1, mode="constant")
+    highest = current.argmax(axis=1)
+    around = np.arange(-round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns))
+    index = highest[:, np.newaxis] + around
+    inside = (index >= 0) & (index < charge.shape[1])
+    taken = np.take_along_axis(current, index.clip(0, charge.shape[1] - 1), axis=1)
+    taken = np.where(inside, taken, 0).astype(np.float32)
+    taken[~known] = np.nan
+    return taken, np.where(known, highest * dt_ns, np.nan)
+
+
+def linearity(
+    translate: TemplateTranslator, templates: FloatArray, *, seed: int = 0
+) -> Linearity:
+    """Compare sums of translated templates with translated sums.
+
+    Parameters
+    ----------
+    translate
+        What to judge.
+    templates
+        Translatable ones, shape (n, samples); sums of three with random weights are made.
+    seed
+        Of templates and weights.
+
+    Raises
+    ------
+    CpunetError
+        If none of the sums can be translated.
+    """
+    rng = np.random.default_rng(seed)
+    sites = rng.integers(len(templates), size=(EVENTS, SITES))
+    weights = rng.dirichlet(np.ones(SITES), EVENTS).astype(np.float32)
+    alone, alone_codes = translate(templates)
+    summed, codes = translate(_sums(weights, templates[sites]))
+    valid = (codes == Rejection.ACCEPTED) & (alone_codes[sites] == Rejection.ACCEPTED).all(1)
+    if not valid.any():
+        raise CpunetError("no sum of templates can be translated; are they charge pulses?")
+    expected, found = _sums(weights, alone[sites])[valid], summed[valid]
+    apart = (expected - found) / np.abs(found).max()
+    steepest = [np.diff(set_, axis=1).max(axis=1) for set_ in (expected, found)]
+    return Linearity(
+        events=int(valid.sum()),
+        largest=float(np.abs(apart).max()),
+        rms=float(np.sqrt(np.mean(apart.astype(float) ** 2))),
+        current_amplitude=float(np.abs(steepest[0] / steepest[1] - 1).max()),
+    )
+
+
+def _sums(weights: FloatArray, of_sites: FloatArray) -> npt.NDArray[np.float32]:
+    """Weighted sums (events, samples) over sites of (events, sites, samples)."""
+    return np.asarray(np.einsum("es,est->et", weights, of_sites), np.float32)

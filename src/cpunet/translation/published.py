@@ -1,0 +1,179 @@
+"""The authors' published weights, by the names of their files, as networks of ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from cpunet.errors import CpunetError
+from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.positional_unet import PositionalUNet, positional_map
+from cpunet.recipes.schema import GruConfig, PunetConfig
+
+# Their names → ours, of layers; the ninth positional map is never used.
+LAYERS = (
+    {"inc.double_conv": "inlet", "outc.conv.0": "outlet"}
+    | {"fc_mean": "latent_mean", "fc_var": "latent_log_variance"}
+    | {f"down{i}.maxpool_conv.1.double_conv": f"down.{i - 1}" for i in range(1, 5)}
+    | {f"up{i}.conv.double_conv": f"up.{i - 1}" for i in range(1, 5)}
+)
+MAPS = [f"pe{i}.pe" for i in range(1, 10)]
+MAP_TOLERANCE = 1e-3  # theirs are computed in single precision
+
+DISCRIMINATOR_LAYERS = {
+    "embedding": "embedding",
+    "RNNLayer": "gru",
+    "attention_weight": "attention",
+    "norm": "norm",
+    "fcnet": "outlet",
+    "fcnet.0": "outlet",
+}
+
+State = dict[str, Tensor]
+
+
+def load_state(path: Path) -> State:
+    """Read a state dict with torch's loader of plain tensors.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or is anything but a mapping of names to tensors.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # a damaged or hostile file can raise anything
+        raise CpunetError(
+            f"{path}: no plain state dict of tensors, or damaged ({type(error).__name__}); "
+            "nothing of it was executed"
+        ) from error
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
+        raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
+    return dict(state)
+
+
+def read_generator(path: Path, length: int) -> PositionalUNet:
+    """Load a published generator, ``fep_REN.pt`` or ``fep_IREN.pt``.
+
+    Parameters
+    ----------
+    path
+        File of its state dict.
+    length
+        Samples of a pulse.
+
+    Raises
+    ------
+    CpunetError
+        If it is no such file, or its tensors or positional maps are those of another
+        architecture: names what is missing, extra or of another shape.
+    """
+    state = load_state(path)
+    first = state.get("inc.double_conv.0.weight")
+    width = 0 if first is None or first.ndim == 0 else len(first)
+    if width < 2 or width % 2:
+        raise CpunetError(
+            f"{path}: no Positional U-Net (inc.double_conv.0.weight is missing or has an odd "
+            "number of channels); give a file such as fep_REN.pt"
+        )
+    config = PunetConfig(name="punet", width=width, dropout=0.1, residual=False)
+    with torch.device("meta"):
+        expected = PositionalUNet(config, length).state_dict()
+    maps = {name: state.pop(name) for name in MAPS if name in state}
+    named = _renamed(state, LAYERS)
+    _require_same(path, named, expected, sorted(set(MAPS) - set(maps)))
+    _check_maps(path, maps, width, length)
+    network = PositionalUNet(config, length)
+    network.load_state_dict(named)
+    return network.eval()
+
+
+def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
+    """Load a published discriminator's weights, ``fep_netD_A.pth`` or ``fep_netD_B.pth``.
+
+    They are kept by name: the published network never calls its attention matrix and batch
+    norm, so outputs of the network here differ from its own.
+
+    Raises
+    ------
+    CpunetError
+        As `read_generator`.
+    """
+    state = load_state(path)
+    table, hidden = state.get("embedding.weight"), state.get("RNNLayer.weight_hh_l0")
+    if table is None or table.ndim != 2 or hidden is None or hidden.ndim != 2:
+        raise CpunetError(f"{path}: no discriminator; give a file such as fep_netD_A.pth")
+    config = GruConfig(
+        name="gru",
+        embedding_rows=len(table),
+        embedding_dim=table.shape[1],
+        hidden=hidden.shape[1],
+        samples_per_step=1,
+        value_range=None,
+    )
+    network = GruDiscriminator(config)
+    named = _renamed(state, DISCRIMINATOR_LAYERS)
+    _require_same(path, named, network.state_dict(), [])
+    network.load_state_dict(named)
+    return network.eval(), config
+
+
+def _renamed(state: State, layers: dict[str, str]) -> State:
+    """Our names for the layers known, theirs for the others."""
+    named: State = {}
+    for name, value in state.items():
+        layer, _, rest = name.rpartition(".")
+        # batch norms and convolutions are numbered inside their block
+        block, _, number = layer.rpartition(".")
+        if layer in layers:
+            named[f"{layers[layer]}.{rest}"] = value
+        elif block in layers and number.isdecimal():
+            named[f"{layers[block]}.{number}.{rest}"] = value
+        else:
+            named[name] = value
+    return named
+
+
+def _require_same(path: Path, named: State, expected: State, absent: list[str]) -> None:
+    missing = [*sorted(expected.keys() - named.keys()), *absent]
+    extra = sorted(named.keys() - expected.keys())
+    other = [
+        name
+        for name in sorted(expected.keys() & named.keys())
+        if named[name].shape != expected[name].shape
+    ]
+    told = [
+        f"{len(names)} {what} ({', '.join(names[:3])}{', …' if len(names) > 3 else ''})"
+        for names, what in ((missing, "missing"), (extra, "extra"), (other, "of other shape"))
+        if names
+    ]
+    if told:
+        raise CpunetError(f"{path}: weights of another architecture: {'; '.join(told)}")
+
+
+def _check_maps(path: Path, maps: State, width: int, length: int) -> None:
+    """The maps are no weights, but a network with others is another network."""
+    m = width
+    channels = (m, 2 * m, 4 * m, 8 * m, 8 * m, 4 * m, 2 * m, m)
+    last = (1, 2, 4, 8, 16, 8, 4, 2)
+    offsets = (0, 0, 0, 0, 0, 4 * m, 2 * m, 2 * m)
+    for name, d, factor, offset in zip(MAPS, channels, last, offsets, strict=False):
+        samples = length // factor + offset
+        found = maps[name]
+        wanted = positional_map(d, samples, 0)
+        if (
+            found.ndim != 3
+            or found.shape[:2] != wanted.shape[:2]
+            or found.shape[2] < samples
+            or not torch.allclose(found[..., :samples].float(), wanted, atol=MAP_TOLERANCE)
+        ):
+            raise CpunetError(
+                f"{path}: weights of another architecture: positional map {name} is not that "
+                f"of {d} channels"
+            )

@@ -1,0 +1,293 @@
+"""Translated pulses as raw traces in ADC counts: the preparation undone.
+
+``raw = baseline + scale * prepared``, with a scale in proportion to the energy.  A readout chain
+gives records of any length, with noise all along.  Its noise is added once and nothing is
+normalised afterwards, so that it does not change the height of a pulse.  A network knows
+windows of its own length alone: before them stands the baseline, after them the decay fitted
+to the end of each, both without noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Codes, Rejection, prepare
+from cpunet.recipes.schema import PreparationConfig
+from cpunet.training.run_folder import read_info
+from cpunet.translation.backends import ResponseBackend
+from cpunet.translation.output_form import Formed
+from cpunet.translation.translator import BATCH, REN
+
+HIGHEST = int(np.iinfo(np.uint16).max)
+RISE_SAMPLES = 20  # of the pulse whose height defines the gain
+LEAST_ADC = 20.0  # a median scale below is none of raw traces
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AdcScale:
+    """How prepared units become ADC counts.
+
+    Parameters
+    ----------
+    per_kev
+        ADC counts of 1 in prepared units, per keV.
+    baseline
+        In ADC counts.
+    """
+
+    per_kev: float
+    baseline: float
+
+
+def to_adc(
+    windows: FloatArray, scale: npt.ArrayLike, baseline: npt.ArrayLike
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
+    """Undo ``prepared = (raw - baseline) / scale``, round, and keep to what 16 bits hold.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses, shape (n, samples); a row with NaN becomes a row of 0.
+    scale, baseline
+        In ADC counts, for each row or for all.
+
+    Returns
+    -------
+    traces
+        Of the same shape.
+    saturated
+        Which rows would have left the range, shape (n,).
+
+    Examples
+    --------
+    >>> to_adc(np.array([[0, 0.8], [0, 80]], np.float32), 1000.0, 200.0)
+    (array([[  200,  1000],
+           [  200, 65535]], dtype=uint16), array([False,  True]))
+    """
+    factor = np.asarray(scale, float).reshape(-1, 1)
+    counts = np.rint(windows * factor + np.asarray(baseline, float).reshape(-1, 1))
+    missing = ~np.isfinite(counts).all(axis=1)
+    counts[missing] = 0
+    saturated = ((counts < 0) | (counts > HIGHEST)).any(axis=1)
+    return counts.clip(0, HIGHEST).astype(np.uint16), saturated
+
+
+def adc_scale(
+    run: Path, ren: REN, *, adc_per_kev: float | None, baseline: float | None
+) -> AdcScale:
+    """Find gain and baseline: as given, else those of the data that the run was trained on.
+
+    Parameters
+    ----------
+    run
+        Folder of the run, whose ``run.json`` tells of the data.
+    ren
+        The run, loaded.
+    adc_per_kev
+        Maximum over the baseline of a fast pulse in ADC counts per keV; the inverse of
+        what ``--kev-per-adc`` says of data.
+    baseline
+        In ADC counts.
+
+    Raises
+    ------
+    CpunetError
+        If one is neither given nor known, or not a positive number.
+    """
+    for name, value in (("--adc-per-kev", adc_per_kev), ("--baseline", baseline)):
+        if value is not None and not (np.isfinite(value) and value >= 0):
+            raise CpunetError(f"{name} is {value}; expected a number above 0")
+    if adc_per_kev == 0:
+        raise CpunetError("--adc-per-kev is 0; expected a number above 0")
+    known_gain, known_baseline = _of_the_data(run, ren)
+    per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
+    level = known_baseline if baseline is None else baseline
+    if per_kev is None:
+        raise CpunetError(
+            f"{run}: does not say how many ADC counts a keV is; give --adc-per-kev"
+        )
+    if level is None:
+        raise CpunetError(f"{run}: does not say where the baseline is; give --baseline")
+    return AdcScale(per_kev, level)
+
+
+class AdcForm:
+    """Raw traces in ADC counts, 0 for pulses that were rejected.
+
+    Parameters
+    ----------
+    ren
+        A trained run.
+    scale
+        Gain and baseline.
+    length, n_pre
+        Samples of a trace, and those before a pulse reaches 99.9 % of its maximum (without
+        noise); the window's own if None.
+
+    Raises
+    ------
+    CpunetError
+        If `n_pre` is not within the trace.
+    """
+
+    samples: npt.DTypeLike = np.uint16
+    units = "ADC"
+
+    def __init__(
+        self, ren: REN, scale: AdcScale, length: int | None = None, n_pre: int | None = None
+    ) -> None:
+        self.ren, self.scale = ren, scale
+        self.config = ren.recipe.preparation
+        self.length = self.config.length if length is None else length
+        self.n_pre = self.config.samples_before if n_pre is None else n_pre
+        if not 0 <= self.n_pre < self.length:
+            raise CpunetError(
+                f"--n-pre {self.n_pre} is not within a trace of {self.length} samples; "
+                "give less, or more for --length"
+            )
+        self.t0_ns = -self.n_pre * ren.dt_ns
+
+    @property
+    def fills_in(self) -> bool:
+        """Whether parts of a trace are no translation, but baseline and decay without noise."""
+        before = self.n_pre - self.config.samples_before
+        after = self.length - self.n_pre - self.config.samples_after
+        return not isinstance(self.ren.backend, ResponseBackend) and max(before, after) > 0
+
+    def __call__(
+        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
+    ) -> Formed:
+        """Translate pulses, keeping their rows; those without energy are rejected."""
+        backend = self.ren.backend
+        if isinstance(backend, ResponseBackend):
+            windows, codes = self._of_chain(backend, pulses, noise, generator)
+        else:
+            done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
+            codes = done.codes.copy()
+            windows = extended(
+                done.pulses.waveforms, self.config, self.ren.dt_ns, self.length, self.n_pre
+            )
+        unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
+        codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
+        windows[codes != Rejection.ACCEPTED] = np.nan
+        scale = np.where(unknown, 0.0, self.scale.per_kev * pulses.energy_kev)
+        traces, saturated = to_adc(windows, scale, self.scale.baseline)
+        # 16 bits are exact in single precision
+        return Formed(pulses.with_waveforms(traces.astype(np.float32)), codes, saturated)
+
+    def _of_chain(
+        self,
+        backend: ResponseBackend,
+        pulses: Pulses,
+        noise: bool,
+        generator: torch.Generator | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
+        prepared = prepare(pulses, self.config, "simulated")
+        traces = np.full((len(pulses), self.length), np.nan, np.float32)
+        codes = prepared.codes.copy()
+        usable = np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0)
+        kept = usable[prepared.index]
+        index = prepared.index[kept]
+        windows = prepared.pulses.waveforms[kept]
+        device = backend.device if generator is None else generator.device
+        seed = torch.randint(2**62, (), generator=generator, device=device)
+        rng = np.random.default_rng(int(seed))
+        for first in range(0, len(windows), BATCH):
+            rows = index[first : first + BATCH]
+            levels, codes[rows] = self._levels(backend, windows[first : first + BATCH])
+            if noise:
+                energies = pulses.energy_kev[rows]
+                levels += backend.chain.noise.draw(energies, self.length, rng)
+            traces[rows] = levels
+        return traces, codes
+
+    def _levels(self, backend: ResponseBackend, windows: FloatArray) -> tuple[FloatArray, Codes]:
+        """Noise-free traces of prepared simulated windows, the 99.9 % at sample `n_pre`."""
+        config, dt_ns = self.config, self.ren.dt_ns
+        before = max(0, self.n_pre - config.samples_before)
+        after = max(0, self.length - self.n_pre - config.samples_after)
+        # before its window no charge has moved, after it all has been collected
+        long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
+        with torch.inference_mode():
+            records = backend.network(torch.from_numpy(long).to(backend.device)).cpu().numpy()
+        config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
+        clean = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
+        source = clean.align_sample[:, np.newaxis] - self.n_pre + np.arange(self.length)
+        source = source.clip(0, records.shape[1] - 1)
+        level = np.take_along_axis(records[clean.index], source, axis=1)
+        levels = np.full((len(windows), self.length), np.nan, np.float32)
+        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / clean.scale[
+            :, np.newaxis
+        ]
+        return levels, clean.codes
+
+
+def extended(
+    windows: FloatArray, config: PreparationConfig, dt_ns: float, length: int, n_pre: int
+) -> FloatArray:
+    """Cut or extend prepared windows: 0 before them, each one's fitted decay after them.
+
+    Parameters
+    ----------
+    windows
+        Shape (n, config.length); rows of NaN stay that.
+    config
+        How they were prepared; `decay_fit_samples` at the end of each give its decay.
+    dt_ns
+        Sampling period in ns.
+    length, n_pre
+        Samples of the result, and those before the aligned one.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape (n, length).
+    """
+    time = np.arange(length) - n_pre + config.samples_before  # as samples of the window
+    inside = (time >= 0) & (time < config.length)
+    result = np.zeros((len(windows), length), np.float32)
+    result[:, inside] = windows[:, time[inside]]
+    late = time >= config.length
+    if late.any():
+        measured = prepare(Pulses.of(windows, dt_ns=dt_ns), config, "measured")
+        per_sample = np.zeros(len(windows))
+        per_sample[measured.index] = measured.tail_slope * dt_ns * 1e-6
+        # the level of the last samples belongs to their middle
+        since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
+        end = windows[:, -config.tail_samples :].mean(axis=1)
+        result[:, late] = end[:, np.newaxis] * np.exp(per_sample[:, np.newaxis] * since)
+    result[np.isnan(windows).any(axis=1)] = np.nan
+    return result
+
+
+def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:
+    """Gain (ADC of 1 in prepared units, per keV) and baseline of the data, if the run tells."""
+    info = read_info(run)
+    cuts = (info.get("data") or {}).get("cuts") or {}
+    amplitude = float(cuts.get("amplitude") or 0.0)
+    if amplitude < LEAST_ADC:
+        return None, None
+    centres = {window["name"]: float(window["centre"]) for window in cuts.get("windows", ())}
+    peak = ren.recipe.peaks.get(info["peak"])
+    return (None if peak is None else amplitude / peak.energy_kev), centres.get("baseline")
+
+
+def _height(ren: REN) -> float:
+    """Highest sample, in prepared units, of a fast pulse without noise."""
+    config = ren.recipe.preparation
+    time = np.arange(config.length) - config.samples_before
+    ramp = np.clip(time / RISE_SAMPLES + 1, 0, 1).astype(np.float32)
+    height = float(ren.apply(ramp[np.newaxis], noise=False).max())
+    if not (np.isfinite(height) and height > 0):
+        raise CpunetError("the run cannot translate a fast pulse; train again")
+    return height

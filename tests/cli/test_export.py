@@ -1,0 +1,122 @@
+"""The commands export, import and library: what they print, write and refuse."""
+
+from __future__ import annotations
+
+import pickle
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+import torch
+from lgdo import Array, Scalar, Struct
+
+
+def library_file(path, n_samples=300, dt_ns=16.0):
+    time = np.arange(n_samples) * dt_ns
+    charge = 1 / (1 + np.exp(-(time - np.linspace(500, 900, 12)[:, None]) / 40))
+    charge = charge.reshape(3, 4, n_samples)
+    charge[2, 3] = np.nan
+    content = {
+        "r": Array(np.arange(3.0), attrs={"units": "mm"}),
+        "z": Array(np.arange(4.0), attrs={"units": "mm"}),
+        "dt": Scalar(dt_ns, attrs={"units": "ns"}),
+        "t0": Scalar(0.0, attrs={"units": "ns"}),
+        "waveform_000_deg": Array(charge, attrs={"units": ""}),
+    }
+    lh5.write(Struct(content), "V01", str(path), wo_mode="of")
+    return path
+
+
+def test_a_library_is_translated(command, trained, tmp_path):
+    source = library_file(tmp_path / "psl.lh5")
+    done = command("library", "translate", trained, source, "--out", tmp_path / "ren.lh5")
+    assert done.code == 0, done.err
+    assert "11 of 12 templates translated; 1 outside" in done.out
+    assert "current amplitude within" in done.out
+    with h5py.File(tmp_path / "ren.lh5") as file:
+        assert file["V01/waveform_000_deg"].shape == (3, 4, 300)
+    again = command("library", "translate", trained, source, "--out", tmp_path / "ren.lh5")
+    assert again.code == 2
+    assert "exists already" in again.err
+    other = library_file(tmp_path / "fine.lh5", dt_ns=1.0)
+    refused = command("library", "translate", trained, other, "--out", tmp_path / "x.lh5")
+    assert refused.code == 2
+    assert "knows 16 ns alone" in " ".join(refused.err.split())
+    (tmp_path / "text").write_text("no HDF5")
+    refused = command("library", "translate", trained, tmp_path / "text", "--out", "x.lh5")
+    assert refused.code == 2
+    assert len(refused.err.strip().splitlines()) == 1
+
+
+def test_a_library_is_made(command, tmp_path):
+    words = ["library", "make", "--detector", "ppc", "--out", tmp_path / "psl.lh5"]
+    short = ["--grid-mm", "12", "--dt-ns", "8", "--length-ns", "2400"]
+    done = command(*words, *short, "--angles", "0,30,45")
+    assert done.code == 0, done.err
+    assert "places have a template" in done.out
+    (name,) = lh5.ls(str(tmp_path / "psl.lh5"))
+    made = lh5.read(name, str(tmp_path / "psl.lh5"))
+    assert {"waveform_000_deg", "waveform_030_deg", "drift_time_045_deg"} <= set(made)
+    assert made["dt"].value == 8
+    assert made["waveform_000_deg"].nda.shape[2] == 300
+    for wrong in (["--angles", "0,0"], ["--angles", "1.5"], ["--grid-mm", "0"]):
+        refused = command(*words[:-1], tmp_path / "other.lh5", *short, *wrong)
+        assert refused.code == 2
+        assert "Traceback" not in refused.err
+        assert not (tmp_path / "other.lh5").exists()
+
+
+def test_export(command, trained, tmp_path):
+    out = tmp_path / "ren.pt"
+    done = command("export", trained, "--format", "torchscript", "--out", out)
+    assert done.code == 0, done.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ren.card.md", "ren.pt"]
+    card = (tmp_path / "ren.card.md").read_text()
+    assert "recipe small" in card
+    assert "`epsilon`" in card
+    assert "data.lh5" in card
+    refused = command("export", trained, "--format", "torchscript", "--out", out)
+    assert refused.code == 2
+    refused = command("export", tmp_path, "--out", tmp_path / "x.onnx")
+    assert refused.code == 2
+    assert "no finished run" in refused.err
+    assert command("export", trained, "--format", "tflite", "--out", out).code == 2
+
+
+def test_import_pulses(command, tmp_path):
+    source = tmp_path / "fep.pickle"
+    with source.open("wb") as stream:
+        for i in range(3):
+            pickle.dump({"wf": np.arange(50.0) + i, "tp0": 3, "energy": 2614.5}, stream)
+    done = command("import", "pulses", source, "--out", tmp_path / "pulses.lh5")
+    assert done.code == 0, done.err
+    assert "3 of 3 pulses" in done.out
+    assert "3" in command("info", tmp_path / "pulses.lh5").out
+    source.write_bytes(source.read_bytes()[:-5])
+    done = command("import", "pulses", source, "--out", tmp_path / "pulses.lh5", "--force")
+    assert done.code == 0
+    assert "2 of 2 pulses" in done.out
+    assert "ends within a pulse" in " ".join(done.err.split())
+    source.write_bytes(b"cos\nsystem\n(S'touch made'\ntR.")
+    refused = command("import", "pulses", source, "--out", tmp_path / "other.lh5")
+    assert refused.code == 2
+    assert "refused, nothing of it was executed" in refused.err
+
+
+def test_import_weights(command, tmp_path):
+    refused = command("import", "weights", "--out", tmp_path / "run")
+    assert refused.code == 2
+    assert "no generator given" in refused.err
+    torch.save({"weight": torch.zeros(1)}, tmp_path / "other.pt")
+    refused = command(
+        "import", "weights", "--ren", tmp_path / "other.pt", "--out", tmp_path / "run"
+    )
+    assert refused.code == 2
+    assert "no Positional U-Net" in refused.err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["export", "import", "library"])
+def test_help(command, name):
+    assert command(name, "--help").code == 0

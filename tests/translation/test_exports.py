@@ -1,0 +1,161 @@
+"""Exported graphs against the run, by the tools that read them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.errors import CpunetError
+from cpunet.jobs.export import export_run
+from cpunet.networks.hybrid import EdgeResidual
+from cpunet.networks.linear_inverse import LinearInverse, Sizes
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import write_run
+from cpunet.translation.exports import FORMATS, export, graph_of
+from cpunet.translation.translator import IREN, REN
+
+
+def write_chain(folder: Path, recipe_name: str) -> Path:
+    """A run of a readout chain, with a residual if its recipe has one."""
+    recipe = load_recipe(recipe_name)
+    generator = ResponseGenerator(recipe.matching.generator, 16.0)
+    noise = BaselineNoise(np.full(NOISE_BINS, 9.0), 2 * (NOISE_BINS - 1), 16.0, 100)
+    generator.set_noise(noise)
+    inverse = LinearInverse(Sizes.of(recipe.preparation.length, recipe.matching.training))
+    inverse.half_height.fill_(0.4)
+    inverse.weights.copy_(torch.eye(len(inverse.weights)))
+    model = nn.ModuleDict({"ren": generator, "iren": inverse})
+    if recipe_name == "best":
+        residual = EdgeResidual(recipe.residual)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            nn.init.normal_(residual.outlet.weight, std=0.05)
+        residual.used.fill_(True)
+        model["residual"] = residual
+    info = {"recipe": recipe_name, "peak": "FEP", "seed": 0, "dt_ns": 16.0, "seconds": 1.0}
+    folder.mkdir()
+    write_run(folder, model, recipe, info | {"device": "cpu"})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_chain(tmp_path_factory.mktemp("exports") / "chain", "fast")
+
+
+def prepared(sim: np.ndarray) -> np.ndarray:
+    config = load_recipe("fast").preparation
+    return prepare(Pulses.of(sim, dt_ns=16), config, "simulated").pulses.waveforms
+
+
+def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    ort = pytest.importorskip("onnxruntime")
+    done = export_run(chain, tmp_path / "ren.onnx", "onnx")
+    assert done.difference < 2e-5
+    model = onnx.load(tmp_path / "ren.onnx")
+    onnx.checker.check_model(model)
+    assert {opset.version for opset in model.opset_import if not opset.domain} == {18}
+    session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
+    windows = prepared(sim)
+    translator = REN.load(chain)
+    for n in (1, 5):
+        (records,) = session.run(None, {"windows": windows[:n]})
+        expected = translator.backend.network(torch.from_numpy(windows[:n])).detach().numpy()
+        assert records.shape == (n, 1400)
+        np.testing.assert_allclose(records, expected, atol=2e-5)
+    # prepared as the card says, they are the translation
+    clean = prepare(
+        Pulses.of(records, dt_ns=16),
+        translator.recipe.preparation.model_copy(update={"saturation_run": 2000}),
+        "measured",
+    )
+    np.testing.assert_allclose(
+        clean.pulses.waveforms, translator.translate(sim, noise=False), atol=5e-5
+    )
+
+
+def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
+    pytest.importorskip("onnx")
+    ort = pytest.importorskip("onnxruntime")
+    export_run(run, tmp_path / "ren.onnx", "onnx")
+    session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
+    windows, translator = prepared(sim), REN.load(run)
+    channels = translator.backend.network.latent_mean.out_channels
+    zeros = np.zeros((5, channels, 50), np.float32)
+    (mean,) = session.run(None, {"windows": windows, "epsilon": zeros})
+    np.testing.assert_allclose(mean, translator.apply(windows, noise=False), atol=1e-5)
+    draw = torch.randn(zeros.shape, generator=torch.Generator().manual_seed(4)).numpy()
+    (drawn,) = session.run(None, {"windows": windows, "epsilon": draw})
+    expected = translator.apply(windows, generator=torch.Generator().manual_seed(4))
+    np.testing.assert_allclose(drawn, expected, atol=1e-5)
+    assert np.abs(drawn - mean).max() > 1e-5
+
+
+def test_torchscript_and_torch_export(run, chain, tmp_path):
+    hybrid = write_chain(tmp_path / "best", "best")
+    for folder, kind in ((run, IREN), (chain, REN), (chain, IREN), (hybrid, REN)):
+        graph = graph_of(kind.load(folder))
+        for form in ("torchscript", "torch-export"):
+            if (folder, form) == (run, "torch-export"):
+                continue  # seconds, and what ONNX is made of
+            assert export(graph, tmp_path / "graph", form) < 2e-5
+
+
+def test_the_card_and_the_noise(chain, tmp_path):
+    report = tmp_path / "report"
+    report.mkdir()
+    scores = {"SEP": {"parameters": {"drift_time": {"iou": {"ren": 0.87, "ceiling": 0.9}}}}}
+    (report / "metrics.json").write_text(json.dumps({"peaks": scores}))
+    done = export_run(chain, tmp_path / "ren.pt", "torchscript", report=report)
+    assert (done.card.name, done.noise.name) == ("ren.card.md", "ren.noise.npz")
+    card = done.card.read_text()
+    for words in (
+        "recipe fast",
+        "trained on FEP",
+        "(batch, 800)",
+        "(batch, 1400)",
+        "every 16 ns",
+        "ren.noise.npz",
+        "| SEP | drift time | ren 87.0, ceiling 90.0 |",
+    ):
+        assert words in card
+    with np.load(done.noise) as noise:
+        total = noise["shares"] @ (noise["continua"] + noise["lines"])
+        np.testing.assert_allclose(total, 9.0, rtol=1e-5)
+        assert noise["samples"] == 2 * (len(total) - 1)
+    with pytest.raises(CpunetError, match="exists already"):
+        export_run(chain, tmp_path / "ren.pt", "torchscript")
+    export_run(chain, tmp_path / "iren.pt", "torchscript", inverse=True)
+    assert not (tmp_path / "iren.noise.npz").exists()
+
+
+def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
+    with pytest.raises(CpunetError, match="no scores"):
+        export_run(chain, tmp_path / "ren.pt", "torchscript", report=tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "onnx", None)
+    with pytest.raises(CpunetError, match=r"pip install 'cpunet\[onnx\]'"):
+        export_run(chain, tmp_path / "ren.onnx", "onnx")
+    graph = graph_of(REN.load(chain))
+    with pytest.raises(CpunetError, match="not known"):
+        export(graph, tmp_path / "x", "tflite")
+    # a graph that is not the run's is not left behind
+    other = REN.load(chain)
+    with torch.no_grad():
+        other.backend.chain.response.log_decay_us.add_(1)
+    wrong = type(graph)(
+        graph.module, graph.inputs, graph.output, graph.example, graph_of(other).expected
+    )
+    with pytest.raises(CpunetError, match="differs from the run"):
+        export(wrong, tmp_path / "x", "torchscript")
+    assert set(FORMATS) == {"onnx", "torchscript", "torch-export"}
+    assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []

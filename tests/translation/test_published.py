@@ -1,0 +1,374 @@
+"""Published weights against the layer table, written out; pickles, pulses and others."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import lh5
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.import_published import import_pulses, import_weights
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.translation.restricted_unpickler import ForbiddenError, TruncatedError, load
+from cpunet.translation.translator import IREN, REN
+
+M = 4
+LENGTH = 800
+
+
+def blocks(m: int) -> dict[str, tuple[int, int, int]]:
+    """Channels in, middle and out of each double convolution, by the layer table."""
+    table = {"inc": (1, m, m)}
+    for i, (c, o) in enumerate(((m, 2 * m), (2 * m, 4 * m), (4 * m, 8 * m), (8 * m, 8 * m)), 1):
+        table[f"down{i}.maxpool_conv.1"] = (c, o, o)
+    for i, (c, o) in enumerate(((16, 4), (8, 2), (4, 1), (2, 0.5)), 1):
+        table[f"up{i}.conv"] = (c * m, c * m // 2, int(o * m))
+    return table
+
+
+def state_dict(m: int = M, seed: int = 0) -> dict[str, Tensor]:
+    """Random weights under the published names, with maps in single precision."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int, low: float = -1.0, high: float = 1.0) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=rng)
+
+    state: dict[str, Tensor] = {}
+    for name, (c, mid, o) in blocks(m).items():
+        for first, (i, j, kernel) in ((0, (c, mid, 11)), (3, (mid, o, 7))):
+            layer = f"{name}.double_conv"
+            scale = 1 / math.sqrt(i * kernel)
+            state[f"{layer}.{first}.weight"] = scale * uniform(j, i, kernel)
+            norm = f"{layer}.{first + 1}"
+            state[f"{norm}.weight"] = uniform(j, low=0.5, high=1.5)
+            state[f"{norm}.bias"] = uniform(j)
+            state[f"{norm}.running_mean"] = uniform(j)
+            state[f"{norm}.running_var"] = uniform(j, low=0.5, high=2.0)
+            state[f"{norm}.num_batches_tracked"] = torch.tensor(7)
+    for name, c, o in (("fc_mean", 8 * m, 8 * m), ("fc_var", 8 * m, 8 * m)):
+        state[f"{name}.weight"] = uniform(o, c, 1) / math.sqrt(c)
+        state[f"{name}.bias"] = uniform(o)
+    state["outc.conv.0.weight"] = uniform(1, m // 2, 1)
+    state["outc.conv.0.bias"] = uniform(1)
+    for i, d in enumerate((m, 2 * m, 4 * m, 8 * m, 8 * m, 4 * m, 2 * m, m, m // 2), 1):
+        position = torch.arange(10_000).float()
+        frequency = torch.exp(torch.arange(0, d, 2).float() * (-math.log(10_000) / d))
+        phase = frequency[:, None] * position
+        map_ = torch.zeros(1, d, 10_000)
+        map_[0, 0::2], map_[0, 1::2] = phase.sin(), phase.cos()
+        state[f"pe{i}.pe"] = map_
+    return state
+
+
+def published_forward(state: dict[str, Tensor], pulses: Tensor, epsilon: Tensor) -> Tensor:
+    """The network of the layer table, step by step; epsilon is the latent noise."""
+
+    def block(name: str, x: Tensor) -> Tensor:
+        for first, pad in ((0, 5), (3, 3)):
+            layer = f"{name}.double_conv"
+            x = F.conv1d(x, state[f"{layer}.{first}.weight"], padding=pad)
+            n = f"{layer}.{first + 1}"
+            x = F.batch_norm(
+                x,
+                state[f"{n}.running_mean"],
+                state[f"{n}.running_var"],
+                state[f"{n}.weight"],
+                state[f"{n}.bias"],
+            )
+            x = F.leaky_relu(x, 0.01)
+        return x
+
+    def position(i: int, x: Tensor, offset: int = 0) -> Tensor:
+        return x + state[f"pe{i}.pe"][:, :, offset : offset + x.shape[2]]
+
+    m = len(state["inc.double_conv.0.weight"])
+    skips = [position(1, block("inc", pulses))]
+    for i in (1, 2, 3):
+        x = block(f"down{i}.maxpool_conv.1", F.max_pool1d(skips[-1], 2))
+        skips.append(position(i + 1, x))
+    x = block("down4.maxpool_conv.1", F.max_pool1d(skips[-1], 2))
+    mean = F.conv1d(x, state["fc_mean.weight"], state["fc_mean.bias"])
+    log_variance = F.conv1d(x, state["fc_var.weight"], state["fc_var.bias"])
+    x = position(5, mean + torch.exp(log_variance / 2) * epsilon)
+    for i, offset in ((1, 4 * m), (2, 2 * m), (3, 2 * m), (4, None)):
+        wide = F.interpolate(x, scale_factor=2, mode="linear", align_corners=True)
+        x = block(f"up{i}.conv", torch.cat([skips[4 - i], wide], dim=1))
+        if offset is not None:
+            x = position(5 + i, x, offset)
+    return F.conv1d(x, state["outc.conv.0.weight"], state["outc.conv.0.bias"])
+
+
+def windows(n: int = 3) -> np.ndarray:
+    width = np.linspace(2, 6, n)[:, None]
+    charge = 1 / (1 + np.exp(-(np.arange(LENGTH) - 370) / width))
+    return charge.astype(np.float32)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    torch.save(state_dict(seed=1), tmp_path / "fep_REN.pt")
+    torch.save(state_dict(seed=2), tmp_path / "fep_IREN.pt")
+    return tmp_path / "fep_REN.pt", tmp_path / "fep_IREN.pt"
+
+
+def test_the_table_has_the_published_number_of_parameters():
+    names = ("pe", "running", "num_batches")
+    weights = {k: v for k, v in state_dict(40).items() if not any(n in k for n in names)}
+    assert sum(v.numel() for v in weights.values()) == 7_213_781
+
+
+def test_imported_generators_give_the_published_outputs(files, tmp_path):
+    ren, iren = files
+    info = import_weights(tmp_path / "run", ren=ren, iren=iren)
+    assert set(info["imported"]) == {"ren", "iren"}
+    pulses = torch.from_numpy(windows())[:, None]
+    for kind, seed in ((REN, 1), (IREN, 2)):
+        translator = kind.load(tmp_path / "run")
+        mean = translator.apply(windows(), noise=False)
+        expected = published_forward(state_dict(seed=seed), pulses, torch.zeros(()))
+        assert np.abs(mean - expected[:, 0].numpy()).max() < 1e-5
+        generator = torch.Generator().manual_seed(9)
+        drawn = translator.apply(windows(), generator=generator)
+        epsilon = torch.randn(3, 8 * M, 50, generator=torch.Generator().manual_seed(9))
+        expected = published_forward(state_dict(seed=seed), pulses, epsilon)
+        assert np.abs(drawn - expected[:, 0].numpy()).max() < 1e-5
+    # and the run can be used as any other
+    assert REN.load(tmp_path / "run").translate(windows(), noise=False).shape == (3, LENGTH)
+    stored = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert stored["dt_ns"] == 16
+    assert len(stored["imported"]["ren"]["sha256"]) == 64
+
+
+def test_one_generator_is_enough(files, tmp_path):
+    import_weights(tmp_path / "run", ren=files[0])
+    REN.load(tmp_path / "run")
+    with pytest.raises(CpunetError, match="weights of another network"):
+        IREN.load(tmp_path / "run")
+
+
+def discriminator(hidden: int = 64) -> dict[str, Tensor]:
+    both = 2 * hidden
+    state = {"embedding.weight": torch.rand(1000, 64)}
+    for end in ("", "_reverse"):
+        state[f"RNNLayer.weight_ih_l0{end}"] = torch.rand(3 * hidden, 64)
+        state[f"RNNLayer.weight_hh_l0{end}"] = torch.rand(3 * hidden, hidden)
+        state[f"RNNLayer.bias_ih_l0{end}"] = torch.rand(3 * hidden)
+        state[f"RNNLayer.bias_hh_l0{end}"] = torch.rand(3 * hidden)
+    state["attention_weight.weight"] = torch.rand(both, both)
+    for name in ("weight", "bias", "running_mean", "running_var"):
+        state[f"norm.{name}"] = torch.rand(both)
+    state["norm.num_batches_tracked"] = torch.tensor(1)
+    state["fcnet.0.weight"], state["fcnet.0.bias"] = torch.rand(1, 2 * both), torch.rand(1)
+    return state
+
+
+def test_discriminators_are_kept(files, tmp_path):
+    weights = discriminator()
+    count = sum(v.numel() for n, v in weights.items() if "running" not in n and "num" not in n)
+    assert count == 130_817
+    torch.save(weights, tmp_path / "fep_netD_A.pth")
+    info = import_weights(
+        tmp_path / "run", ren=files[0], discriminator_data=tmp_path / "fep_netD_A.pth"
+    )
+    assert set(info["imported"]) == {"ren", "discriminator_data"}
+    del weights["norm.bias"]
+    torch.save(weights, tmp_path / "fep_netD_A.pth")
+    with pytest.raises(CpunetError, match=r"1 missing \(norm.bias\)"):
+        import_weights(
+            tmp_path / "other", ren=files[0], discriminator_data=tmp_path / "fep_netD_A.pth"
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s.pop("fc_var.bias"), "1 missing (latent_log_variance.bias)"),
+        (lambda s: s.update(more=torch.zeros(1)), "1 extra (more)"),
+        (lambda s: s.update({"fc_mean.bias": torch.zeros(3)}), "1 of other shape"),
+        (lambda s: s.pop("pe3.pe"), "1 missing (pe3.pe)"),
+        (lambda s: s["pe3.pe"].mul_(2), "positional map pe3.pe"),
+        (lambda s: s.update({"pe2.pe": torch.zeros(1, 8, 10)}), "positional map pe2.pe"),
+        (lambda s: s.pop("inc.double_conv.0.weight"), "no Positional U-Net"),
+        (lambda s: s.update({"inc.double_conv.0.weight": torch.zeros(())}), "no Positional"),
+    ],
+)
+def test_other_architectures_are_refused_in_one_line(tmp_path, change, words):
+    state = state_dict()
+    change(state)
+    torch.save(state, tmp_path / "other.pt")
+    with pytest.raises(CpunetError) as error:
+        import_weights(tmp_path / "run", ren=tmp_path / "other.pt")
+    assert words in str(error.value)
+    assert str(tmp_path / "other.pt") in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+class Hostile:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+def test_hostile_and_broken_weights_are_refused(files, tmp_path):
+    bad = tmp_path / "bad.pt"
+    content = files[0].read_bytes()
+    for write in (
+        lambda: torch.save({"inc": Hostile(tmp_path / "made")}, bad),
+        lambda: bad.write_bytes(pickle.dumps(Hostile(tmp_path / "made"))),
+        lambda: bad.write_bytes(content[: len(content) // 2]),
+        lambda: bad.write_bytes(b""),
+        lambda: torch.save([1, 2], bad),
+        lambda: torch.save({"a": 1}, bad),
+        lambda: bad.unlink(),
+    ):
+        write()
+        with pytest.raises(CpunetError) as error:
+            import_weights(tmp_path / "run", ren=bad)
+        assert "\n" not in str(error.value)
+    assert not (tmp_path / "made").exists()
+    assert not (tmp_path / "run").exists()
+
+
+def entry(i: int, **more: object) -> dict[str, Any]:
+    wf = np.linspace(0, 100, 60) + i
+    return {"wf": wf, "tp0": 20 + i, "energy": 2600.0 + i} | more
+
+
+def dump(path: Path, values: list[Any], protocol: int | None = None) -> Path:
+    with path.open("wb") as stream:
+        for value in values:
+            pickle.dump(value, stream, protocol)
+    return path
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("in_a_list", [False, True])
+def test_pulses_of_every_protocol(tmp_path, protocol, in_a_list):
+    pulses = [entry(i, event=100 + i) for i in range(5)]
+    pulses[1]["wf"] = pulses[1]["wf"].astype(">f4")
+    pulses[2]["energy"] = np.float64(2602.0)
+    pulses[3]["wf"] = np.asfortranarray(pulses[3]["wf"]).astype(np.int16)
+    pulses[4]["event"] = np.int32(104)
+    source = dump(tmp_path / "p.pkl", [pulses] if in_a_list else pulses, protocol)
+    told = import_pulses(source, tmp_path / "p.lh5", dt_ns=10)
+    assert told == {"read": 5, "written": 5, "rejections": {}, "truncated": False}
+    made = lh5.read("geds/raw", str(tmp_path / "p.lh5"))
+    np.testing.assert_allclose(
+        made["waveform"]["values"].nda,
+        [np.asarray(p["wf"], np.float32) for p in pulses],
+    )
+    assert made["waveform"]["dt"].nda.tolist() == [10.0] * 5
+    assert made["energy"].nda.tolist() == [2600.0, 2601, 2602, 2603, 2604]
+    assert made["event_number"].nda.tolist() == [100, 101, 102, 103, 104]
+    assert made["tp0"].nda.tolist() == [20, 21, 22, 23, 24]
+
+
+def test_what_is_no_pulse_is_counted(tmp_path):
+    values = [
+        entry(0),
+        {"energy": 3.0},
+        7,
+        entry(3, wf=np.zeros(9)),
+        entry(4, wf=np.zeros((2, 9))),
+        entry(5, energy="much"),
+        entry(6),
+    ]
+    told = import_pulses(dump(tmp_path / "p.pkl", values), tmp_path / "p.lh5")
+    assert (told["read"], told["written"]) == (7, 2)
+    assert told["rejections"] == {
+        "no_pulse": 2,
+        "other_length": 1,
+        "no_trace": 1,
+        "no_numbers": 1,
+    }
+    made = lh5.read("geds/raw", str(tmp_path / "p.lh5"))
+    assert made["event_number"].nda.tolist() == [0, 6]
+
+
+def test_a_truncated_file_gives_what_was_before_its_end(tmp_path):
+    source = dump(tmp_path / "p.pkl", [entry(i) for i in range(4)])
+    source.write_bytes(source.read_bytes()[:-20])
+    told = import_pulses(source, tmp_path / "p.lh5")
+    assert (told["read"], told["written"], told["truncated"]) == (3, 3, True)
+    source.write_bytes(source.read_bytes()[:50])
+    with pytest.raises(CpunetError, match="no pulse among 0 entries; it ends early"):
+        import_pulses(source, tmp_path / "q.lh5")
+    assert not (tmp_path / "q.lh5").exists()
+
+
+def test_hostile_pickles_are_refused_and_nothing_is_executed(tmp_path):
+    made = tmp_path / "made"
+    array_of_objects = np.array([Hostile(made)], dtype=object)
+    for value in (
+        Hostile(made),
+        [entry(0), Hostile(made)],
+        entry(0, wf=Hostile(made)),
+        array_of_objects,
+        np.array([1, "a"], dtype=object),
+        np.zeros(3, "M8[s]"),
+        np.zeros(2, [("a", "f4")]),
+        np.ma.masked_array([1.0]),
+        np.dtype("f4"),
+        np.ndarray,
+        slice(3),
+        print,
+        Path("x"),
+        {1, 2}.__class__,
+    ):
+        source = dump(tmp_path / "p.pkl", [entry(0), value])
+        with pytest.raises(CpunetError, match="nothing of it was executed") as error:
+            import_pulses(source, tmp_path / "p.lh5")
+        assert "\n" not in str(error.value)
+        assert not made.exists()
+        assert [f.name for f in tmp_path.iterdir()] == ["p.pkl"]
+
+
+RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        # a change of the function that stands for numpy's: {"a": 1} as its state
+        RECONSTRUCT + b"}(Va\nI1\nub.",
+        RECONSTRUCT + b"(N}(V__call__\nI1\nutb.",
+        # a name below an allowed one, an unknown extension, a persistent object
+        b"\x80\x04\x8c\x05numpy\x8c\x10ndarray.__class__\x93.",
+        b"cnumpy\nload\n.",
+        b"\x82\x01.",
+        b"Pabc\n.",
+        # lengths without content
+        b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
+        b"\x80\x03B\xff\xff\xff\x7fabc.",
+        b"\x80\x02}r\xff\xff\xff\x3f.",
+        b"\x80\x04\x95\xff\xff\xff\xff\x00\x00\x00\x00}.",
+        # an array of another size than its bytes, and a code that is none
+        RECONSTRUCT + b"(tR(I1\n(I9\ntcnumpy\ndtype\n(Vf8\ntRI00\nVabc\ntb.",
+        b"\xff\xfe",
+        b"c",
+    ],
+)
+def test_malformed_codes_raise_one_of_two_errors(code):
+    with pytest.raises((ForbiddenError, TruncatedError)):
+        load(io.BytesIO(code))
+
+
+def test_the_network_of_the_run_is_the_published_one(files, tmp_path):
+    import_weights(tmp_path / "run", ren=files[0])
+    network = REN.load(tmp_path / "run").backend.network
+    assert isinstance(network, PositionalUNet)
+    assert not network.training
