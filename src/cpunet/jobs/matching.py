@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from torch import nn
 
+from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import measured_noise
 from cpunet.networks.hybrid import HybridGenerator
+from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import HybridConfig, Recipe, ResponseConfig
@@ -19,6 +22,7 @@ from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import Record
 from cpunet.training.matching import fit_response
 from cpunet.training.residual import fit_residual
+from cpunet.training.run_folder import load_network, read_recipe
 
 POOR_FIT = 3.0  # chi-square per moment from which on a response does not describe the data
 
@@ -32,12 +36,32 @@ class Sides:
     data_file: InputFile
 
 
-def _with_found_ringing(recipe: Recipe, found: ResponseConfig) -> Recipe:
-    """The recipe of the response as it was fitted: it may have begun to ring."""
+def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
+    """The recipe with the configuration of a response: it may have begun to ring."""
     if not isinstance(recipe.generator, ResponseConfig):
         return recipe
-    rings = {"ringing_mhz": found.ringing_mhz}
-    return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=rings)})
+    own = {name: getattr(response, name) for name in ResponseConfig.model_fields}
+    del own["name"]
+    return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=own)})
+
+
+def _known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
+    """The response of a run, to start from.
+
+    Raises
+    ------
+    CpunetError
+        If the run has none.
+    """
+    recipe = read_recipe(run)
+    if not isinstance(recipe.generator, ResponseConfig):
+        raise CpunetError(
+            f"{run}: a network ({recipe.name}), from which no readout chain can start; give a "
+            "run of fast or best"
+        )
+    generator = ResponseGenerator(recipe.generator, dt_ns)
+    load_network(run, "ren", generator)
+    return generator.response
 
 
 def match(
@@ -46,6 +70,7 @@ def match(
     seed: int,
     listen: Callable[[list[Record]], None],
     monitor: Monitor,
+    init: Path | None = None,
 ) -> tuple[nn.Module, dict[str, Any], Recipe]:
     """Measure the noise, fit the response, and invert it.
 
@@ -61,6 +86,8 @@ def match(
         Given a record for each step of the fit.
     monitor
         Told of what is to be noted.
+    init
+        Folder of a run to start from.
 
     Returns
     -------
@@ -80,6 +107,9 @@ def match(
     def tell(step: int, chi_square: float) -> None:
         listen([{"iteration": step, "rate": 0.0, "losses": {"chi_square": chi_square}}])
 
+    known = None if init is None else _known_response(init, sides.sim.dt_ns)
+    if known is not None:
+        recipe = _with_config(recipe, known.config)
     response, fit = fit_response(
         sides.sim.waveforms,
         sides.data.waveforms,
@@ -87,6 +117,7 @@ def match(
         noise,
         recipe,
         seed=seed,
+        known=known,
         listener=tell,
     )
     if fit.chi_square > POOR_FIT * fit.moments:
@@ -94,7 +125,7 @@ def match(
             f"warning: the response describes the data poorly, chi-square "
             f"{fit.chi_square:.0f} for {fit.moments} moments; look at the report"
         )
-    recipe = _with_found_ringing(recipe, response.config)
+    recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
     ren.set_noise(noise)

@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -30,7 +32,16 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import MatchingConfig, Recipe
 from cpunet.training.loop import Keeping, Record, train
-from cpunet.training.run_folder import INFO, append_losses, read_losses, versions, write_run
+from cpunet.training.run_folder import (
+    INFO,
+    append_losses,
+    fill_networks,
+    read_info,
+    read_losses,
+    versions,
+    weights_sha256,
+    write_run,
+)
 from cpunet.training.tensorboard import LossBoard
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
@@ -48,6 +59,7 @@ def train_run(
     peak: str = "FEP",
     seed: int = 0,
     device: str = "auto",
+    init: Path | None = None,
     resume: bool = False,
     force: bool = False,
     tensorboard: bool = False,
@@ -71,6 +83,8 @@ def train_run(
         Of everything random.
     device
         ``"cpu"``, ``"cuda"``, or ``"auto"`` for the GPU if there is one.
+    init
+        Folder of a run of the same kind to start from, as of another detector or period.
     resume
         Go on with the unfinished training, if there is one; all else must be as it was.
     force
@@ -101,7 +115,10 @@ def train_run(
         sim_set = load_simulated(sim, recipe, selection, monitor)
         data_set = load_measured(data, recipe, selection, monitor)
         require_same_sampling(sim_set, data_set)
-        job = _Job(recipe, peak, seed, device, sim_set, data_set, data, folder, monitor)
+        if init is not None:
+            _require_sampling(init, data_set)
+        sides = sim_set, data_set, data
+        job = _Job(recipe, peak, seed, device, init, *sides, folder, monitor)
         with _enough_memory(recipe):
             if isinstance(recipe.training, MatchingConfig):
                 model, info, recipe = job.match(tensorboard)
@@ -124,6 +141,16 @@ def _workplace(
     return folder_written_aside(out, marker=INFO, force=force)
 
 
+def _require_sampling(init: Path, data: InputSet) -> None:
+    """Raise a `CpunetError` if the run to start from had another sampling."""
+    known_ns = float(read_info(init)["dt_ns"])
+    if not np.isclose(known_ns, data.dt_ns):
+        raise CpunetError(
+            f"{init}: trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns; "
+            "resample them"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Job:
     """What is to be trained, on what and where."""
@@ -132,6 +159,7 @@ class _Job:
     peak: str
     seed: int
     device: str
+    init: Path | None
     sim: InputSet
     data: InputSet
     data_file: InputFile
@@ -152,7 +180,9 @@ class _Job:
                 show(records)
                 advance(len(records))
 
-            model, more, recipe = match(sides, self.recipe, self.seed, listen, self.monitor)
+            model, more, recipe = match(
+                sides, self.recipe, self.seed, listen, self.monitor, self.init
+            )
         seconds = time.perf_counter() - clock
         info = self._info(started.isoformat(timespec="seconds"), seconds)
         return model, info | more, recipe
@@ -182,6 +212,7 @@ class _Job:
                 self.recipe,
                 seed=self.seed,
                 device=self.device,
+                init=None if self.init is None else partial(fill_networks, self.init),
                 listener=listen,
                 keeping=Keeping(run.save, start, stop),
             )
@@ -192,11 +223,15 @@ class _Job:
     def _fingerprint(self) -> dict[str, Any]:
         """All that determines the weights."""
         recipe = self.recipe.model_dump(mode="json")
+        del recipe["search"]  # what may be tuned changes no weight
         training = recipe["training"]
         recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
         told = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
         sides = (("simulation", self.sim), ("data", self.data))
-        return {"recipe": recipe, "peak": self.peak, "seed": self.seed} | {
+        settings = {"recipe": recipe, "peak": self.peak, "seed": self.seed}
+        if self.init is not None:
+            settings["init"] = weights_sha256(self.init)
+        return settings | {
             side: {k: v for k, v in pulses.provenance().items() if k in told}
             for side, pulses in sides
         }
@@ -214,6 +249,7 @@ class _Job:
             "recipe": self.recipe.name,
             "peak": self.peak,
             "seed": self.seed,
+            "init": None if self.init is None else str(self.init),
             "device": self.device,
             "threads": torch.get_num_threads(),
             "started": started,

@@ -46,6 +46,7 @@ def fit_response(
     recipe: Recipe,
     *,
     seed: int,
+    known: ElectronicsResponse | None = None,
     listener: Listener | None = None,
 ) -> tuple[ElectronicsResponse, Fit]:
     """Fit a response to unpaired prepared pulses.
@@ -62,6 +63,9 @@ def fit_response(
         With a response to be matched.
     seed
         Of the choice of pulses, if there are many, and of the noise.
+    known
+        The response of a similar readout, of the recipe's configuration, to start from.  Only
+        if that leads nowhere the recipe's own starts are tried.
     listener
         Told step and chi-square.
 
@@ -96,7 +100,8 @@ def fit_response(
         drawn[0],
         last=ROOM_BEFORE + recipe.preparation.samples_before + DELAY,
     )
-    problem, fit = _best_start(first, config, training, listener)
+    near = None if known is None else _from_known(first, known, training, listener)
+    problem, fit = near or _best_start(first, config, training, listener)
     if _poor(fit):
         problem, fit = _ringing_if_better(problem, fit, config, training, listener)
     if sets > 1:
@@ -114,6 +119,24 @@ def fit_response(
 
 def _poor(fit: Fit) -> bool:
     return fit.chi_square >= GOOD_FIT * fit.moments
+
+
+def _from_known(
+    first: ResponseProblem,
+    known: ElectronicsResponse,
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Fit] | None:
+    """Fit from a response that is known, first as if the data were near; None if it is poor."""
+    start = copy.deepcopy(known)
+    _set_decay(start, float(first.moments.slope))
+    problem, steps = first.of(start), 0
+    for coarse in (False, True):
+        fit = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
+        steps += fit.steps
+        if not _poor(fit):
+            return problem, replace(fit, steps=steps)
+    return None
 
 
 def _best_start(
@@ -174,6 +197,11 @@ def _start(
     """A response with the recipe's poles times a factor, and the data's own decay."""
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
-    if slope < 0:
-        response.log_decay_us.data.fill_(math.log(-dt_ns * 1e-3 / slope))
+    _set_decay(response, slope)
     return response
+
+
+def _set_decay(response: ElectronicsResponse, slope: float) -> None:
+    """Take the data's own decay, if it has one."""
+    if slope < 0:
+        response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))

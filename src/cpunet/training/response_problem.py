@@ -115,11 +115,13 @@ class ResponseProblem:
                 values = self.moments.of_records(records + noise, self.last, self.clip)
                 usable = torch.isfinite(values).all(dim=1)
                 total, n = total + values[usable].sum(dim=0), n + int(usable.sum())
-        return (total / max(n, 1) - self.wanted) / self.sigma
+        pulls: Tensor = (total / max(n, 1) - self.wanted) / self.sigma
+        return pulls
 
     def deviations(self, vector: Tensor) -> Tensor:
         """Deviations of the moments, uncorrelated."""
-        return self.whiten @ self.pulls(vector)
+        deviations: Tensor = self.whiten @ self.pulls(vector)
+        return deviations
 
     def residuals(self, vector: Tensor) -> Tensor:
         """Uncorrelated deviations, and those of the priors."""

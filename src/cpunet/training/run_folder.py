@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 from collections.abc import Iterable
@@ -112,10 +113,7 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
         If the file is missing, damaged or of another architecture.
     """
     path = Path(run) / WEIGHTS
-    try:
-        weights: dict[str, Tensor] = load_file(path, device=device)
-    except (OSError, SafetensorError) as error:
-        raise CpunetError(f"{path}: no readable weights; train again") from error
+    weights = _weights_of(run, device)
     prefix = f"{name}."
     own = {key.removeprefix(prefix): v for key, v in weights.items() if key.startswith(prefix)}
     expected = network.state_dict()
@@ -129,3 +127,43 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
         )
     network.load_state_dict(own)
     return network.to(torch.device(device)).eval()
+
+
+def fill_networks(run: Path, model: nn.Module) -> None:
+    """Fill all networks of `model` that the run has weights of; REN and IREN at least.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, damaged or of another architecture.
+    """
+    device = str(next(model.parameters()).device)
+    there = _weights_of(run, device)
+    for name, network in model.named_children():
+        if name in ("ren", "iren") or any(key.startswith(f"{name}.") for key in there):
+            was_training = network.training
+            load_network(run, name, network, device).train(was_training)
+
+
+def weights_sha256(run: Path) -> str:
+    """Fingerprint of a run's weights.
+
+    Raises
+    ------
+    CpunetError
+        If there are none.
+    """
+    path = Path(run) / WEIGHTS
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CpunetError(f"{path}: no readable weights; train again") from error
+
+
+def _weights_of(run: Path, device: str) -> dict[str, Tensor]:
+    path = Path(run) / WEIGHTS
+    try:
+        weights: dict[str, Tensor] = load_file(path, device=device)
+    except (OSError, SafetensorError) as error:
+        raise CpunetError(f"{path}: no readable weights; train again") from error
+    return weights

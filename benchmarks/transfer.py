@@ -1,0 +1,111 @@
+"""A REN for another readout, begun from a trained one: time and scores beside a fresh start.
+
+Run with ``python benchmarks/transfer.py KNOWN STAND``: folders of ``cpunet stand`` with
+different readouts.  The REN of the first is the start on the second, where it sees
+``--pulses`` measured pulses of the training's peak only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cpunet.jobs.evaluation import evaluate
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.train import train_run
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+
+
+def few_of(data: InputFile, pulses: int, folder: Path) -> InputFile:
+    """A file with that many traces of the training's peak."""
+    recipe = load_recipe("fast")
+    select = parse_selection("FEP", recipe.peaks).select
+    kept: list[Pulses] = []
+    for block in data.open().blocks():
+        kept.append(block[np.flatnonzero(select(block.energy_kev))])
+        if sum(map(len, kept)) >= pulses:
+            break
+    few = Pulses.of(
+        np.concatenate([part.waveforms for part in kept])[:pulses],
+        dt_ns=kept[0].dt_ns,
+        energy_kev=np.concatenate([part.energy_kev for part in kept])[:pulses],
+    )
+    path = folder / "few.lh5"
+    write_pulses(path, few, table="geds/raw")
+    return InputFile(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("known", type=Path)
+    parser.add_argument("stand", type=Path)
+    parser.add_argument("--pulses", type=int, default=500)
+    arguments = parser.parse_args()
+    sim, data = (InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data"))
+    rows: dict[str, tuple[float, dict[str, Any]]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        known = folder / "known"
+        sides = [InputFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
+        train_run(sides[0], sides[1], known, load_recipe("fast"), device="cpu")
+        few = few_of(data, arguments.pulses, folder)
+        # no more simulated pulses than the measured ones can tell
+        less = [f"training.max_pulses={2 * arguments.pulses}", "training.noise_sets=1"]
+        for title, start, measured, overrides in (
+            ("fresh, all pulses", None, data, []),
+            (f"fresh, {arguments.pulses} pulses", None, few, less),
+            (f"from the other, {arguments.pulses} pulses", known, few, less),
+        ):
+            run = folder / title.replace(" ", "_").replace(",", "")
+            recipe = load_recipe("fast", overrides)
+            info = train_run(sim, measured, run, recipe, init=start, device="cpu")
+            scored = evaluate(
+                run,
+                sim,
+                data,
+                truth=arguments.stand / "truth.npz",
+                rivals=False,
+                seed=0,
+                device="cpu",
+                monitor=Monitor(),
+            )
+            rows[title] = (info["seconds"], scored.metrics)
+    show(rows)
+
+
+def show(rows: dict[str, tuple[float, dict[str, Any]]]) -> None:
+    """Seconds and scores of each training."""
+    table = Table()
+    for column in (
+        "training",
+        "seconds",
+        "peak",
+        "I_max",
+        "T_drift",
+        "tail",
+        "AUC",
+        "edge RMSE",
+    ):
+        table.add_column(column, no_wrap=True)
+    for title, (seconds, metrics) in rows.items():
+        for peak in ("SEP", "DEP"):
+            scores = metrics["peaks"][peak]
+            iou = [f"{p['iou']['ren']:.1f}" for p in scores["parameters"].values()]
+            auc = f"{scores['two_sample']['ren']['auc']:.2f}"
+            edge = f"{scores['paired']['ren']['edge_rmse']:.5f}"
+            table.add_row(title, f"{seconds:.0f}", peak, *iou, auc, edge)
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main()

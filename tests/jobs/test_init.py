@@ -1,0 +1,126 @@
+"""Trainings that start from another: of the same kind, and from its weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.train import train_run
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+
+FAST = load_recipe(
+    "fast",
+    [
+        "training.components=4",
+        "training.squares=2",
+        "training.start_factors=[1]",
+        "training.ringing_mhz=[]",
+        "training.noise_sets=1",
+        "generator.slow_ns=[]",
+        "generator.fast_decays_us=[]",
+    ],
+)
+TINY = load_recipe(
+    "small",
+    [
+        "generator.width=2",
+        "discriminator.embedding_rows=20",
+        "discriminator.embedding_dim=2",
+        "discriminator.hidden=2",
+        "discriminator.samples_per_step=16",
+        "training.iterations=1",
+        "training.rate_generators=1e-12",
+        "training.weight_decay=0",
+        "training.batch_size=4",
+        "training.statistics_batches=1",
+    ],
+)
+
+
+def write(path: Path, seed: int, pole: float | None, dt_ns: float = 16.0) -> InputFile:
+    """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(1100.0)
+    width = rng.uniform(1.0, 6.0, (240, 1))
+    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (240, 1))) / width))
+    if pole is not None:
+        kernel = np.exp(-np.arange(90) / pole)
+        smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())[:, :1100]
+        decayed = smooth * np.exp(-np.clip(time - 450, 0, None) / 4000)
+        pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
+    kev = np.full(240, 2614.5)
+    write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
+    return InputFile(path)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, InputFile]:
+    folder = tmp_path_factory.mktemp("init")
+    return {
+        "sim": write(folder / "sim.lh5", 1, None),
+        "one": write(folder / "one.lh5", 2, 4.0),
+        "other": write(folder / "other.lh5", 3, 6.0),
+    }
+
+
+@pytest.fixture(scope="module")
+def chain(files, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("chain") / "run"
+    train_run(files["sim"], files["one"], out, FAST, device="cpu")
+    return out
+
+
+@pytest.fixture(scope="module")
+def network(files, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("network") / "run"
+    train_run(files["sim"], files["one"], out, TINY, device="cpu")
+    return out
+
+
+def poles(run: Path) -> list[float]:
+    fit = json.loads((run / "run.json").read_text())["fit"]
+    return [v for name, v in fit["parameters"].items() if name.startswith("pole")]
+
+
+def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> None:
+    cold = train_run(files["sim"], files["other"], tmp_path / "cold", FAST, device="cpu")
+    warm = train_run(
+        files["sim"], files["other"], tmp_path / "warm", FAST, init=chain, device="cpu"
+    )
+    assert warm["init"] == str(chain)
+    assert warm["fit"]["steps"] < cold["fit"]["steps"]
+    # it ends where the other does, not where it began
+    near = np.sqrt(np.sum(np.square(poles(tmp_path / "warm"))))
+    assert near == pytest.approx(np.sqrt(np.sum(np.square(poles(tmp_path / "cold")))), rel=0.03)
+    assert near > 1.2 * np.sqrt(np.sum(np.square(poles(chain))))
+
+
+def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None:
+    # a training whose rates are next to nothing stays where it began
+    train_run(files["sim"], files["other"], tmp_path / "run", TINY, init=network, seed=5)
+    before, after = (load_file(r / "weights.safetensors") for r in (network, tmp_path / "run"))
+    kept = [n for n in before if n.startswith(("ren.", "iren.")) and "running" not in n]
+    assert kept
+    for name in kept:
+        assert np.allclose(before[name], after[name], atol=1e-6), name
+
+
+def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
+    with pytest.raises(CpunetError, match="from which no readout chain can start"):
+        train_run(files["sim"], files["one"], tmp_path / "a", FAST, init=network)
+    with pytest.raises(CpunetError, match="weights of another network"):
+        train_run(files["sim"], files["one"], tmp_path / "b", TINY, init=chain)
+    with pytest.raises(CpunetError, match="no finished run"):
+        train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path)
+    fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
+    with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
+        train_run(*fast_sampled, tmp_path / "d", FAST, init=chain)
+    assert not any((tmp_path / name).exists() for name in "abcd")
