@@ -1,0 +1,367 @@
+"""The Snakemake workflow: what it would run, what it does where jobs fail, and a real run."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lh5
+import numpy as np
+import pytest
+import yaml
+from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
+
+pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
+
+WORKFLOW = Path(__file__).parents[2] / "workflow"
+BIN = Path(sys.executable).parent
+
+# stands for the command line: notes its words, and writes small outputs at once
+PRETENDER = """#!{python}
+import json, os, pathlib, sys
+words = sys.argv[1:]
+if words[0] == "summary":
+    os.execv({real!r}, [{real!r}, *words])
+with open({calls!r}, "a") as calls:
+    calls.write(json.dumps(words) + "\\n")
+out = pathlib.Path(words[words.index("--out") + 1])
+if words[0] == "train" and os.path.exists({broken!r}) and "V01" in str(out):
+    sys.exit("error: no such pulses")
+if words[0] in ("train", "validate"):
+    out.mkdir()
+    iou = dict(iou=dict(ren=80.0, ceiling=85.0), iou_std=dict(ren=2.0, ceiling=2.0))
+    metrics = dict(peaks=dict(SEP=dict(parameters=dict(drift_time=iou))))
+    (out / "metrics.json").write_text(json.dumps(metrics))
+elif words[0] != "demo":
+    out.write_text("pulses")
+"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder to run the workflow in, with a command that only pretends."""
+
+    folder: Path
+
+    def pretend(self) -> None:
+        command = self.folder / "bin" / "cpunet"
+        command.parent.mkdir()
+        command.write_text(
+            PRETENDER.format(
+                python=sys.executable,
+                real=str(BIN / "cpunet"),
+                calls=str(self.folder / "calls"),
+                broken=str(self.folder / "broken"),
+            )
+        )
+        command.chmod(0o755)
+
+    def configure(self, config: dict[str, Any]) -> None:
+        (self.folder / "config.yaml").write_text(yaml.safe_dump(config))
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        path = os.pathsep.join([str(self.folder / "bin"), str(BIN), os.environ["PATH"]])
+        snakemake = [sys.executable, "-m", "snakemake", "-s", str(WORKFLOW / "Snakefile")]
+        return subprocess.run(
+            [*snakemake, "--configfile", "config.yaml", *words],
+            cwd=self.folder,
+            env=os.environ | {"PATH": path},
+            # messages of a dry run go to one, those of a run to the other
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=3000,
+        )
+
+    def called(self) -> list[list[str]]:
+        """What the pretender was called with since the last time."""
+        calls = self.folder / "calls"
+        lines = calls.read_text().splitlines() if calls.exists() else []
+        calls.unlink(missing_ok=True)
+        return [json.loads(line) for line in lines]
+
+
+def two_detectors() -> dict[str, Any]:
+    return {
+        "results": "all results",
+        "periods": {"p03": {"data": "raw {period}/{detector}.lh5"}},
+        "detectors": {
+            "V01": {"simulations": "sim/*.lh5", "table": "ch1/raw", "energy": "ch1/hit/e"},
+            "B02": {
+                "simulate": {"detector": "bege", "events": "FEP=3", "seed": 7},
+                "kev_per_adc": 0.5,
+            },
+        },
+        "train": {"set": ["training.start_factors=[1.0]"]},
+        "validate": {"rivals": False},
+    }
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    for file in ("raw p03/V01.lh5", "raw p03/B02.lh5", "raw p04/V01.lh5", "sim/of a.lh5"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("pulses")
+    made = Place(tmp_path)
+    made.configure(two_detectors())
+    return made
+
+
+def counts(printed: str) -> dict[str, int]:
+    """Number of jobs by rule, of a dry run."""
+    table = printed.split("Job stats:")[1]
+    return {name: int(n) for name, n in re.findall(r"^(\w+) +(\d+)$", table, re.MULTILINE)}
+
+
+def test_dry_run(place):
+    config = two_detectors()
+    config["periods"]["p04"] = {"data": "raw*/*.lh5"}
+    config["detectors"]["B02"]["simulate"]["files"] = 3
+    config["detectors"]["B02"]["periods"] = ["p03"]
+    place.configure(config)
+    done = place.run("--dry-run", "--quiet", "rules")
+    assert done.returncode == 0, done.stdout
+    assert counts(done.stdout) == {
+        "all": 1,
+        "warm": 1,
+        "fields": 1,
+        "simulate": 3,
+        "merge_simulation": 1,
+        "merge_data": 1,  # of V01 in p04; the others have one file
+        "train": 3,
+        "translate": 2 + 3,
+        "validate": 3,
+        "summary": 1,
+        "total": 20,
+    }
+    assert not (place.folder / "all results").exists()
+
+
+def words_of(calls: list[list[str]], command: str, detector: str) -> list[str]:
+    (words,) = [c for c in calls if c[0] == command and f"/{detector}/" in " ".join(c)]
+    return words
+
+
+def test_a_failure_stops_no_other_detector(place):
+    place.pretend()
+    (place.folder / "broken").touch()
+    done = place.run("-c2", "--keep-going", "--show-failed-logs")
+    assert done.returncode != 0
+    assert "error: no such pulses" in done.stdout
+    calls = place.called()
+    commands = [call[0] for call in calls]
+    assert commands[0] == "demo"
+    assert sorted(commands) == sorted(
+        ["demo", "fields", "simulate", "train", "train", "translate", "validate"]
+    )
+    require_configured_words(calls)
+    results = place.folder / "all results"
+    assert (results / "B02" / "p03" / "report" / "metrics.json").is_file()
+    assert not (results / "index.html").exists()
+
+    done = place.run("-c1", "so_far")
+    assert done.returncode == 0, done.stdout
+    page = (results / "so_far.html").read_text()
+    assert "<strong>No report:</strong> V01 · p03." in page
+
+    # what was done is not done again
+    (place.folder / "broken").unlink()
+    done = place.run("-c2")
+    assert done.returncode == 0, done.stdout
+    assert sorted(call[0] for call in place.called()) == ["train", "translate", "validate"]
+    assert "2 of 2 reports" in (results / "index.html").read_text()
+    logged = {p.name for p in (results / "V01" / "p03" / "logs").iterdir()}
+    assert logged == {"train.log", "translate-of a.log", "validate.log"}
+    measured = {p.name for p in (results / "V01" / "p03" / "benchmarks").iterdir()}
+    assert measured == {"train.tsv", "translate-of a.tsv", "validate.tsv"}
+
+    assert "Nothing to be done" in place.run("-c1", "--dry-run").stdout
+
+
+def require_configured_words(calls: list[list[str]]) -> None:
+    """The commands are given what the configuration says."""
+    simulated = words_of(calls, "simulate", "B02")
+    assert {"--detector=bege", "--events=FEP=3", "--seed=7"} <= set(simulated)
+    train = words_of(calls, "train", "V01")
+    assert {"--data-table=ch1/raw", "--data-energy=ch1/hit/e"} <= set(train)
+    assert {"--set=training.start_factors=[1.0]", "--recipe=fast", "--peak=FEP"} <= set(train)
+    assert train[train.index("--sim") + 1] == "sim/of a.lh5"
+    assert train[train.index("--data") + 1] == "raw p03/V01.lh5"
+    assert "--kev-per-adc=0.5" in words_of(calls, "train", "B02")
+    assert "--no-rivals" in words_of(calls, "validate", "B02")
+
+
+def changed(path: str, value: object) -> dict[str, Any]:
+    """The configuration with one value of another; ``None`` takes it out."""
+    config: Any = two_detectors()
+    *folders, name = path.split(".")
+    inside = config
+    for folder in folders:
+        inside = inside[folder]
+    if value is None:
+        del inside[name]
+    else:
+        inside[name] = value
+    return config
+
+
+DEFECTS = {
+    "misspelt": (
+        "train.recipes",
+        "fast",
+        "train: Additional properties are not allowed ('recipes' was unexpected)",
+    ),
+    "neither": ("detectors.V01.simulations", None, "needs either simulate or simulations"),
+    "no file": (
+        "periods.p03.data",
+        "none/*.lh5",
+        "periods.p03.data: no file matches none/*.lh5",
+    ),
+    "other period": (
+        "detectors.V01.periods",
+        ["p05"],
+        "detectors.V01.periods: p05 is not in periods",
+    ),
+    "energies of one": (
+        "periods.p03.energies",
+        "raw p03/*.lh5",
+        "detectors.B02: no energy, the column in the files of periods.p03.energies",
+    ),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_defect_of_the_configuration_is_one_line(place, defect):
+    path, value, words = DEFECTS[defect]
+    place.configure(changed(path, value))
+    done = place.run("--dry-run")
+    assert done.returncode == 1
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("configuration")]
+    assert words in line
+    assert "Traceback" not in done.stdout
+
+
+def test_the_example_is_valid():
+    import jsonschema
+
+    schema = yaml.safe_load((WORKFLOW / "config" / "schema.yaml").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    example = yaml.safe_load((WORKFLOW / "config" / "example.yaml").read_text())
+    jsonschema.Draft202012Validator(schema).validate(example)
+
+
+def test_the_profile_names_rules_that_are_there():
+    profile = yaml.safe_load((WORKFLOW / "profiles" / "slurm" / "config.yaml").read_text())
+    text = "".join(file.read_text() for file in (WORKFLOW / "rules").iterdir())
+    assert set(profile["set-threads"]) <= set(re.findall(r"^rule (\w+):", text, re.MULTILINE))
+    assert profile["executor"] == "slurm"
+    assert profile["keep-going"] is True
+
+
+def write_raw(path: Path, first: int, n: int) -> None:
+    """Traces of channel 1 in an LH5 file, and energies as in a hit tier in another."""
+    values = np.arange(n * 8, dtype=np.uint16).reshape(n, 8) + first
+    waveform = WaveformTable(
+        t0=np.zeros(n),
+        t0_units="ns",
+        dt=np.full(n, 16.0),
+        dt_units="ns",
+        values=ArrayOfEqualSizedArrays(nda=values, attrs={"units": "ADC"}),
+    )
+    raw = Table(col_dict={"waveform": waveform, "event": Array(np.arange(n))})
+    hit = Table(
+        col_dict={"e": Array(first + np.arange(n, dtype=float), attrs={"units": "keV"})}
+    )
+    lh5.write(raw, "raw", str(path), group="ch1", wo_mode="overwrite_file")
+    lh5.write(hit, "hit", str(path.with_name(f"hit-{path.name}")), group="ch1")
+
+
+def merge_script() -> Any:
+    spec = importlib.util.spec_from_file_location("merge", WORKFLOW / "scripts" / "merge.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_files_are_merged_in_order(tmp_path):
+    files = [tmp_path / "a.lh5", tmp_path / "b.lh5"]
+    write_raw(files[0], 1000, 3)
+    write_raw(files[1], 2000, 2)
+    out = tmp_path / "merged.lh5"
+    energies = [f"{file.with_name(f'hit-{file.name}')}:ch1/hit/e" for file in files]
+    made = merge_script().merge(out, files, "geds/raw", table="ch1/raw", energies=energies)
+    assert made == 5
+    merged = lh5.read("geds/raw", str(out))
+    assert merged["energy"].nda.tolist() == [1000, 1001, 1002, 2000, 2001]
+    assert merged["energy"].attrs["units"] == "keV"
+    assert merged["waveform"].values.nda[:, 0].tolist() == [1000, 1008, 1016, 2000, 2008]
+    assert set(merged["waveform"].dt.nda) == {16.0}
+
+
+def test_files_that_do_not_belong_together_are_one_line(tmp_path):
+    write_raw(tmp_path / "a.lh5", 0, 3)
+    (tmp_path / "b.lh5").write_text("no pulses")
+    script = [sys.executable, str(WORKFLOW / "scripts" / "merge.py")]
+    words = [str(tmp_path / "out.lh5"), "--made-table", "geds/raw", "--files"]
+    files = map(str, sorted(tmp_path.glob("?.lh5")))
+    done = subprocess.run([*script, *words, *files], capture_output=True, text=True)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: {tmp_path / 'b.lh5'}: ")
+    assert not (tmp_path / "out.lh5").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_real_run_of_two_detectors(tmp_path):
+    cpunet = str(BIN / "cpunet")
+    for detector, seed in (("V01", "1"), ("V02", "2")):
+        stand = [cpunet, "stand", "--preset", "legend200", "--seed", seed]
+        events = ["--events", "FEP=300,SEP=60,DEP=60", "--out", str(tmp_path / detector)]
+        subprocess.run([*stand, *events], check=True, capture_output=True)
+    here = Place(tmp_path)
+    here.configure(
+        {
+            "periods": {"p03": {"data": "V0*/data.lh5"}},  # both: merged
+            "detectors": {
+                "V01": {"simulations": "V01/sim.lh5"},
+                "V02": {
+                    "simulate": {
+                        "detector": "icpc",
+                        "events": "FEP=150,SEP=30,DEP=30",
+                        "files": 2,
+                    }
+                },
+            },
+            "train": {
+                "set": [
+                    "training.steps=1",
+                    "training.start_factors=[1.0]",
+                    "scores.bootstraps=20",
+                ]
+            },
+            "validate": {"rivals": False},
+        }
+    )
+    done = here.run("-c2", "--show-failed-logs")
+    assert done.returncode == 0, done.stdout
+    results = tmp_path / "results"
+    page = (results / "index.html").read_text()
+    assert "2 of 2 reports" in page
+    for detector, parts in (("V01", ["sim"]), ("V02", ["part000", "part001"])):
+        folder = results / detector / "p03"
+        assert f'href="{detector}/p03/report/report.html"' in page
+        metrics = json.loads((folder / "report" / "metrics.json").read_text())
+        assert {"FEP", "SEP", "DEP"} == set(metrics["peaks"])
+        assert sorted(p.stem for p in (folder / "translated").iterdir()) == parts
+        assert not (folder / "data.lh5").exists()  # merged for the time being
+    assert "Nothing to be done" in here.run("-c1").stdout

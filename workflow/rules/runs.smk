@@ -1,0 +1,82 @@
+# A training per detector and period, and what is done with it.
+
+
+rule train:
+    input:
+        warmed,
+        sim=one_simulation,
+        data=one_data,
+        energies=lambda w: ENERGIES.get((w.detector, w.period), []),
+        recipe=a_file(config["train"]["recipe"]),
+    output:
+        directory(f"{RESULTS}/{{detector}}/{{period}}/run"),
+    log:
+        f"{RESULTS}/{{detector}}/{{period}}/logs/train.log",
+    benchmark:
+        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/train.tsv"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=60,
+    params:
+        reading=reading,
+        options=options(**config["train"], device=config["device"]),
+    shell:
+        "cpunet train --sim {input.sim:q} --data {input.data:q} {params.reading}"
+        " {params.options} --threads {threads} --out {output:q} --force > {log:q} 2>&1"
+
+
+def translation_reading(wildcards):
+    return simulation_reading(wildcards.detector)
+
+
+rule translate:
+    input:
+        run=rules.train.output,
+        pulses=lambda w: SIMULATIONS[w.detector][w.part],
+    output:
+        f"{RESULTS}/{{detector}}/{{period}}/translated/{{part}}.lh5",
+    log:
+        f"{RESULTS}/{{detector}}/{{period}}/logs/translate-{{part}}.log",
+    benchmark:
+        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/translate-{{part}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=120,
+    params:
+        options=lambda w: options(
+            # noise of its own in each file
+            seed=config["train"]["seed"] + list(SIMULATIONS[w.detector]).index(w.part),
+            device=config["device"],
+        ),
+        reading=translation_reading,
+    shell:
+        "cpunet translate {input.run:q} {input.pulses:q} {params.options} {params.reading}"
+        " --out {output:q} --force > {log:q} 2>&1"
+
+
+rule validate:
+    input:
+        run=rules.train.output,
+        sim=one_simulation,
+        data=one_data,
+        energies=lambda w: ENERGIES.get((w.detector, w.period), []),
+    output:
+        directory(f"{RESULTS}/{{detector}}/{{period}}/report"),
+    log:
+        f"{RESULTS}/{{detector}}/{{period}}/logs/validate.log",
+    benchmark:
+        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/validate.tsv"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=60,
+    params:
+        reading=reading,
+        options=options(seed=config["train"]["seed"], device=config["device"]),
+        rivals="--rivals" if config["validate"]["rivals"] else "--no-rivals",
+    shell:
+        "cpunet validate {input.run:q} --sim {input.sim:q} --data {input.data:q}"
+        " {params.reading} {params.options} {params.rivals} --out {output:q} --force"
+        " > {log:q} 2>&1"
