@@ -11,11 +11,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from lgdo import Table, WaveformTable
+from lgdo import Array, Table, VectorOfVectors, WaveformTable
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.appending import ColumnAppender
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.row_columns import RowColumns, repeated
 from cpunet.pulses.writing import PulseWriter, write_pulses
 
 
@@ -142,3 +144,63 @@ def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 5e6
     finally:
         tracemalloc.stop()
+
+
+def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    pulses = Pulses.of(np.arange(12).reshape(4, 3) * 5000, dt_ns=16)
+    hits = [[1.0], [], [2.0, 3.0], [4.0]]
+    with PulseWriter(path, samples=np.uint16, waveform_units="ADC") as writer:
+        for rows in (slice(0, 1), slice(1, 4)):
+            column = VectorOfVectors(hits[rows], dtype=np.float64)
+            writer.append(pulses[rows], others={"edep": column})
+        with pytest.raises(CpunetError, match="write them to separate files"):
+            writer.append(pulses)
+        writer.stamp("made", "by hand")
+    table = lh5.read("geds/sim", path)
+    assert table.waveform.values.nda.dtype == np.uint16
+    np.testing.assert_array_equal(table.waveform.values.nda, pulses.waveforms)
+    assert [list(row) for row in table.edep] == hits
+    with h5py.File(path) as file:
+        assert file.attrs["made"] == "by hand"
+
+
+def test_other_columns_are_read_by_rows(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    columns = {"a": (np.arange(6), "mm"), "realisation": (np.arange(6), "")}
+    write_pulses(path, some(), columns=columns)
+    own = {"waveform", "energy", "event_number", "realisation"}
+    others = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
+    assert (others.names, others.left_out) == (
+        {"a": "a", "realisation": "realisation_source"},
+        {},
+    )
+    found = others.read(2, 3, repeats=2)
+    assert found["a"].nda.tolist() == [2, 2, 3, 3, 4, 4]
+    assert found["a"].attrs["units"] == "mm"
+    inner = Table({"x": Array(np.arange(2)), "y": VectorOfVectors([[1], [2, 3]])})
+    twice = repeated(inner, 2)
+    assert twice.x.nda.tolist() == [0, 0, 1, 1]
+    assert [list(row) for row in twice.y] == [[1], [1], [2, 3], [2, 3]]
+
+
+def test_a_column_of_other_length_is_not_appended(tmp_path):
+    source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
+    write_pulses(source, some(6))
+    with (
+        pytest.raises(CpunetError, match="5 pulses beside 6 rows"),
+        ColumnAppender(out, source, table="geds/sim", name="more") as writer,
+    ):
+        writer.append(some(5))
+    for table, name, said in (
+        ("geds/sim", "energy", "has a column energy already"),
+        ("geds", "more", "no table of LH5"),
+    ):
+        with (
+            pytest.raises(CpunetError, match=said),
+            ColumnAppender(out, source, table=table, name=name),
+        ):
+            pass
+    with pytest.raises(CpunetError, match="no name of a column"):
+        ColumnAppender(out, source, table="geds/sim", name="a/b")
+    assert [path.name for path in tmp_path.iterdir()] == ["pulses.lh5"]

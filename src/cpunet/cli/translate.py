@@ -2,62 +2,193 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.errors import CpunetError
 
-Source = Annotated[Path, typer.Argument(help="File of pulses to translate.", metavar="FILE")]
-Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
+if TYPE_CHECKING:
+    from cpunet.jobs.translate_options import Adc
+
+FILES, ADC = "Many files", "Raw traces in ADC counts (--output adc)"
+
+
+class Output(StrEnum):
+    """Forms of output."""
+
+    NORMALISED = "normalised"
+    ADC = "adc"
+
+
+Sources = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Files of pulses to translate, or patterns as 'sim_*.lh5'.", metavar="FILE…"
+    ),
+]
+Out = Annotated[
+    str,
+    typer.Option("--out", help="LH5 file to write; for several files, or with /, a folder."),
+]
 Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulation-like.")]
 Noise = Annotated[
     bool, typer.Option("--noise/--no-noise", help="Add noise as the data have it, or none.")
 ]
+Realisations = Annotated[
+    int | None,
+    typer.Option(min=1, help="Draw the noise so many times: rows repeated, and counted."),
+]
 Table = Annotated[str | None, typer.Option(help="Table to read, if the file has several.")]
 OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or geds/iren.")]
+AppendColumn = Annotated[
+    str | None,
+    typer.Option(help="Copy the file, and add the pulses to its table as a column so named."),
+]
 Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
+Jobs = Annotated[
+    int, typer.Option(min=1, help="Processes, a file each at a time.", rich_help_panel=FILES)
+]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Skip what is there already, if made in the same way.",
+        rich_help_panel=FILES,
+    ),
+]
+AdcPerKev = Annotated[
+    float | None,
+    typer.Option(
+        help="Maximum over the baseline, ADC counts per keV; that of the run's data.",
+        rich_help_panel=ADC,
+    ),
+]
+Baseline = Annotated[
+    float | None,
+    typer.Option(help="In ADC counts; that of the run's data.", rich_help_panel=ADC),
+]
+Length = Annotated[
+    int | None,
+    typer.Option(min=1, help="Samples of a trace; those of a window.", rich_help_panel=ADC),
+]
+NPre = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        help="Samples before 99.9 % of the maximum; those of a window.",
+        rich_help_panel=ADC,
+    ),
+]
 
 
 def translate(
     run: options.Run,
-    source: Source,
-    out_file: Out,
+    sources: Sources,
+    out_name: Out,
     inverse: Inverse = False,
     noise: Noise = True,
     seed: options.Seed = 0,
+    realisations: Realisations = None,
     table: Table = None,
     out_table: OutTable = None,
+    append_column: AppendColumn = None,
     energy: Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    output: Annotated[Output, typer.Option(help="Form of the output.")] = Output.NORMALISED,
+    adc_per_kev: AdcPerKev = None,
+    baseline: Baseline = None,
+    length: Length = None,
+    n_pre: NPre = None,
+    jobs: Jobs = 1,
+    resume: Resume = False,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
-    """Translate a file of pulses with a trained run, keeping its rows.
+    """Translate files of pulses with a trained run, keeping their rows and columns.
 
     Example: cpunet translate run sim.lh5 --out translated.lh5
+
+    Example: cpunet translate run sim_*.lh5 --out translated/ --jobs 4 --resume
     """
     from cpunet.jobs.inputs import InputFile
     from cpunet.jobs.translate import translate_file
+    from cpunet.jobs.translate_files import expanded, translate_files
+    from cpunet.jobs.translate_options import TranslateOptions
 
-    counts = translate_file(
-        run,
-        InputFile(source, table, energy, kev_per_adc, dt),
-        out_file,
-        inverse=inverse,
-        noise=noise,
-        seed=seed,
-        table=out_table,
-        device=device,
-        force=force,
-        monitor=monitor(),
-    )
-    rejected = ", ".join(f"{n} {reason}" for reason, n in counts["rejections"].items())
-    out.print(
-        f"{out_file}: {counts['translated']} of {counts['read']} pulses translated"
-        + (f"; rows of NaN for {rejected}" if rejected else ""),
-        soft_wrap=True,
-    )
+    adc = _adc(output, adc_per_kev, baseline, length, n_pre)
+    files = [InputFile(f, table, energy, kev_per_adc, dt) for f in expanded(sources)]
+    place = Path(out_name)
+    if len(files) > 1 or out_name.endswith("/") or place.is_dir():
+        form = TranslateOptions(
+            inverse, noise, seed, out_table, append_column, realisations, adc
+        )
+        told = translate_files(
+            run,
+            files,
+            place,
+            form,
+            jobs=jobs,
+            device=device,
+            resume=resume,
+            force=force,
+            monitor=monitor(),
+        )
+    else:
+        told = translate_file(
+            run,
+            files[0],
+            place,
+            inverse=inverse,
+            noise=noise,
+            seed=seed,
+            table=out_table,
+            append_column=append_column,
+            realisations=realisations,
+            adc=adc,
+            device=device,
+            resume=resume,
+            force=force,
+            monitor=monitor(),
+        )
+    out.print(f"{place}: {_in_words(told, adc)}", soft_wrap=True)
+
+
+def _adc(
+    output: Output,
+    adc_per_kev: float | None,
+    baseline: float | None,
+    length: int | None,
+    n_pre: int | None,
+) -> Adc | None:
+    from cpunet.jobs.translate_options import Adc
+
+    adc = Adc(adc_per_kev, baseline, length, n_pre)
+    if output == Output.ADC:
+        return adc
+    if adc != Adc():
+        raise CpunetError(
+            "--adc-per-kev, --baseline, --length and --n-pre belong to traces in ADC counts; "
+            "add --output adc"
+        )
+    return None
+
+
+def _in_words(told: dict[str, Any], adc: Adc | None) -> str:
+    text = f"{told['translated']} of {told['read']} pulses translated"
+    if "files" in told:
+        text = f"{told['files']} files, {text}"
+    if told.get("skipped"):
+        which = f"{told['skipped']} files were" if "files" in told else "it was"
+        text += f" ({which} there already)"
+    rejected = ", ".join(f"{n} {reason}" for reason, n in told["rejections"].items())
+    if rejected:
+        text += f"; rows of {'NaN' if adc is None else '0'} for {rejected}"
+    if told.get("saturated"):
+        text += f"; {told['saturated']} saturated"
+    return text

@@ -8,20 +8,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import h5py
-import lh5
 import numpy as np
 import numpy.typing as npt
-from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
+from lgdo import LGDO, Array, Table
 
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing, written_aside
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table
 
 Columns = Mapping[str, tuple[npt.ArrayLike, str]]
-
-# Chunks of whole traces, so that a block of events is read without unpacking others.
-_CHUNK_BYTES = 1 << 18
 
 
 class PulseWriter:
@@ -43,6 +39,8 @@ class PulseWriter:
         Time of the first sample in ns.
     attrs
         Attributes of the table, such as where the pulses come from.
+    samples
+        Type in which samples are stored, such as ``numpy.uint16``; they must fit.
     force
         Whether to replace an existing file.
 
@@ -55,6 +53,7 @@ class PulseWriter:
     Examples
     --------
     >>> import tempfile
+    >>> import lh5
     >>> pulses = Pulses.of(np.zeros((2, 8)), dt_ns=16, energy_kev=[1592.5, 2614.5])
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     with PulseWriter(Path(folder) / "pulses.lh5") as writer:
@@ -71,9 +70,11 @@ class PulseWriter:
         waveform_units: str = "",
         t0_ns: float = 0.0,
         attrs: Mapping[str, str | float] | None = None,
+        samples: npt.DTypeLike = np.float32,
         force: bool = False,
     ) -> None:
         self.path = Path(path)
+        self._samples = samples
         self.n_pulses = 0
         self._table = table.strip("/")
         if not self._table:
@@ -83,12 +84,12 @@ class PulseWriter:
         self._attrs = dict(attrs or {})
         self._shape: tuple[int, float, tuple[str, ...]] | None = None
         self._stack = ExitStack()
-        self._file: h5py.File | None = None
+        self._file: FileInTheMaking | None = None
         refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
         aside = self._stack.enter_context(written_aside(self.path))
-        self._file = self._stack.enter_context(h5py.File(aside, "w"))
+        self._file = self._stack.enter_context(FileInTheMaking(aside, self.path))
         return self
 
     def __exit__(
@@ -102,7 +103,12 @@ class PulseWriter:
                 raise CpunetError(f"{self.path}: no pulses to write; nothing was written")
         self._stack.__exit__(kind, error, trace)
 
-    def append(self, pulses: Pulses, columns: Columns | None = None) -> None:
+    def append(
+        self,
+        pulses: Pulses,
+        columns: Columns | None = None,
+        others: Mapping[str, LGDO] | None = None,
+    ) -> None:
         """Add a block of pulses.
 
         Parameters
@@ -111,23 +117,27 @@ class PulseWriter:
             The block; an empty one adds nothing.
         columns
             More values per event: name → (array of shape ``(n,)``, units).
+        others
+            Columns of any kind as the LH5 library has them, of n rows.
         """
         if self._file is None:
             raise ValueError("append outside of the writer's with block")
-        extra = dict(columns or {})
-        self._require_same(pulses, extra)
+        extra, others = dict(columns or {}), dict(others or {})
+        self._require_same(pulses, extra | others)
         if len(pulses) == 0:
             return
         content = {
-            "waveform": self._waveforms(pulses),
+            "waveform": waveform_table(
+                pulses, t0_ns=self._t0_ns, units=self._waveform_units, samples=self._samples
+            ),
             "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
             "event_number": Array(pulses.event_number),
         }
         for name, (values, units) in extra.items():
             content[name] = self._column(name, values, units, len(pulses))
-        block = Table(col_dict=content, attrs=dict(self._attrs))
+        block = Table(col_dict=content | others, attrs=dict(self._attrs))
         group, _, name = self._table.rpartition("/")
-        lh5.write(block, name, self._file, group=group or "/", wo_mode="append")
+        self._file.write(block, name, group or "/")
         self.n_pulses += len(pulses)
 
     def append_rows(self, table: str, columns: Columns) -> None:
@@ -151,30 +161,19 @@ class PulseWriter:
             for key, (values, units) in rows.items()
         }
         if len(next(iter(content.values()))) > 0:
-            lh5.write(Table(content), name, self._file, group=group or "/", wo_mode="append")
+            self._file.write(Table(content), name, group or "/")
 
     def annotate(self, attrs: Mapping[str, str | float]) -> None:
         """Add attributes to the table of pulses, once it holds some."""
-        if self._file is None or self._table not in self._file:
+        if self._file is None or self._table not in self._file.h5:
             raise ValueError("annotate before any pulse was appended")
-        self._file[self._table].attrs.update(attrs)
+        self._file.h5[self._table].attrs.update(attrs)
 
-    def _waveforms(self, pulses: Pulses) -> WaveformTable:
-        n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
-        values = ArrayOfEqualSizedArrays(
-            nda=pulses.waveforms,
-            attrs={
-                "units": self._waveform_units,
-                "hdf5_settings": {"chunks": (n_rows, pulses.length)},
-            },
-        )
-        return WaveformTable(
-            t0=np.full(len(pulses), self._t0_ns),
-            t0_units="ns",
-            dt=np.full(len(pulses), pulses.dt_ns),
-            dt_units="ns",
-            values=values,
-        )
+    def stamp(self, name: str, text: str) -> None:
+        """Set an attribute of the file, such as a record of how it was made."""
+        if self._file is None:
+            raise ValueError("stamp outside of the writer's with block")
+        self._file.h5.attrs[name] = text
 
     def _column(self, name: str, values: npt.ArrayLike, units: str, n: int) -> Array:
         array = np.asarray(values)

@@ -1,8 +1,8 @@
 """Translated pulses as raw traces in ADC counts: the preparation undone.
 
-``raw = baseline + scale * prepared``, with a scale in proportion to the energy.  A readout chain
-gives records of any length, with noise all along.  Its noise is added once and nothing is
-normalised afterwards, so that it does not change the height of a pulse.  A network knows
+``raw = baseline + scale * prepared``, with a scale in proportion to the energy.  A readout
+chain gives records of any length, with noise all along.  Its noise is added once and nothing
+is normalised afterwards, so that it does not change the height of a pulse.  A network knows
 windows of its own length alone: before them stands the baseline, after them the decay fitted
 to the end of each, both without noise.
 """
@@ -211,7 +211,9 @@ class AdcForm:
             traces[rows] = levels
         return traces, codes
 
-    def _levels(self, backend: ResponseBackend, windows: FloatArray) -> tuple[FloatArray, Codes]:
+    def _levels(
+        self, backend: ResponseBackend, windows: FloatArray
+    ) -> tuple[FloatArray, Codes]:
         """Noise-free traces of prepared simulated windows, the 99.9 % at sample `n_pre`."""
         config, dt_ns = self.config, self.ren.dt_ns
         before = max(0, self.n_pre - config.samples_before)

@@ -1,0 +1,56 @@
+"""One process at a time writes an output."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cpunet.errors import CpunetError
+
+
+@contextmanager
+def only_writer(target: Path) -> Iterator[None]:
+    """Hold the right to write `target`, until the block or the process ends.
+
+    The lock is a hidden file beside `target`, locked by the system, so that none is left
+    behind that counts.  On file systems without locks it keeps nobody out; then the last
+    output to be moved into place stays.
+
+    Raises
+    ------
+    CpunetError
+        If another process is writing it, or the folder cannot be written to.
+    """
+    path = target.parent / f".{target.name}.lock"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise CpunetError(f"{target}: cannot be written ({error.strerror})") from error
+    try:
+        _lock(handle, path, target)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, path: Path, target: Path) -> None:
+    busy = CpunetError(f"{target}: another process is writing it; wait for that one")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise busy from None
+    except OSError:
+        return  # no locks on this file system
+    try:
+        same = os.fstat(handle).st_ino == path.stat().st_ino
+    except FileNotFoundError:
+        same = False
+    if not same:  # its holder was done and removed it while this one was opening it
+        raise busy

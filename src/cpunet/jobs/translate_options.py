@@ -1,0 +1,47 @@
+"""How to translate a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cpunet.errors import CpunetError
+
+
+@dataclass(frozen=True)
+class Adc:
+    """Output as raw traces in ADC counts, see `cpunet.translation.to_adc`."""
+
+    adc_per_kev: float | None = None
+    baseline: float | None = None
+    length: int | None = None
+    n_pre: int | None = None
+
+
+@dataclass(frozen=True)
+class TranslateOptions:
+    """How to translate a file, see `translate_file`."""
+
+    inverse: bool = False
+    noise: bool = True
+    seed: int = 0
+    table: str | None = None
+    append_column: str | None = None
+    realisations: int | None = None
+    adc: Adc | None = None
+
+    def __post_init__(self) -> None:
+        if self.realisations is not None and self.realisations < 1:
+            raise CpunetError(f"--realisations is {self.realisations}; expected 1 or more")
+        if (self.realisations or 1) > 1 and not self.noise:
+            raise CpunetError("realisations without noise are all the same; give one of both")
+        if self.append_column is not None and self.realisations is not None:
+            raise CpunetError(
+                "realisations repeat rows, so they cannot be a further column; "
+                "leave out --append-column"
+            )
+        if self.append_column is not None and self.table is not None:
+            raise CpunetError(
+                "a column is appended to the table that is read; leave out --out-table"
+            )
+        if self.adc is not None and self.inverse:
+            raise CpunetError("the inverse gives charge, no ADC counts; leave out --output adc")

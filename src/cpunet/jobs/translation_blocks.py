@@ -1,0 +1,117 @@
+"""Blocks of pulses of a fixed size, each with noise of its own, and what became of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Rejection
+from cpunet.translation.output_form import Formed
+
+NOISE_ROWS = 512  # noise is seeded anew for so many pulses, however many are read at a time
+
+
+def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> int:
+    """Seed of the noise of a block of a file.
+
+    Parameters
+    ----------
+    seed
+        Of the whole.
+    key
+        Name of the file; None for a file on its own, whose first block then has `seed`
+        itself, as `cpunet.translation.translator.Translator.translate` would.
+    block
+        Its number in the file.
+    realisation
+        How many times its noise was drawn before.
+    """
+    if key is None and block == realisation == 0:
+        return seed
+    digest = hashlib.sha256((key or "").encode()).digest()
+    words = [seed, block, realisation, int.from_bytes(digest[:16])]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
+    """The same pulses in blocks of `size`, the last one shorter.
+
+    Examples
+    --------
+    >>> pulses = Pulses.of(np.zeros((7, 2)), dt_ns=16)
+    >>> [len(block) for block in regrouped([pulses[:2], pulses[2:3], pulses[3:]], 3)]
+    [3, 3, 1]
+    """
+    waiting: list[Pulses] = []
+    for block in blocks:
+        first = 0
+        while first < len(block):
+            room = size - sum(map(len, waiting))
+            waiting.append(block[first : first + room])
+            first += room
+            if sum(map(len, waiting)) == size:
+                yield Pulses.concatenate(waiting)
+                waiting = []
+    if waiting:
+        yield Pulses.concatenate(waiting)
+
+
+def interleaved(realisations: list[Formed]) -> Formed:
+    """Realisations of the same pulses as rows: all of the first pulse, then of the second."""
+    if len(realisations) == 1:
+        return realisations[0]
+    n, first = len(realisations), realisations[0].pulses
+    rows = np.repeat(np.arange(len(first)), n)
+    waveforms = np.stack([formed.pulses.waveforms for formed in realisations], axis=1)
+    return Formed(
+        Pulses.of(
+            waveforms.reshape(len(rows), first.length),
+            dt_ns=first.dt_ns,
+            energy_kev=first.energy_kev[rows],
+            event_number=first.event_number[rows],
+        ),
+        np.stack([formed.codes for formed in realisations], axis=1).ravel(),
+        np.stack([formed.saturated for formed in realisations], axis=1).ravel(),
+    )
+
+
+class Counts:
+    """How many rows were written, and why some of them hold no pulse."""
+
+    def __init__(self) -> None:
+        self.codes = np.zeros(256, np.int64)
+        self.saturated = 0
+
+    def add(self, formed: Formed) -> None:
+        """Count the rows of a block."""
+        self.codes += np.bincount(formed.codes, minlength=len(self.codes))
+        self.saturated += int(formed.saturated.sum())
+
+    @property
+    def read(self) -> int:
+        """All rows."""
+        return int(self.codes.sum())
+
+    @property
+    def translated(self) -> int:
+        """Those that hold a pulse."""
+        return int(self.codes[Rejection.ACCEPTED])
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Counts by reason of those that do not."""
+        rejected = [code for code in np.flatnonzero(self.codes) if code]
+        return {Rejection(int(code)).label: int(self.codes[code]) for code in rejected}
+
+    def told(self, *, adc: bool) -> dict[str, Any]:
+        """As a dictionary, in ADC with the number of saturated rows."""
+        told = {
+            "read": self.read,
+            "translated": self.translated,
+            "rejections": self.rejections,
+        }
+        return told | ({"saturated": self.saturated} if adc else {})

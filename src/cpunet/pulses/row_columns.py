@@ -1,0 +1,168 @@
+"""Columns that stand beside the waveforms of a file, of any kind, copied by rows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import lh5
+import numpy as np
+from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
+
+from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
+from cpunet.pulses.reading.hdf5 import opened, text_attribute
+
+SUFFIX = "_source"  # of columns whose name the translation needs for its own
+_NUMBERS = "iufb"
+
+
+@dataclass(frozen=True)
+class RowColumns:
+    """Columns of one table of a file, to be read by rows as LH5 objects.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        The group that holds them; not used for columns of other formats.
+    names
+        Names in the file, and under which they are given.
+    left_out
+        Names of those that cannot be copied, and why.
+    columns
+        Of files other than HDF5: what their reader found.
+    """
+
+    path: Path
+    table: str = ""
+    names: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, Column] = field(default_factory=dict)
+
+    @classmethod
+    def of_hdf5(
+        cls, path: Path, waveforms: str, n_pulses: int, own: Collection[str]
+    ) -> RowColumns:
+        """Find the columns beside the waveforms at `waveforms`, but for these.
+
+        Parameters
+        ----------
+        path
+            An LH5 or HDF5 file.
+        waveforms
+            Path of the waveforms in it.
+        n_pulses
+            Rows that each column must have.
+        own
+            Names that the output has for itself.  A column called so is given with `SUFFIX`,
+            unless it says the same: the event number, or an energy in keV.
+        """
+        table, _, chosen = waveforms.rpartition("/")
+        names, left_out = {}, {}
+        with opened(path) as file:
+            group = file[table or "/"]
+            for name in group:
+                if name == chosen or _is_same(name, group.get(name), own):
+                    continue
+                reason = _unreadable(group.get(name), n_pulses)
+                if reason:
+                    left_out[name] = reason
+                else:
+                    names[name] = name + SUFFIX if name in own else name
+        return cls(path, table or "/", names, left_out)
+
+    @classmethod
+    def of_columns(
+        cls, path: Path, columns: Mapping[str, Column], own: Collection[str]
+    ) -> RowColumns:
+        """Take the columns that the reader of another format found; names as above."""
+        names = {
+            name: name + SUFFIX if name in own else name
+            for name, column in columns.items()
+            if not (name == "event_number" or _in_kev(name, column.units)) or name not in own
+        }
+        return cls(path, names=names, columns=columns)
+
+    def read(self, start: int, n: int, repeats: int = 1) -> dict[str, LGDO]:
+        """Rows from `start` on, each `repeats` times in a row."""
+        if not self.names:
+            return {}
+        if self.columns:
+            found = {name: _from_column(self.columns[name], start, n) for name in self.names}
+        else:
+            with opened(self.path) as file:
+                group = file[self.table]
+                found = {name: _rows(group[name], start, n) for name in self.names}
+        return {
+            self.names[name]: repeated(column, repeats) if repeats > 1 else column
+            for name, column in found.items()
+        }
+
+
+def repeated(column: LGDO, repeats: int) -> LGDO:
+    """Each row of an LH5 object so many times."""
+    attrs = {k: v for k, v in column.attrs.items() if k != "datatype"}
+    if isinstance(column, Table):
+        inner = {name: repeated(values, repeats) for name, values in column.items()}
+        return Table(inner, attrs=attrs)
+    if isinstance(column, VectorOfVectors):
+        values = column.view_as("ak")
+        return VectorOfVectors(values[np.repeat(np.arange(len(values)), repeats)], attrs=attrs)
+    rows = np.repeat(column.nda, repeats, axis=0)
+    return type(column)(nda=rows, attrs=dict(column.attrs))
+
+
+def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:
+    if text_attribute(item, "datatype"):
+        return lh5.read(item.name, item.file, start_row=start, n_rows=n)
+    attrs = {"units": units} if (units := text_attribute(item, "units")) else {}
+    if item.ndim == 0:
+        return Array(np.full(n, item[()]), attrs=attrs)
+    rows: Any = item[start : start + n]
+    if rows.ndim > 1:
+        return ArrayOfEqualSizedArrays(nda=rows, attrs=attrs)
+    if rows.dtype.kind == "O":
+        attrs["datatype"] = "array<1>{string}"
+    return Array(rows, attrs=attrs)
+
+
+def _from_column(column: Column, start: int, n: int) -> Array:
+    attrs = {"units": column.units} if column.units else {}
+    values = np.asarray(column.read(start, start + n))
+    if values.dtype.kind == "U":
+        values = np.char.encode(values, "utf-8")
+    return Array(values, attrs=attrs)
+
+
+def _is_same(name: str, item: object, own: Collection[str]) -> bool:
+    """Tell whether a column says what the output's own of that name does."""
+    if name not in own or not isinstance(item, h5py.Dataset):
+        return False
+    return name == "event_number" or _in_kev(name, text_attribute(item, "units"))
+
+
+def _in_kev(name: str, units: str) -> bool:
+    return name == "energy" and units in ENERGY_UNITS
+
+
+def _unreadable(item: h5py.Group | h5py.Dataset | None, n_pulses: int) -> str:
+    """Why a column cannot be copied; empty if it can."""
+    if item is None:
+        return "a link that leads nowhere"
+    if not text_attribute(item, "datatype"):
+        if not isinstance(item, h5py.Dataset):
+            return "a group that is no column"
+        if item.dtype.kind not in _NUMBERS and not h5py.check_string_dtype(item.dtype):
+            return f"of type {item.dtype}"
+        rows = n_pulses if item.ndim == 0 else item.shape[0]
+    else:
+        try:
+            rows = lh5.read_n_rows(item.name, item.file)
+            _rows(item, 0, 1)
+        except Exception as error:  # whatever the library makes of a foreign type
+            return f"the LH5 library cannot read it ({' '.join(str(error).split())})"
+    return "" if rows == n_pulses else f"{rows} rows beside {n_pulses} pulses"

@@ -1,0 +1,107 @@
+"""`cpunet translate` over many files, and in ADC counts, on the command line."""
+
+from __future__ import annotations
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def sources(stand, tmp_path):
+    """Three files of pulses, the second with two that cannot be translated."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    waveforms = stand.sim_waveforms[:20].copy()
+    for number in range(3):
+        if number == 1:
+            waveforms[4], waveforms[5, 3] = 0.5, np.nan
+        path = folder / f"sim_{number}.lh5"
+        stand.write(path, "geds/sim", waveforms, stand.sim_kev[:20], units="")
+        waveforms = stand.sim_waveforms[:20].copy()
+    return folder
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def said(outcome):
+    return " ".join(outcome.out.split())
+
+
+def test_a_pattern_into_a_folder(command, trained, sources, tmp_path):
+    out = tmp_path / "out"
+    words = ("translate", trained, sources / "sim_*.lh5", "--out", f"{out}/")
+    outcome = command(*words)
+    assert outcome.code == 0, outcome.err
+    expected = "3 files, 58 of 60 pulses translated; rows of NaN for 1 nan, 1 constant"
+    assert expected in said(outcome)
+    assert names(out) == names(sources)
+    refused = command(*words)
+    assert refused.code == 2
+    assert "sim_0.lh5: exists already" in refused.err
+    before = [(out / name).read_bytes() for name in names(out)]
+    (out / "sim_1.lh5").unlink()
+    again = command(*words, "--resume")
+    assert again.code == 0
+    assert "3 files, 58 of 60 pulses translated (2 files were there already)" in said(again)
+    assert [(out / name).read_bytes() for name in names(out)] == before
+    other = command(*words, "--resume", "--seed", 5)
+    assert other.code == 2
+    assert "was made with other options (seed)" in other.err.splitlines()[-1]
+
+
+def test_a_file_into_a_folder_that_is_there(command, trained, sources, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    assert command("translate", trained, sources / "sim_0.lh5", "--out", out).code == 0
+    assert names(out) == ["sim_0.lh5"]
+
+
+def test_one_finished_file_is_skipped(command, trained, sources, tmp_path):
+    words = ("translate", trained, sources / "sim_0.lh5", "--out", tmp_path / "o.lh5")
+    assert command(*words).code == 0
+    again = command(*words, "--resume")
+    assert again.code == 0
+    assert "20 of 20 pulses translated (it was there already)" in said(again)
+
+
+def test_a_column_and_realisations(command, trained, sources, tmp_path):
+    first = ("translate", trained, sources / "sim_0.lh5", "--out")
+    assert command(*first, tmp_path / "a.lh5", "--append-column", "waveform_ren").code == 0
+    table = lh5.read("geds/sim", tmp_path / "a.lh5")
+    assert {"waveform", "waveform_ren", "waveform_ren_rejection"} <= set(table)
+    assert command(*first, tmp_path / "b.lh5", "--realisations", 2).code == 0
+    table = lh5.read("geds/ren", tmp_path / "b.lh5")
+    assert table.realisation.nda.tolist() == [0, 1] * 20
+
+
+def test_adc_counts(command, trained, stand, sources, tmp_path):
+    first = ("translate", trained, sources / "sim_1.lh5", "--output", "adc", "--out")
+    length = ("--length", 1000, "--n-pre", 480)
+    # the run was trained on data of 15 ADC per keV on a baseline of 8000
+    outcome = command(*first, tmp_path / "a.lh5", *length)
+    assert outcome.code == 0, outcome.err
+    assert "18 of 20 pulses translated; rows of 0 for 1 nan, 1 constant" in said(outcome)
+    with h5py.File(tmp_path / "a.lh5") as file:
+        values = file["geds/ren/waveform/values"]
+        assert (values.dtype, values.shape) == (np.uint16, (20, 1000))
+        traces = values[:].astype(float)
+    assert (traces[4:6] == 0).all()
+    kept = np.delete(traces, [4, 5], axis=0)
+    assert (kept[:, :50] == 8000).all()
+    late = kept[:, 875:880].mean(axis=1) - 8000
+    expected = 15 * np.exp(-400 * 16 / 55_000) * np.delete(stand.sim_kev[:20], [4, 5])
+    np.testing.assert_allclose(late, expected, rtol=0.3)  # a network that learned nothing
+    refused = command("translate", trained, sources / "sim_0.lh5", "--out", "x", *length)
+    assert refused.code == 2
+    assert "add --output adc" in refused.err
+
+
+@pytest.mark.parametrize("words", [("--jobs", 0), ("--output", "volts"), ("--length", 0)])
+def test_words_that_are_none(command, trained, sources, tmp_path, words):
+    first = ("translate", trained, sources / "sim_0.lh5", "--out", tmp_path / "out")
+    assert command(*first, *words).code == 2
+    assert names(tmp_path) == ["in"]

@@ -1,0 +1,611 @@
+"""Translation of files: bytes, columns, realisations, ADC counts, and what can go wrong."""
+
+from __future__ import annotations
+
+import multiprocessing
+import operator
+import os
+import resource
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import awkward as ak
+import h5py
+import lh5
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, WaveformTable
+from torch import nn
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.errors import CpunetError
+from cpunet.jobs import translate as translate_job
+from cpunet.jobs.file_workers import in_processes
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.output_lock import only_writer
+from cpunet.jobs.translate import translate_file
+from cpunet.jobs.translate_files import expanded, translate_files
+from cpunet.jobs.translate_options import Adc, TranslateOptions
+from cpunet.jobs.translation_blocks import noise_seed, regrouped
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import write_run
+from cpunet.translation.to_adc import extended, to_adc
+from cpunet.translation.translator import REN
+
+DT_NS, N = 16.0, 40
+NOISE_KEV = 2.0
+INFO = {"dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "device": "cpu", "seed": 0}
+# the data of a run: 1 in prepared units was 26145.11 ADC at 2614.511 keV
+DATA = {
+    "cuts": {
+        "amplitude": 26145.11,
+        "noise": 9.0,
+        "windows": [{"name": "baseline", "centre": 14000.0, "low": 0, "high": 1}],
+    }
+}
+ADC = Adc(length=1400, n_pre=700)
+
+
+class Listening(Monitor):
+    def __init__(self):
+        self.notes: list[str] = []
+
+    def note(self, message):
+        self.notes.append(message)
+
+
+def charge(n=N, seed=1, length=225):
+    """Edges of random width that end at 1."""
+    width = np.random.default_rng(seed).uniform(1.5, 5, (n, 1))
+    return (1 / (1 + np.exp(-(np.arange(length) - 80) / width))).astype(np.float32)
+
+
+def write_chain(folder, info=INFO, **buffers):
+    recipe = load_recipe("fast")
+    chain = ResponseGenerator(recipe.matching.generator, DT_NS)
+    chain.set_noise(BaselineNoise(np.full(4097, NOISE_KEV**2), 8192, DT_NS, 100))
+    folder.mkdir()
+    write_run(folder, nn.ModuleDict({"ren": chain}), recipe, {"recipe": "fast"} | info)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A readout chain that was not fitted."""
+    return write_chain(tmp_path_factory.mktemp("runs") / "run", INFO | {"data": DATA})
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    """A narrow network that was not trained."""
+    recipe = load_recipe("small", ["generator.width=2"])
+    torch.manual_seed(0)
+    model = nn.ModuleDict({"ren": PositionalUNet(recipe.cyclegan.generator, 800)})
+    folder = tmp_path_factory.mktemp("networks") / "run"
+    folder.mkdir()
+    write_run(folder, model, recipe, {"recipe": "small"} | INFO)
+    return folder
+
+
+def sim_file(path, n=N, seed=1, **others):
+    """An LH5 file by the LH5 library, with columns of many kinds."""
+    rng = np.random.default_rng(seed)
+    content = {
+        "waveform": WaveformTable(
+            t0=np.zeros(n),
+            t0_units="ns",
+            dt=np.full(n, DT_NS),
+            dt_units="ns",
+            values=ArrayOfEqualSizedArrays(nda=charge(n, seed)),
+        ),
+        "energy": Array(rng.uniform(500, 2600, n), attrs={"units": "keV"}),
+        "event_number": Array(7 + 2 * np.arange(n)),
+    }
+    lh5.write(
+        Table(col_dict=content | others), "sim", path, group="geds", wo_mode="overwrite_file"
+    )
+    return path
+
+
+def many_columns(n=N):
+    hits = ak.Array([[float(i)] * (i % 4) for i in range(n)])
+    return {
+        "edep": VectorOfVectors(hits, attrs={"units": "keV"}),
+        "names": Array(np.array([b"a", b"bcd"] * (n // 2))),
+        "drift_time": Array(np.arange(n) * 1.5, attrs={"units": "ns"}),
+        "flag": Array(np.arange(n) % 3 == 0),
+        "position": ArrayOfEqualSizedArrays(nda=np.arange(3.0 * n).reshape(n, 3)),
+        "vertex": Table({"x": Array(np.arange(n)), "hits": VectorOfVectors(hits)}),
+        "rejection": Array(np.full(n, 9)),
+    }
+
+
+def plain(column, rows=slice(None)):
+    """A column of LH5 as nested lists."""
+    if isinstance(column, Table):
+        return {name: plain(inner, rows) for name, inner in column.items()}
+    if isinstance(column, VectorOfVectors):
+        return ak.to_list(column.view_as("ak")[rows])
+    return column.nda[rows].tolist()
+
+
+def values(path, table="geds/ren"):
+    return lh5.read(f"{table}/waveform/values", path).nda
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- what is written
+
+
+def test_all_other_columns_are_kept(run, tmp_path):
+    source = sim_file(tmp_path / "sim.lh5", **many_columns())
+    translate_file(run, InputFile(source), tmp_path / "out.lh5", device="cpu")
+    before, after = lh5.read("geds/sim", source), lh5.read("geds/ren", tmp_path / "out.lh5")
+    assert set(after) == set(before) | {"rejection_source"}
+    assert plain(after.rejection_source) == [9] * N
+    assert plain(after.rejection) == [0] * N
+    for name in set(before) - {"waveform", "rejection"}:
+        assert plain(after[name]) == plain(before[name]), name
+        assert after[name].attrs.get("units") == before[name].attrs.get("units")
+
+
+def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path):
+    with h5py.File(tmp_path / "sim.hdf5", "w") as file:
+        file["waveform"], file["dt_ns"] = charge(), DT_NS
+        file["energy_kev"], file["depth"] = np.full(N, 1000.0), np.arange(N)
+        file["text"] = np.array(["a", "bc"] * (N // 2), dtype=object)
+        file["short"] = np.arange(3)
+        file["pair"] = np.ones(N, complex)
+    listening, out = Listening(), tmp_path / "out.lh5"
+    translate_file(run, InputFile(tmp_path / "sim.hdf5"), out, device="cpu", monitor=listening)
+    table = lh5.read("geds/ren", out)
+    assert plain(table.depth) == list(range(N))
+    assert plain(table.text) == [b"a", b"bc"] * (N // 2)
+    told = " ".join(listening.notes)
+    assert "column short is left out: 3 rows beside 40 pulses" in told
+    assert "column pair is left out: of type complex128" in told
+    assert {"short", "pair"}.isdisjoint(table)
+
+    np.savez(
+        tmp_path / "sim.npz", waveforms=charge(), energy_kev=np.full(N, 1e3), z=np.arange(N)
+    )
+    source = InputFile(tmp_path / "sim.npz", dt_ns=DT_NS)
+    translate_file(run, source, tmp_path / "npz.lh5", device="cpu")
+    assert plain(lh5.read("geds/ren", tmp_path / "npz.lh5").z) == list(range(N))
+
+
+def test_realisations_repeat_rows(run, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
+    told = translate_file(
+        run, source, tmp_path / "out.lh5", realisations=3, seed=4, device="cpu"
+    )
+    assert told["translated"] == 3 * N
+    table = lh5.read("geds/ren", tmp_path / "out.lh5")
+    assert plain(table.realisation) == [0, 1, 2] * N
+    before = lh5.read("geds/sim", source.path)
+    rows = np.repeat(np.arange(N), 3)
+    for name in ("edep", "drift_time", "vertex", "position", "names", "event_number"):
+        assert plain(table[name]) == plain(before[name], rows)
+    translate_file(run, source, tmp_path / "one.lh5", seed=4, device="cpu")
+    waveforms = table.waveform.values.nda.reshape(N, 3, 800)
+    np.testing.assert_array_equal(waveforms[:, 0], values(tmp_path / "one.lh5"))
+    noise = waveforms[..., :300] - waveforms[..., :300].mean(axis=1, keepdims=True)
+    together = (noise[:, 0] * noise[:, 1]).mean() / (noise[:, 0] ** 2).mean()
+    assert together == pytest.approx(-0.5, abs=0.03)  # three independent draws about their mean
+
+
+def test_a_column_appended_to_a_copy(run, tmp_path):
+    source = sim_file(tmp_path / "sim.lh5", **many_columns())
+    with h5py.File(source, "a") as file:
+        file["elsewhere/note"] = 5
+    before = source.read_bytes()
+    out = tmp_path / "out.lh5"
+    translate_file(run, InputFile(source), out, append_column="waveform_ren", device="cpu")
+    assert source.read_bytes() == before
+    table = lh5.read("geds/sim", out)
+    assert isinstance(table.waveform_ren, WaveformTable)
+    assert set(table) - set(lh5.read("geds/sim", source)) == {
+        "waveform_ren",
+        "waveform_ren_rejection",
+    }
+    np.testing.assert_array_equal(table.waveform.values.nda, charge())
+    translate_file(run, InputFile(source), tmp_path / "plain.lh5", device="cpu")
+    np.testing.assert_array_equal(table.waveform_ren.values.nda, values(tmp_path / "plain.lh5"))
+    with h5py.File(out) as file:
+        assert file["elsewhere/note"][()] == 5
+    again = {"append_column": "waveform_ren", "device": "cpu"}
+    with pytest.raises(CpunetError, match="has a column waveform_ren already"):
+        translate_file(run, InputFile(out), tmp_path / "again.lh5", **again)
+    assert names(tmp_path) == ["out.lh5", "plain.lh5", "sim.lh5"]
+
+
+# --- noise and bytes
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    sizes=st.lists(st.integers(0, 30), min_size=1, max_size=8),
+    size=st.integers(1, 20),
+)
+def test_blocks_are_regrouped(sizes, size):
+    pulses = Pulses.of(np.arange(sum(sizes))[:, None], dt_ns=DT_NS)
+    ends = np.cumsum(sizes)
+    blocks = [pulses[end - n : end] for end, n in zip(ends, sizes, strict=True)]
+    found = list(regrouped(blocks, size))
+    assert all(len(block) == size for block in found[:-1])
+    numbers = [i for block in found for i in block.event_number.tolist()]
+    assert numbers == list(range(sum(sizes)))
+
+
+@pytest.fixture(scope="module")
+def in_blocks(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("blocks")
+    source = InputFile(sim_file(folder / "sim.lh5", n=50))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(translate_job, "NOISE_ROWS", 16)
+        translate_file(run, source, folder / "whole.lh5", device="cpu")
+    return source, (folder / "whole.lh5").read_bytes()
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
+@given(size=st.integers(1, 60), longest=st.integers(225, 225 * 60))
+def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, longest):
+    source, expected = in_blocks
+    out = tmp_path_factory.mktemp("blocks") / "whole.lh5"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(translate_job, "NOISE_ROWS", 16)
+        patch.setattr(translate_job, "BLOCK_SIZE", size)
+        patch.setattr(translate_job, "BLOCK_SAMPLES", longest)
+        translate_file(run, source, out, device="cpu")
+    assert out.read_bytes() == expected
+
+
+def test_seeds_differ_by_file_block_and_realisation():
+    seeds = [
+        noise_seed(seed, key, block, realisation)
+        for seed in (0, 1)
+        for key in (None, "a.lh5", "b.lh5")
+        for block in (0, 1)
+        for realisation in (0, 1)
+    ]
+    assert len(set(seeds)) == len(seeds)
+    assert noise_seed(5, None, 0) == 5
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("many")
+    return [InputFile(sim_file(folder / f"sim_{i}.lh5", seed=i)) for i in range(3)]
+
+
+@pytest.fixture(scope="module")
+def sequential(run, many, tmp_path_factory):
+    out = tmp_path_factory.mktemp("sequential") / "out"
+    told = translate_files(run, many, out, device="cpu")
+    return out, told
+
+
+def test_files_in_a_folder(sequential):
+    out, told = sequential
+    counts = {"read": 3 * N, "translated": 3 * N, "rejections": {}}
+    assert told == {"files": 3, "skipped": 0} | counts
+    assert names(out) == ["sim_0.lh5", "sim_1.lh5", "sim_2.lh5"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
+    run, many, sequential, tmp_path, jobs
+):
+    bad, listening, out = tmp_path / "bad.lh5", Listening(), tmp_path / "out"
+    bad.write_bytes(many[0].path.read_bytes()[:3000])
+    sources = [InputFile(bad), *many]
+    with pytest.raises(
+        CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"
+    ) as error:
+        translate_files(run, sources, out, jobs=jobs, device="cpu", monitor=listening)
+    assert "\n" not in str(error.value)
+    assert sum("bad.lh5" in note for note in listening.notes) == 1
+    assert names(out) == names(sequential[0])
+    for path in sequential[0].iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+    assert multiprocessing.active_children() == []
+
+
+def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
+    out = tmp_path / "out"
+    translate_files(run, many[:2], out, device="cpu")
+    before = [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)]
+    with pytest.raises(CpunetError, match="exists already"):
+        translate_files(run, many, out, device="cpu")
+    told = translate_files(run, many, out, device="cpu", resume=True)
+    assert (told["skipped"], told["translated"]) == (2, 3 * N)
+    assert [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)] == before
+    for path in sequential[0].iterdir():
+        assert (out / path.name).read_bytes() == path.read_bytes()
+
+
+def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, tmp_path):
+    out = sequential[0]
+
+    def refused(run=run, sources=many, **options):
+        with pytest.raises(CpunetError) as error:
+            translate_files(
+                run, sources, out, TranslateOptions(**options), resume=True, device="cpu"
+            )
+        return str(error.value)
+
+    assert "was made with another run" in refused(run=network)
+    assert "was made with other options (seed)" in refused(seed=1)
+    assert "was made with other options (noise)" in refused(noise=False)
+    other = InputFile(sim_file(tmp_path / "sim_0.lh5", seed=9))
+    assert "sim_0.lh5: was made with another source" in refused(sources=[other])
+    foreign = tmp_path / "out"
+    foreign.mkdir()
+    (foreign / "sim_0.lh5").write_bytes(b"x")
+    with pytest.raises(CpunetError, match="no translation that is finished"):
+        translate_files(run, many[:1], foreign, resume=True, device="cpu")
+
+
+# --- ADC counts
+
+
+def measured(n=30, seed=3):
+    """Traces in ADC with a decay and noise, of all energies, the edge at about sample 600."""
+    rng = np.random.default_rng(seed)
+    traces = np.zeros((n, 1300))
+    traces[:, 500:725] = charge(n, seed)
+    traces[:, 725:] = 1
+    traces *= np.exp(-np.clip(np.arange(1300) - 590, 0, None) * DT_NS / 55_000)
+    height, baseline = rng.uniform(3000, 40_000, (n, 1)), rng.uniform(8000, 16000, (n, 1))
+    return np.rint(baseline + height * traces + rng.normal(0, 8, traces.shape))
+
+
+def test_the_preparation_is_undone_to_half_a_count():
+    raw = measured()
+    prepared = prepare(Pulses.of(raw, dt_ns=DT_NS), load_recipe("fast").preparation, "measured")
+    assert len(prepared) == len(raw)
+    back, saturated = to_adc(prepared.pulses.waveforms, prepared.scale, prepared.baseline)
+    rows = prepared.align_sample[:, None] - 400 + np.arange(800)
+    assert np.abs(back - np.take_along_axis(raw, rows, axis=1)).max() <= 0.5
+    assert not saturated.any()
+    again = prepare(Pulses.of(back, dt_ns=DT_NS), load_recipe("fast").preparation, "measured")
+    np.testing.assert_allclose(again.scale, prepared.scale, atol=1)
+    lost = np.abs(again.pulses.waveforms - prepared.pulses.waveforms).max(axis=1)
+    assert (lost * prepared.scale < 1.0).all()
+
+
+def test_windows_are_extended_by_their_decay():
+    config = load_recipe("fast").preparation
+    raw = Pulses.of(measured(), dt_ns=DT_NS)
+    prepared = prepare(raw, config, "measured")
+    longer = extended(prepared.pulses.waveforms, config, DT_NS, 1100, 450)
+    np.testing.assert_array_equal(longer[:, 50:850], prepared.pulses.waveforms)
+    assert (longer[:, :50] == 0).all()
+    rows = prepared.align_sample[:, None] - 450 + np.arange(850, 1100)
+    expected = np.take_along_axis(raw.waveforms, rows, axis=1)
+    counts = longer[:, 850:] * prepared.scale[:, None] + prepared.baseline[:, None] - expected
+    assert np.abs(counts.mean(axis=1)).max() < 20
+    short = extended(prepared.pulses.waveforms, config, DT_NS, 300, 100)
+    np.testing.assert_array_equal(short, prepared.pulses.waveforms[:, 300:600])
+
+
+@pytest.mark.parametrize("adc", [Adc(), ADC])
+def test_traces_in_adc_counts(run, tmp_path, adc):
+    source, out = sim_file(tmp_path / "sim.lh5"), tmp_path / "out.lh5"
+    told = translate_file(run, InputFile(source), out, adc=adc, device="cpu")
+    assert (told["translated"], told["saturated"]) == (N, 0)
+    length, n_pre = adc.length or 800, adc.n_pre or 400
+    table = lh5.read("geds/ren", out)
+    traces = table.waveform.values.nda
+    assert (traces.dtype, traces.shape) == (np.uint16, (N, length))
+    assert table.waveform.values.attrs["units"] == "ADC"
+    assert (table.waveform.t0.nda == -n_pre * DT_NS).all()
+    # the stored data: baseline 14000, and 10 ADC per keV and prepared unit
+    energy = table.energy.nda
+    assert traces[:, :200].mean() == pytest.approx(14_000, abs=2)
+    white = traces[:, :200].std(axis=1).mean()
+    assert white == pytest.approx(10 * NOISE_KEV, rel=0.05)
+    end = traces[:, n_pre + 395 : n_pre + 400].mean(axis=1) - 14_000
+    np.testing.assert_allclose(end / energy, 8.0, atol=5 * 20 / np.sqrt(5) / energy.min())
+    # prepared again they are what translation gives without ADC
+    config = load_recipe("fast").preparation
+    clean = tmp_path / "clean.lh5"
+    translate_file(run, InputFile(source), clean, adc=adc, noise=False, device="cpu")
+    back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
+    assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
+    windows = REN.load(run).translate(charge(), noise=False)
+    same = back.align_sample == n_pre
+    assert same.sum() > N / 3
+    np.testing.assert_allclose(
+        back.pulses.waveforms[same], windows[back.index[same]], atol=1.2 / 5000
+    )
+
+
+def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
+    run, network, tmp_path
+):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    translate_file(run, source, tmp_path / "chain.lh5", adc=ADC, device="cpu")
+    traces = values(tmp_path / "chain.lh5").astype(float)
+    for part in (slice(0, 250), slice(1150, 1400)):
+        steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
+        assert steps.mean() == pytest.approx(10 * NOISE_KEV, rel=0.05)
+    listening = Listening()
+    given = Adc(adc_per_kev=8.0, baseline=14_000, length=1000, n_pre=500)
+    told = translate_file(
+        network,
+        source,
+        tmp_path / "unet.lh5",
+        adc=given,
+        noise=False,
+        device="cpu",
+        monitor=listening,
+    )
+    assert told["read"] == N
+    assert any("beyond them stand baseline and decay" in note for note in listening.notes)
+    assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
+
+
+def test_gain_is_the_height_of_a_fast_pulse(run, tmp_path):
+    source = sim_file(tmp_path / "sim.lh5")
+    given = Adc(adc_per_kev=7.0, baseline=100.0)
+    out = tmp_path / "out.lh5"
+    translate_file(run, InputFile(source), out, adc=given, noise=False, device="cpu")
+    table = lh5.read("geds/ren", out)
+    height = table.waveform.values.nda.max(axis=1) - 100.0
+    np.testing.assert_allclose(height / table.energy.nda, 7.0, rtol=0.01)
+
+
+def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
+    waveforms, kev = charge(6), np.array([1000.0, 6500.0, np.nan, 1000.0, 6500.0, 1000.0])
+    waveforms[3] = 0.5
+    path = tmp_path / "sim.lh5"
+    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
+    told = translate_file(run, InputFile(path), tmp_path / "out.lh5", adc=ADC, device="cpu")
+    assert told == {
+        "read": 6,
+        "translated": 4,
+        "rejections": {"constant": 1, "energy_unknown": 1},
+        "saturated": 2,
+    }
+    table = lh5.read("geds/ren", tmp_path / "out.lh5")
+    traces = table.waveform.values.nda
+    assert (traces[[2, 3]] == 0).all()
+    assert traces.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
+    codes = [Rejection(code).label for code in table.rejection.nda]
+    assert codes == ["accepted", "accepted", "energy_unknown", "constant"] + 2 * ["accepted"]
+
+
+def test_adc_needs_to_be_known(network, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+
+    def refused(**adc):
+        with pytest.raises(CpunetError) as error:
+            translate_file(network, source, tmp_path / "o.lh5", adc=Adc(**adc), device="cpu")
+        return str(error.value)
+
+    assert "give --adc-per-kev" in refused()
+    assert "give --baseline" in refused(adc_per_kev=5)
+    assert "expected a number above 0" in refused(adc_per_kev=0, baseline=5)
+    assert "not within a trace" in refused(adc_per_kev=5, baseline=5, length=100, n_pre=100)
+
+
+# --- what can go wrong
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"realisations": 0}, "expected 1 or more"),
+        ({"realisations": 2, "noise": False}, "all the same"),
+        ({"realisations": 2, "append_column": "a"}, "cannot be a further column"),
+        ({"table": "a/b", "append_column": "a"}, "leave out --out-table"),
+        ({"inverse": True, "adc": Adc()}, "leave out --output adc"),
+    ],
+)
+def test_options_that_contradict_each_other(options, said):
+    with pytest.raises(CpunetError, match=said):
+        TranslateOptions(**options)
+
+
+def test_a_file_that_changes_meanwhile_gives_no_output(run, tmp_path, monkeypatch):
+    source = sim_file(tmp_path / "sim.lh5")
+
+    class Touching(Monitor):
+        @contextmanager
+        def stage(self, title, total=None):
+            yield lambda _: os.utime(source, ns=(0, 0))
+
+    with pytest.raises(CpunetError, match=r"sim.lh5: changed while it was read"):
+        translate_file(
+            run, InputFile(source), tmp_path / "out.lh5", device="cpu", monitor=Touching()
+        )
+    assert names(tmp_path) == ["sim.lh5"]
+
+
+def test_a_second_writer_is_refused(run, tmp_path):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    with (
+        only_writer(out),
+        pytest.raises(CpunetError, match=r"out.lh5: another process is writing it"),
+    ):
+        translate_file(run, source, out, device="cpu")
+    translate_file(run, source, out, device="cpu")
+    assert names(tmp_path) == ["out.lh5", "sim.lh5"]
+
+
+@contextmanager
+def largest_file(size):
+    """A limit on the size of files: fails as a full disk does, in the midst of a write."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("options", [{}, {"append_column": "waveform_ren"}])
+def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path, options):
+    source, out = sim_file(tmp_path / "sim.lh5", n=400), tmp_path / "out" / "out.lh5"
+    listing = r"out.lh5: cannot be written \(File too large\); nothing was left$"
+    for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
+        with largest_file(size), pytest.raises(CpunetError, match=listing):
+            translate_file(run, InputFile(source), out, device="cpu", **options)
+        assert names(out.parent) == []
+
+
+def test_no_space_left_is_told(run, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError("Can't write (file write failed: errno = 28, error message = 'No ...')")
+
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    monkeypatch.setattr("cpunet.pulses.lh5_parts.lh5.write", full)
+    with pytest.raises(CpunetError, match=r"out.lh5: cannot be written \(No space left on dev"):
+        translate_file(run, source, tmp_path / "out.lh5", device="cpu")
+    assert names(tmp_path) == ["sim.lh5"]
+
+
+def test_targets_that_cannot_be_written(run, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    with pytest.raises(CpunetError, match=r"/proc/nowhere/out.lh5: cannot be written"):
+        translate_file(run, source, Path("/proc/nowhere/out.lh5"), device="cpu")
+    with pytest.raises(CpunetError, match="is the input; choose another"):
+        translate_file(run, source, source.path, device="cpu", force=True)
+    with pytest.raises(CpunetError, match="is a file, but several outputs need a folder"):
+        translate_files(run, [source, source], source.path, device="cpu")
+
+
+def test_a_process_that_is_killed_costs_its_task():
+    silent = (lambda _: None, lambda _: None)
+    done = dict(in_processes(partial(os._exit, 3), ["a", "b"], 2, *silent))
+    assert all("ended with status 3" in str(error) for error in done.values())
+    done = dict(in_processes(partial(partial, operator.is_), ["a", "b", "c"], 2, *silent))
+    assert done == {0: False, 1: False, 2: False}
+
+
+def test_names(run, many, tmp_path):
+    folder = many[0].path.parent
+    assert expanded([folder / "sim_*.lh5"]) == [source.path for source in many]
+    assert expanded([folder / "other.lh5"]) == [folder / "other.lh5"]
+    with pytest.raises(CpunetError, match="no such files"):
+        expanded([folder / "x*.lh5"])
+    twice = [many[0], many[0]]
+    with pytest.raises(CpunetError, match=r"occur twice among the files, as sim_0.lh5"):
+        translate_files(run, twice, tmp_path / "out", device="cpu")
+    shared = [InputFile(one.path, energy="hit.lh5:a/b") for one in many]
+    with pytest.raises(CpunetError, match="belongs to one file"):
+        translate_files(run, shared, tmp_path / "out", device="cpu")
