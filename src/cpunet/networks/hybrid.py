@@ -145,7 +145,8 @@ def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
 def _folded(stretches: Tensor) -> Tensor:
     """(batch, samples) → (batch, FOLD, samples / FOLD)."""
     # not by the number of pulses, which would fix it in an exported graph
-    return stretches.unflatten(1, (-1, FOLD)).transpose(1, 2)
+    folded: Tensor = stretches.unflatten(1, (-1, FOLD))  # type: ignore[no-untyped-call]
+    return folded.transpose(1, 2)
 
 
 def _taper() -> Tensor:

@@ -121,7 +121,7 @@ class PositionalUNet(nn.Module):
 
     def __init__(self, config: PunetConfig, length: int) -> None:
         super().__init__()
-        m = config.width
+        self.width = m = config.width
         if length % 16:
             raise ValueError(f"the pulse length {length} is no multiple of 16")
         self.length = length

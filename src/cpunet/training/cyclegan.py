@@ -13,7 +13,13 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.time_major import fast_passes_pay
 from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.training.fast_step import (
+    fast_translations,
+    judge_together,
+    plain_translations,
+)
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
 
 LOSS_NAMES = (
@@ -49,18 +55,32 @@ class Step:
 
     The learning rates of all three optimisers follow the iteration, also between
     the discriminators' updates.
+
+    Parameters
+    ----------
+    model, config
+        What is trained, and how.
+    fast
+        Whether to take the passes of `cpunet.training.fast_step`; as it pays if None.
     """
 
-    def __init__(self, model: CycleGan, config: TrainingConfig) -> None:
+    def __init__(
+        self, model: CycleGan, config: TrainingConfig, *, fast: bool | None = None
+    ) -> None:
         self.model = model
         self.config = config
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
         self.noise = config.instance_noise
+        self.fast = fast_passes_pay(model.ren, device.type) if fast is None else fast
 
         def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
             return AdamW(
-                parameters, lr=rate, betas=config.betas, weight_decay=config.weight_decay
+                parameters,
+                lr=rate,
+                betas=config.betas,
+                weight_decay=config.weight_decay,
+                fused=True,
             )
 
         self.generators = optimiser(model.generator_parameters(), config.rate_generators)
@@ -114,16 +134,27 @@ class Step:
     ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """Return the six losses of the generators and the two translated batches."""
         model, weights = self.model, self.weights
-        fake_data, fake_sim = model.ren(sim), model.iren(data)
+        translations = fast_translations if self.fast else plain_translations
+        done = translations(model.ren, model.iren, sim, data)
+        judged_data, judged_sim = self._judged(
+            (model.discriminator_data, self._noisy(done.fake_data)),
+            (model.discriminator_sim, self._noisy(done.fake_sim)),
+        )
         losses = {
-            "identity_data": weighted_l1(model.ren(data), data, weights),
-            "identity_sim": weighted_l1(model.iren(sim), sim, weights),
-            "cycle_forward": weighted_l1(model.iren(fake_data), sim, weights),
-            "cycle_backward": weighted_l1(model.ren(fake_sim), data, weights),
-            "adversarial_ren": real_loss(model.discriminator_data(self._noisy(fake_data))),
-            "adversarial_iren": real_loss(model.discriminator_sim(self._noisy(fake_sim))),
+            "identity_data": weighted_l1(done.same_data, data, weights),
+            "identity_sim": weighted_l1(done.same_sim, sim, weights),
+            "cycle_forward": weighted_l1(done.cycled_sim, sim, weights),
+            "cycle_backward": weighted_l1(done.cycled_data, data, weights),
+            "adversarial_ren": real_loss(judged_data),
+            "adversarial_iren": real_loss(judged_sim),
         }
-        return losses, fake_data, fake_sim
+        return losses, done.fake_data, done.fake_sim
+
+    def _judged(self, *pairs: tuple[GruDiscriminator, Tensor]) -> list[Tensor]:
+        """Logits of the pulses of each discriminator."""
+        if self.fast:
+            return judge_together(*pairs)
+        return [network(pulses) for network, pulses in pairs]
 
     def total(self, losses: dict[str, Tensor]) -> Tensor:
         """Weighted sum of the generators' six losses."""
@@ -158,7 +189,7 @@ class Step:
         return pulses + self.noise * torch.randn_like(pulses)
 
     def _discriminator_loss(
-        self, network: nn.Module, real: Tensor, fake: Tensor
+        self, network: GruDiscriminator, real: Tensor, fake: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the adversarial loss and the gradient penalty."""
         weight = self.config.losses.gradient_penalty
@@ -166,7 +197,7 @@ class Step:
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
         # cuDNN's GRU has no second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
-            logits = network(pulses)
+            (logits,) = self._judged((network, pulses)) if not weight else (network(pulses),)
         loss = real_loss(logits[: len(real)]) + fake_loss(logits[len(real) :])
         if not weight:
             return loss, torch.zeros_like(loss)

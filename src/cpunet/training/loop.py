@@ -60,6 +60,7 @@ def train(
     *,
     seed: int,
     device: str = "cpu",
+    init: Callable[[CycleGan], None] | None = None,
     listener: Listener | None = None,
     keeping: Keeping = NOTHING_KEPT,
 ) -> CycleGan:
@@ -78,6 +79,8 @@ def train(
         Of the initial weights, the dealing of batches, dropout and latent noise.
     device
         ``"cpu"`` or ``"cuda"``.
+    init
+        Fills the networks with weights to start from, in place of the closed-form start.
     listener
         Called every ``log_interval`` iterations, and before each state is kept, with the
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``.
@@ -101,7 +104,11 @@ def train(
             Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, seed=side)
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
-        match_skips(model, decks[0].pulses, decks[1].pulses, recipe.preparation.samples_before)
+        if init is not None:
+            init(model)
+        else:
+            sim_side, data_side = (deck.pulses for deck in decks)
+            match_skips(model, sim_side, data_side, recipe.preparation.samples_before)
         training = _Training(model, decks, config, device)
         if keeping.start is not None:
             training.load_state_dict(keeping.start)

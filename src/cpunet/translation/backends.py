@@ -14,6 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.time_major import FrozenUNet, fast_passes_pay
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -47,7 +48,9 @@ class NetworkBackend(Backend):
     """A network from window to window; its noise is the latent one."""
 
     def __init__(self, network: PositionalUNet) -> None:
-        self.network = network.eval()
+        self.network = self._unet = network.eval()
+        # made when first needed: an importer or exporter may yet change or move the network
+        self._frozen: FrozenUNet | None = None
 
     def __call__(
         self,
@@ -59,9 +62,19 @@ class NetworkBackend(Backend):
         """Run the network; its output is a prepared window as it is."""
         del energy_kev
         batch = torch.from_numpy(windows).to(self.device)
-        out = self.network(batch[:, None], generator=generator, mean=not noise)
+        out = self._translate(batch[:, None], generator, mean=not noise)
         result: FloatArray = out[:, 0].cpu().numpy()
         return result, np.zeros(len(windows), np.uint8)
+
+    def _translate(
+        self, batch: torch.Tensor, generator: torch.Generator | None, mean: bool
+    ) -> torch.Tensor:
+        if not fast_passes_pay(self._unet, self.device.type):
+            out: torch.Tensor = self._unet(batch, generator=generator, mean=mean)
+            return out
+        if self._frozen is None:
+            self._frozen = FrozenUNet(self._unet)
+        return self._frozen.translate(batch, generator=generator, mean=mean)
 
 
 class ResponseBackend(Backend):
