@@ -118,9 +118,7 @@ def test_every_figure_can_be_drawn(whole) -> None:
         assert make().axes
 
 
-def test_a_missing_peak_is_told_and_the_rest_stands(
-    run, files, tmp_path, monkeypatch
-) -> None:
+def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("cpunet.jobs.validate.figure_makers", lambda found: {})  # drawn above
     metrics = validate_run(
         run, files["sim"], files["no DEP"], tmp_path / "report", rivals=False, device="cpu"

@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+
+Metrics = Mapping[str, Any]
+Values = npt.NDArray[np.float64]
 
 FAILED = 0.9  # of the median: below it, a training has failed
 WORST = 0.05  # quantile
-
-Metrics = Mapping[str, Any]
 
 
 def seed_table(metrics: Mapping[int, Metrics]) -> list[dict[str, Any]]:
@@ -43,11 +45,11 @@ def seed_table(metrics: Mapping[int, Metrics]) -> list[dict[str, Any]]:
                 "ceiling": _median(ious, "ceiling"),
             }
         )
-    return rows + [*_small_is_good(metrics)]
+    return [*rows, *_small_is_good(metrics)]
 
 
 def failed_seeds(metrics: Mapping[int, Metrics]) -> dict[int, list[str]]:
-    """Seeds with a score below 0.9 of the median, or without it: which, as ``"SEP drift_time"``."""
+    """Seeds with scores below 0.9 of the median, or without: which, as ``"SEP drift_time"``."""
     poor: dict[int, list[str]] = {}
     for peak, parameter, ious in _compared(metrics):
         limit = FAILED * _median(ious, "ren")
@@ -68,14 +70,8 @@ def _compared(
         for parameter in scores["parameters"]
     )
     for peak, parameter in places:
-        yield (
-            peak,
-            parameter,
-            [
-                of_seed["peaks"].get(peak, {}).get("parameters", {}).get(parameter, {}).get("iou", {})
-                for of_seed in metrics.values()
-            ],
-        )
+        path = ("peaks", peak, "parameters", parameter, "iou")
+        yield peak, parameter, [_part(of_seed, path) or {} for of_seed in metrics.values()]
 
 
 def _small_is_good(metrics: Mapping[int, Metrics]) -> Iterator[dict[str, Any]]:
@@ -102,7 +98,7 @@ def _part(content: Any, path: tuple[str, ...]) -> Any:
     return content
 
 
-def _values(ious: list[Mapping[str, Any]], method: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _values(ious: list[Mapping[str, Any]], method: str) -> Values:
     return np.array([iou.get(method) for iou in ious], float)  # None becomes NaN
 
 

@@ -13,8 +13,8 @@ from cpunet.cli.messages import monitor, out
 Names = Annotated[
     list[str],
     typer.Argument(
-        help="Figures by name, or part of it: spectrum, cycle, 'single pulse', 'SEP drift_time', "
-        "superpulses, 'A over E', noise, losses.",
+        help="Figures by name, or part of it: spectrum, cycle, 'single pulse', "
+        "'SEP drift_time', superpulses, 'A over E', noise, losses.",
         metavar="NAME…",
     ),
 ]
@@ -22,12 +22,6 @@ Sim = Annotated[Path | None, typer.Option("--sim", help="File of simulated pulse
 Data = Annotated[Path | None, typer.Option("--data", help="File of measured pulses.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the files.")]
 Suffix = Annotated[str, typer.Option("--format", help="png, pdf or svg.")]
-Truth = Annotated[
-    Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
-]
-Rivals = Annotated[
-    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
-]
 
 
 def figure(
@@ -37,8 +31,8 @@ def figure(
     data: Data = None,
     out_folder: Out = Path(),
     suffix: Suffix = "png",
-    truth: Truth = None,
-    rivals: Rivals = True,
+    truth: options.Truth = None,
+    rivals: options.Rivals = True,
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,

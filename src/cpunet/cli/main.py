@@ -23,8 +23,10 @@ from cpunet.cli.messages import fail
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
+from cpunet.cli.summary import summary
 from cpunet.cli.train import train
 from cpunet.cli.translate import translate
+from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.errors import CpunetError
 
@@ -41,9 +43,11 @@ for command in (
     stand,
     train,
     ensemble,
+    tune,
     translate,
     validate,
     compare,
+    summary,
     response,
     figure,
     explore,

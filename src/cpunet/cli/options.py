@@ -36,3 +36,9 @@ Dt = Annotated[
     float | None,
     typer.Option("--dt-ns", "--dt", help="Sampling period in ns, if the files do not tell."),
 ]
+Truth = Annotated[
+    Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
+]
+Rivals = Annotated[
+    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
+]

@@ -12,13 +12,6 @@ from cpunet.cli.messages import monitor, out
 from cpunet.cli.scores import score_table
 
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
-Truth = Annotated[
-    Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
-]
-
-Rivals = Annotated[
-    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
-]
 
 
 def validate(
@@ -26,8 +19,8 @@ def validate(
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
-    truth: Truth = None,
-    rivals: Rivals = True,
+    truth: options.Truth = None,
+    rivals: options.Rivals = True,
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,

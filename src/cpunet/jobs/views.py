@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -63,7 +64,7 @@ def report_views(found: Evaluation) -> dict[str, Any]:
     }
 
 
-def _packed(slices: dict[str, Slices]) -> dict[str, dict[str, Any]]:
+def _packed(slices: Mapping[str, Slices]) -> dict[str, dict[str, Any]]:
     return {
         method: {
             "n": [pulse.n for pulse in found.pulses],
@@ -74,7 +75,7 @@ def _packed(slices: dict[str, Slices]) -> dict[str, dict[str, Any]]:
     }
 
 
-def _slice_names(slices: dict[str, Slices]) -> list[str]:
+def _slice_names(slices: Mapping[str, Slices]) -> list[str]:
     if not slices:
         return []
     edges = slices["data"].edges

@@ -6,7 +6,7 @@ in the recipe that needs it is an error, and so is one that nobody reads.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -297,6 +297,30 @@ class ScoreConfig(Config):
         return self
 
 
+class SearchConfig(Config):
+    """Values of a setting that ``cpunet tune`` tries.
+
+    Either all from ``low`` to ``high``, on a logarithmic scale if ``log``, or one of
+    ``choices``.  Numbers from a whole to a whole number are whole if the setting is.
+    """
+
+    low: int | float | None = None
+    high: int | float | None = None
+    log: bool = False
+    choices: Annotated[tuple[Any, ...], Field(min_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> SearchConfig:
+        if (self.choices is None) == (self.low is None or self.high is None):
+            raise ValueError("give either low and high, or choices")
+        if self.low is not None and self.high is not None:
+            if not self.low < self.high:
+                raise ValueError("low must be less than high")
+            if self.log and self.low <= 0:
+                raise ValueError("log needs low above 0")
+        return self
+
+
 class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
@@ -326,6 +350,7 @@ class Recipe(Config):
     discriminator: GruConfig | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
+    search: dict[str, SearchConfig] | None = None
 
     @property
     def cyclegan(self) -> CycleGanSettings:

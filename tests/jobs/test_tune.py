@@ -1,0 +1,223 @@
+"""A search for settings sees held-out pulses of the training's energies, and nothing else."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.cli.main import main
+from cpunet.errors import CpunetError
+from cpunet.jobs.held_out import HeldOut
+from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.tune import tune_recipe
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
+from cpunet.training.loop import train
+from cpunet.training.search_space import search_space, value_of, with_values
+from cpunet.translation.translator import REN
+
+SPACE = (
+    "search={generator.width: {choices: [2, 4]}, "
+    "training.rate_generators: {low: 1.0e-4, high: 1.0e-2, log: true}}"
+)
+TINY = [
+    "generator.width=2",
+    "discriminator.embedding_dim=2",
+    "discriminator.hidden=2",
+    "discriminator.samples_per_step=16",
+    "training.iterations=8",
+    "training.batch_size=4",
+    "training.statistics_batches=1",
+    "training.checkpoint_interval=2",
+    "scores.bootstraps=10",
+    SPACE,
+]
+N = 100
+PROGRAM = "import sys; from cpunet.cli.main import main; sys.exit(main())"
+
+
+def tiny(*more: str) -> Recipe:
+    return load_recipe("small", [*TINY, *more])
+
+
+class Files(NamedTuple):
+    sim: InputFile
+    data: InputFile
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """Simulated and measured pulses of the full-energy peak, and some of another."""
+    folder = tmp_path_factory.mktemp("files")
+    rng = np.random.default_rng(5)
+    width = rng.uniform(1.5, 4, (N, 1))
+    sim = 1 / (1 + np.exp(-(np.arange(225) - 60) / width))
+    data = np.ones((N, 1200))
+    data[:, :500] = 0
+    data[:, 500:725] = sim[::-1]
+    data *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * 16 / 55_000)
+    kev = np.where(np.arange(N) < 90, 2614.511, 2103.511)
+    adc = 8000 + 20_000 * data + rng.normal(0, 10, data.shape)
+    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
+    write_pulses(folder / "data.lh5", Pulses.of(adc, dt_ns=16, energy_kev=kev))
+    return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
+
+
+def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
+    selection = parse_selection("FEP", recipe.peaks)
+    sim = load_simulated(files.sim, recipe, selection, Monitor())
+    data = load_measured(files.data, recipe, selection, Monitor())
+    return HeldOut.of(sim, data, files.data, recipe, seed)
+
+
+def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
+    parts = held_out(files, tiny())
+    for fit, held in ((parts.fit.sim, parts.sim), (parts.fit.data, parts.data)):
+        events = {*fit.event_number.tolist()}, {*held.event_number.tolist()}
+        assert not events[0] & events[1]
+        assert len(held) == int(0.3 * (len(fit) + len(held)))
+        assert (held.energy_kev == 2614.511).all()
+    other = held_out(files, tiny(), seed=1)
+    assert set(other.sim.event_number) != set(parts.sim.event_number)
+    few = tiny("peaks={FEP: {energy_kev: 2103.511, half_width_kev: 5}}")
+    with pytest.raises(CpunetError, match=r"sim\.lh5: 10 pulses, of which 3 would be held out"):
+        held_out(files, few)
+
+
+class Giving(REN):
+    """Gives pulses whatever it is asked to translate."""
+
+    def __init__(self, windows: np.ndarray, recipe: Recipe) -> None:
+        self.windows, self.recipe = windows, recipe
+
+    def seeded(self, seed: int | None) -> torch.Generator:
+        return torch.Generator()
+
+    def apply(self, *_: Any, **__: Any) -> Any:
+        return self.windows
+
+
+def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
+    recipe = tiny("scores.bootstraps=100")
+    parts = held_out(files, recipe)
+    alike = parts.score(Giving(parts.fit.data.waveforms[: len(parts.data)], recipe))
+    assert 0.3 < alike < 2
+    assert parts.score(Giving(parts.data.waveforms, recipe)) == 0
+    assert parts.score(Giving(parts.sim.waveforms, recipe)) > 10
+    lost = parts.data.waveforms.copy()
+    lost[:3] = np.nan
+    with pytest.raises(CpunetError, match="% of the held-out pulses have no translation"):
+        parts.score(Giving(lost, recipe))
+
+
+def test_scores_on_the_way_do_not_change_the_training(files):
+    recipe = tiny()
+    parts, told = held_out(files, recipe), []
+    ren = parts.train(recipe, 3, "cpu", lambda *at: told.append(at))
+    plain = train(parts.fit.sim.waveforms, parts.fit.data.waveforms, recipe, seed=3)
+    for name, weights in plain.ren.state_dict().items():
+        torch.testing.assert_close(ren.backend.network.state_dict()[name], weights)
+    assert [iteration for iteration, _ in told] == [2, 4, 6]
+    assert np.isfinite([score for _, score in told]).all()
+
+    def enough(_iteration: int, _score: float) -> None:
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        parts.train(recipe, 3, "cpu", enough)
+
+
+@pytest.mark.parametrize(
+    ("space", "words"),
+    [
+        ("{training.rigde: {low: 0.1, high: 0.2}}", "search.training.rigde: there is no such"),
+        ("{training: {low: 0.1, high: 0.2}}", "training"),
+        ("{peaks.FEP.energy_kev: {low: 1, high: 2}}", "search.peaks.FEP.energy_kev: only"),
+        ("{training.ridge: {low: 0.1, high: 2}}", "training.ridge = 2: training.ridge: "),
+        ("{training.clip: {low: -1, high: 2}}", "training.clip = -1: training.clip: "),
+        ("{training.steps: {choices: [10, many]}}", "training.steps = many: training.steps"),
+        ("{training.ridge: {low: 0.1}}", "search.training.ridge: "),
+        ("{training.ridge: {low: 0.2, high: 0.1}}", "search.training.ridge: "),
+        ("{training.ridge: {low: 0, high: 0.1, log: true}}", "search.training.ridge: "),
+        ("{training.ridge: {choices: [0.1]}}", "search.training.ridge"),
+        ("{training.ridge: {from: 0.1, to: 1}}", "search.training.ridge"),
+        ("null", "has no search space; add one"),
+    ],
+)
+def test_what_cannot_be_searched_is_told_by_its_key(space, words):
+    with pytest.raises(CpunetError) as told:
+        search_space(load_recipe("fast", [f"search={space}"]))
+    assert words in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("name", ["fast", "small", "paper"])
+def test_the_recipes_own_spaces_can_be_searched(name):
+    recipe = load_recipe(name)
+    space = search_space(recipe)
+    for key, config in space.items():
+        for value in config.choices or (config.low, config.high):
+            changed = with_values(recipe, {key: value})
+            assert changed.search is None
+            assert value_of(changed, key) == value
+
+
+def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(CpunetError, match=r"pip install 'cpunet\[tune\]'"):
+        tune_recipe(*files, tmp_path / "tune", tiny())
+    assert not [*tmp_path.iterdir()]
+
+
+def trials_begun(journal: Path) -> int:
+    return journal.read_text().count('"worker"') if journal.exists() else 0
+
+
+def test_a_search_that_was_killed_goes_on(files, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("optuna")
+    folder = tmp_path / "tune"
+    long = ["training.iterations=16", "training.log_interval=1"]
+    values = [word for value in [*TINY, *long] for word in ("--set", value)]
+    inputs = ["--sim", files.sim.path, "--data", files.data.path, "--out", folder]
+    words = ["tune", *inputs, "--recipe", "small", *values, "--trials", 2, "--jobs", 1]
+    words = [*map(str, words), "--threads", "1"]
+    job = subprocess.Popen([sys.executable, "-c", PROGRAM, *words], stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 120
+        while not trials_begun(folder / "journal.log") and job.poll() is None:
+            assert time.monotonic() < deadline, "no trial was begun"
+            time.sleep(0.05)
+    finally:
+        job.send_signal(signal.SIGKILL)
+        job.wait()
+    monkeypatch.setattr(sys, "argv", ["cpunet", *words, "--resume"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    told = capsys.readouterr()
+    assert stop.value.code == 0, told.err
+    rows = [*csv.DictReader((folder / "trials.csv").read_text().splitlines())]
+    assert [row["state"] for row in rows] == ["complete", "complete"]
+    best = min(rows, key=lambda row: float(row["score"]))
+    tuned = load_recipe(str(folder / "best.yaml"))
+    assert tuned.search is None
+    assert tuned.generator.width == int(best["generator.width"])
+    assert tuned.training.rate_generators == float(best["training.rate_generators"])
+    assert tuned.scores == tiny().scores
+    # the recipe as it is was the one that was cut off
+    own = {(row["generator.width"], row["training.rate_generators"]) for row in rows}
+    assert ("2", "0.001") in own
+    assert f"best: trial {best['number']}" in told.out
+    assert "the recipe as it is has" in told.out
