@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,4 +28,11 @@ def reference_data() -> Path:
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> None:
     """Tiny networks: threads that wait for each other cost more than they gain."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def one_thread_again() -> Iterator[None]:
+    """What a test sets must not reach the next one: the last bits depend on it."""
+    yield
     torch.set_num_threads(1)

@@ -141,7 +141,7 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
 def test_what_is_told_on_the_way(run: Run) -> None:
     assert run.monitor.warnings == []
     total, *steps = run.monitor.stages["Matching"]
-    assert total == RECIPE.training.iterations
+    assert total is None  # most fits end long before they must
     assert steps == [1] * run.info["fit"]["steps"]
     records = [json.loads(x) for x in (run.folder / "losses.jsonl").read_text().splitlines()]
     assert [record["iteration"] for record in records] == list(range(1, len(steps) + 1))

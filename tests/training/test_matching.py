@@ -236,7 +236,7 @@ def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> 
     numbers = response.describe()
     assert fit.chi_square < GOOD_FIT * fit.moments
     assert numbers["ringing_mhz"] == pytest.approx(6.0, rel=0.02)
-    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.2)  # with its damping
+    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.3)  # with its damping
     assert np.sort(response.log_poles_ns.detach().exp()) == pytest.approx([35, 55], rel=0.03)
     assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
     # and none where there is none

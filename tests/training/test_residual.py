@@ -91,17 +91,17 @@ def test_nothing_is_kept_where_the_physics_agree(chain):
 
 
 def test_wider_edges_are_learned(chain, tmp_path):
-    residual, kept = fitted(chain, 1.6)
+    residual, kept = fitted(chain, 2.2)
     assert kept.kept
     assert kept.held_out_after < 0.9 * kept.held_out_before
     assert kept.rms > 1e-3
-    # the edge of pulses never seen gets closer to what it is in truth
+    # pulses never seen get closer to what they are in truth
     with torch.no_grad():
         before = chain(torch.from_numpy(charge(200, 9)))
-        wanted = chain(torch.from_numpy(charge(200, 9, 1.6)))
+        wanted = chain(torch.from_numpy(charge(200, 9, 2.2)))
         after = residual(before)
-    steep = [float(r.diff(dim=1).amax(dim=1).mean()) for r in (before, after, wanted)]
-    assert abs(steep[1] - steep[2]) < 0.9 * abs(steep[0] - steep[2])
+    rms = [float((records - wanted).square().mean().sqrt()) for records in (before, after)]
+    assert rms[1] < 0.96 * rms[0]
     assert_translated_alike(chain, residual, tmp_path / "run")
 
 

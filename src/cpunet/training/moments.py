@@ -31,6 +31,9 @@ EDGE = 60  # samples to either side of the half maximum hold the steepest point
 # electronics do; so many standard deviations off may the moments be where it is wrong.
 EARLY, WRONG, LATE = 30, 20.0, 2.0
 LEAST_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
+# Of translated pulses, beyond which the cut on the data's tails is no longer followed: the
+# response is still far off.
+MOST_CUT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,10 @@ class Moments:
         Of the moments.
     left_out
         Measured pulses that are no single pulses with a flat baseline, and do not count.
+    slope_range
+        Lowest and highest tail slope of the data.  Quality cuts bound it, and what is beyond
+        is left out on the other side too: behind a fast decay the tails of late pulses are
+        steeper, so that such a cut takes more of these.
     """
 
     config: MatchingConfig
@@ -63,6 +70,7 @@ class Moments:
     values: Tensor
     names: tuple[str, ...]
     left_out: int
+    slope_range: tuple[float, float]
 
     @classmethod
     def of_data(
@@ -126,6 +134,7 @@ class Moments:
             values=torch.empty(0),
             names=_names(config),
             left_out=int((~usable).sum()),
+            slope_range=(float(linear[:, -1].min()), float(linear[:, -1].max())),
         )
         values = drawn_up._of_aligned(aligned, linear[:, -1])
         return cls(**{**vars(drawn_up), "values": values})
@@ -145,11 +154,16 @@ class Moments:
         Returns
         -------
         Tensor
-            Float64, shape (pulses, moments).
+            Float64, shape (pulses, moments); NaN for a pulse that does not count.
         """
         tail_level = self.preparation.tail_level
         aligned, records = at_half_maximum(records, self.level, last, self.config, tail_level)
-        return self._of_aligned(aligned, self._slopes_of(records, last), clip)
+        slopes = self._slopes_of(records, last)
+        values = self._of_aligned(aligned, slopes, clip)
+        cut = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
+        if clip is None and cut.float().mean() < MOST_CUT:
+            values[cut] = torch.nan
+        return values
 
     @property
     def model_errors(self) -> Tensor:
