@@ -15,6 +15,17 @@ settings.register_profile("cpunet", deadline=None)
 settings.load_profile("cpunet")
 
 
+def pytest_configure() -> None:
+    """Give each process its own compiled code.
+
+    Two that write the same cache at once, as in a fresh checkout, may read what the other has
+    half written, and crash.
+    """
+    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+        caches = Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba"
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(caches / worker))
+
+
 @pytest.fixture(scope="session")
 def reference_data() -> Path:
     """Folder of the optional reference data; the test skips without it."""
