@@ -24,8 +24,8 @@ class Nearest:
     rms
         RMS difference to each, in units of the pulse height.
     unaligned
-        Measured pulses left out because the edge region about the crossing of half of
-        their maximum is not all in their window.
+        Measured pulses left out because too little of the edge region about the crossing of
+        half of their maximum is in their window.
     """
 
     index: Indices
@@ -33,7 +33,13 @@ class Nearest:
     unaligned: int
 
 
-def nearest_pulses(edges: FloatArray, measured: FloatArray, count: int) -> Nearest:
+def nearest_pulses(
+    edges: FloatArray,
+    measured: FloatArray,
+    count: int,
+    before: int | None = None,
+    least: float = 1.0,
+) -> Nearest:
     """Find the measured pulses with the least RMS difference from each of some edges.
 
     Noise counts as difference.
@@ -41,25 +47,33 @@ def nearest_pulses(edges: FloatArray, measured: FloatArray, count: int) -> Neare
     Parameters
     ----------
     edges
-        Pulses aligned at half maximum by `align_half_maximum`, with as many samples before
-        it as after it: shape ``(n, 2 * edge_samples)``.
+        Pulses aligned at half maximum by `align_half_maximum`, shape ``(n, samples)``.
     measured
         Prepared windows, ``(m, samples)``, which are aligned likewise.
     count
         How many to find; all, if fewer can be aligned.
+    before
+        Samples of the edges before half maximum; half of them if None.
+    least
+        Part of the samples known of the edges that must be in a measured window; the
+        comparison is on what is known of both.
 
     Raises
     ------
     CpunetError
         If the arrays are no pulses.
     """
-    half = edges.shape[1] // 2
+    before = edges.shape[1] // 2 if before is None else before
     best = np.zeros((len(edges), 0))
     rows = np.zeros((len(edges), 0), np.int64)
     unaligned = 0
     for first in range(0, len(measured), BLOCK):
-        block = align_half_maximum(measured[first : first + BLOCK], half, half)
-        usable = np.flatnonzero(np.isfinite(block).all(axis=1))
+        block = align_half_maximum(
+            measured[first : first + BLOCK], before, edges.shape[1] - before
+        )
+        known = np.isfinite(block).mean(axis=1)
+        usable = np.flatnonzero(known >= least * np.isfinite(edges).mean(axis=1).max(initial=0))
+        usable = usable[known[usable] > 0]
         unaligned += len(block) - len(usable)
         found = np.hstack(
             [best, _mean_squares(edges.astype(float), block[usable].astype(float))]
@@ -72,6 +86,9 @@ def nearest_pulses(edges: FloatArray, measured: FloatArray, count: int) -> Neare
 
 
 def _mean_squares(a: Values, b: Values) -> Values:
-    """Mean square difference of each row of `a` from each of `b`."""
-    squares = (a**2).sum(axis=1)[:, np.newaxis] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.asarray(np.maximum(squares, 0) / a.shape[1])
+    """Mean square difference of each row of `a` from each of `b`, where both are known."""
+    in_a, in_b = (np.isfinite(values).astype(float) for values in (a, b))
+    a, b = np.nan_to_num(a), np.nan_to_num(b)
+    squares = a**2 @ in_b.T + in_a @ (b**2).T - 2 * a @ b.T
+    count = in_a @ in_b.T
+    return np.where(count > 0, np.maximum(squares, 0) / np.maximum(count, 1), np.inf)

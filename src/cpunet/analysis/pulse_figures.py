@@ -14,6 +14,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import DATA_FILL, colours, label, styled
 from cpunet.electronics.rivals.superpulses import fitted_tail_slope, without_decay
@@ -114,17 +115,10 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
     wanted = align_half_maximum(target[np.newaxis], BEFORE, AFTER)
     if not np.isfinite(wanted).any():
         raise CpunetError("the pulse to compare with never crosses half of its maximum")
-    difference = align_half_maximum(windows, BEFORE, AFTER) - wanted
-    known = np.isfinite(difference)
-    # a pulse of which but a part is in the record would be compared on that part only
-    known[known.sum(axis=1) < np.isfinite(wanted).sum() // 2] = False
-    count = known.sum(axis=1)
-    if not count.any():
+    found = nearest_pulses(wanted, windows, 1, BEFORE, least=0.5)
+    if not found.index.size:
         raise CpunetError("no measured pulse crosses half of its maximum; check the file")
-    squares = np.where(known, difference, 0.0).astype(float) ** 2
-    mean = np.where(count > 0, squares.sum(axis=1) / np.maximum(count, 1), np.inf)
-    row = int(mean.argmin())
-    return row, float(np.sqrt(mean[row]))
+    return int(found.index[0, 0]), float(found.rms[0, 0])
 
 
 @styled

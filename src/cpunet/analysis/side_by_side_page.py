@@ -6,17 +6,12 @@ of SVG.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from html import escape
 from string import Template
 
-from cpunet.analysis.side_by_side import Cell, Row, SideBySide
-from cpunet.analysis.style import COLOURS, label
-
-WIDTH, NAMES, RIGHT = 460, 150, 14  # pixels: the panel, the runs' names, what is left free
-LINE, TOP, BOTTOM = 22, 8, 24
-LONGEST = 22  # characters of a name in a panel
+from cpunet.analysis.dot_panel import dot_panel
+from cpunet.analysis.side_by_side import Row, SideBySide
+from cpunet.analysis.style import label
 
 _PAGE = Template("""<!doctype html>
 <html lang="en">
@@ -78,7 +73,7 @@ def side_by_side_page(table: SideBySide) -> str:
         notes="\n".join(f"<p><strong>Note:</strong> {escape(n)}</p>" for n in table.notes),
         head=head,
         rows="\n".join(_table_row(row) for row in table.rows),
-        panels="\n".join(_panel(row, table.names) for row in table.rows),
+        panels="\n".join(dot_panel(row, table.names) for row in table.rows),
     )
 
 
@@ -88,71 +83,3 @@ def _table_row(row: Row) -> str:
         text = escape(cell.text)
         cells.append(f"<td>{f'<b>{text}</b>' if i in row.best else text}</td>")
     return f"<tr>{''.join(cells)}</tr>"
-
-
-def _panel(row: Row, names: tuple[str, ...]) -> str:
-    """One score: a line per run."""
-    low, high = _range(row.cells)
-    scale = (WIDTH - NAMES - RIGHT) / (high - low)
-    bottom = TOP + LINE * len(names)
-    drawn = [f'<path d="M{NAMES} {bottom}H{WIDTH - RIGHT}" stroke="#888"/>']
-    for value in _ticks(low, high):
-        x = NAMES + scale * (value - low)
-        drawn.append(
-            f'<path d="M{x:.1f} {bottom}v4" stroke="#888"/><text x="{x:.1f}" '
-            f'y="{bottom + 17}" text-anchor="middle" fill="#555">{value:g}</text>'
-        )
-    for i, (name, cell) in enumerate(zip(names, row.cells, strict=True)):
-        y = TOP + LINE * (i + 0.5)
-        short = name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}"
-        drawn.append(
-            f'<text x="{NAMES - 8}" y="{y + 4}" text-anchor="end">{escape(short)}</text>'
-        )
-        drawn += _marks(cell, y, lambda value: NAMES + scale * (value - low))
-    title = escape(f"{row.peak}, {row.score}")
-    return (
-        f'<figure><svg viewBox="0 0 {WIDTH} {bottom + BOTTOM}" role="img" '
-        f'aria-label="{title}">{"".join(drawn)}</svg><figcaption>{title}</figcaption></figure>'
-    )
-
-
-def _marks(cell: Cell, y: float, at: Callable[[float], float]) -> list[str]:
-    """What chance gives in grey, the score's error bar, and its dot."""
-    marks: list[str] = []
-    if cell.value is None:
-        return marks
-    if cell.expected is not None:
-        x, spread = at(cell.expected), cell.expected_std or 0.0
-        width = at(cell.expected + spread) - at(cell.expected - spread)
-        marks.append(
-            f'<rect x="{x - width / 2:.1f}" y="{y - 9}" width="{width:.1f}" height="18" '
-            f'fill="#ddd"/><path d="M{x:.1f} {y - 9}v18" stroke="#777"/>'
-        )
-    colour = COLOURS["ren"]
-    if cell.error is not None:
-        left, right = at(cell.value - cell.error), at(cell.value + cell.error)
-        marks.append(f'<path d="M{left:.1f} {y}H{right:.1f}" stroke="{colour}"/>')
-    marks.append(f'<circle cx="{at(cell.value):.1f}" cy="{y}" r="4" fill="{colour}"/>')
-    return marks
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Two to five round numbers."""
-    decade = 10.0 ** math.floor(math.log10((high - low) / 2))
-    step = next(decade * n for n in (5, 2, 1) if decade * n <= (high - low) / 2)
-    first, last = math.ceil(low / step), math.floor(high / step)
-    # rounded, as 3 * 0.1 is not 0.3
-    return [float(f"{step * i:.12g}") for i in range(first, last + 1)]
-
-
-def _range(cells: tuple[Cell, ...]) -> tuple[float, float]:
-    """What a panel spans: every dot with its error, and what chance gives."""
-    ends = []
-    for cell in cells:
-        for value, error in ((cell.value, cell.error), (cell.expected, cell.expected_std)):
-            if cell.value is not None and value is not None:
-                ends += [value - (error or 0.0), value + (error or 0.0)]
-    low, high = min(ends), max(ends)
-    # some space, also if all are equal
-    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-    return low - margin, high + margin

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.analysis.comparisons import data_axis, histogram
+from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import NO_NOISE, colours, label
 from cpunet.analysis.view_parts import axis_info, packed
@@ -277,17 +278,12 @@ def _nearest(
     """Return for each event the measured pulse that differs least from it."""
     to = next((m for m in ("truth", "ren") if m in shown), list(shown)[-1])
     every = measured[:: -(-len(measured) // SEARCHED)]
-    aligned = align_half_maximum(every, *window)
-    aligned = aligned[np.isfinite(aligned).any(axis=1)]
-    if not len(aligned):
+    found = nearest_pulses(shown[to], every, 1, window[0], least=0.5)
+    if not found.index.size:
         return {}
-    nearest = []
-    for pulse in shown[to]:
-        square = (aligned - pulse) ** 2
-        known = np.isfinite(square)
-        mean = np.where(known, square, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        nearest.append(aligned[np.where(known.any(axis=1), mean, np.inf).argmin()])
-    return {"nearest": packed(nearest), "nearest_to": to, "searched": len(aligned)}
+    nearest = align_half_maximum(every[found.index[:, 0]], *window)
+    searched = len(every) - found.unaligned
+    return {"nearest": packed(nearest), "nearest_to": to, "searched": searched}
 
 
 def _home(values: Values) -> list[float]:
