@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import tempfile
@@ -41,6 +42,14 @@ def written_aside(target: Path) -> Iterator[Path]:
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def remove_partial(target: Path) -> None:
+    """Remove what killed processes have left of `target`; no other may be writing it now."""
+    for left in target.parent.glob(f".{glob.escape(target.stem)}-*.partial{target.suffix}"):
+        # the random part has no hyphen, a longer name of another file has
+        if "-" not in left.name.removeprefix(f".{target.stem}-"):
+            left.unlink(missing_ok=True)
 
 
 @contextmanager

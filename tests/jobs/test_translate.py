@@ -411,7 +411,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     table = lh5.read("geds/ren", out)
     traces = table.waveform.values.nda
     assert (traces.dtype, traces.shape) == (np.uint16, (N, length))
-    assert table.waveform.values.attrs["units"] == "ADC"
+    assert table.waveform.values.attrs["sample_units"] == "ADC"
     assert (table.waveform.t0.nda == -n_pre * DT_NS).all()
     # the stored data: baseline 14000, and 10 ADC per keV and prepared unit
     energy = table.energy.nda
@@ -545,6 +545,15 @@ def test_a_second_writer_is_refused(run, tmp_path):
         translate_file(run, source, out, device="cpu")
     translate_file(run, source, out, device="cpu")
     assert names(tmp_path) == ["out.lh5", "sim.lh5"]
+
+
+def test_what_a_killed_process_left_is_removed(run, tmp_path):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    for name in (".out-sxgnbmrx.partial.lh5", ".out-2-sxgnbmrx.partial.lh5"):
+        (tmp_path / name).touch()
+    translate_file(run, source, out, device="cpu")
+    # that of out-2.lh5 may be another process's
+    assert names(tmp_path) == [".out-2-sxgnbmrx.partial.lh5", "out.lh5", "sim.lh5"]
 
 
 @contextmanager

@@ -74,13 +74,42 @@ def test_units_attributes_and_compression(tmp_path):
     path = tmp_path / "pulses.lh5"
     write_pulses(path, some(), table="ch7/raw", waveform_units="ADC", attrs={"run": "r001"})
     table = lh5.read("ch7/raw", path)
-    assert table.waveform.values_units == "ADC"
+    assert table.waveform.values.attrs["sample_units"] == "ADC"
     assert table.attrs["run"] == "r001"
     assert lh5.ls(path, "ch7/") == ["ch7/raw"]
     with h5py.File(path) as h5:
         values = h5["ch7/raw/waveform/values"]
         assert (values.compression, values.shuffle) == ("gzip", True)
         assert values.chunks[1] == 20
+
+
+@pytest.mark.parametrize("column", ["waveform", "waveform_ren"])
+def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path, column):
+    build_dsp = pytest.importorskip("dspeed").build_dsp
+    path, pulses = tmp_path / "pulses.lh5", some(20, 30)
+    write_pulses(path, pulses, table="geds/raw", waveform_units="ADC", attrs={"run": "r001"})
+    if column != "waveform":
+        source, path = path, tmp_path / "more.lh5"
+        words = {"table": "geds/raw", "name": column, "waveform_units": "ADC"}
+        with ColumnAppender(path, source, **words, attrs={"run": "run"}) as writer:
+            writer.append(pulses)
+    largest = {
+        "function": "amax",
+        "module": "numpy",
+        "args": [column, 1, "wf_max"],
+        "kwargs": {"signature": "(n),()->()", "types": ["fi->f"]},
+    }
+    build_dsp(
+        raw_in=str(path),
+        dsp_out=str(tmp_path / "dsp.lh5"),
+        dsp_config={"outputs": ["wf_max"], "processors": {"wf_max": largest}},
+        lh5_tables=["geds/raw"],
+        buffer_len=8,
+        block_width=4,
+    )
+    (name,) = (n for n in lh5.ls(str(tmp_path / "dsp.lh5"), "geds/*") if n != "dsp_info")
+    found = lh5.read(f"{name}/wf_max", str(tmp_path / "dsp.lh5")).nda
+    np.testing.assert_allclose(found, pulses.waveforms.max(axis=1))
 
 
 def test_an_existing_file_is_kept_unless_forced(tmp_path):

@@ -9,12 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cpunet.errors import CpunetError
+from cpunet.files import remove_partial
 
 
 @contextmanager
 def only_writer(target: Path) -> Iterator[None]:
     """Hold the right to write `target`, until the block or the process ends.
 
+    What a process that was killed has left of it is removed first.
     The lock is a hidden file beside `target`, locked by the system, so that none is left
     behind that counts.  On file systems without locks it keeps nobody out; then the last
     output to be moved into place stays.
@@ -31,8 +33,10 @@ def only_writer(target: Path) -> Iterator[None]:
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror})") from error
     try:
-        _lock(handle, path, target)
+        locked = _lock(handle, path, target)
         try:
+            if locked:  # nobody else is at work, so these are of the dead
+                remove_partial(target)
             yield
         finally:
             path.unlink(missing_ok=True)
@@ -40,17 +44,19 @@ def only_writer(target: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _lock(handle: int, path: Path, target: Path) -> None:
+def _lock(handle: int, path: Path, target: Path) -> bool:
+    """Lock the file; return whether the file system has locks."""
     busy = CpunetError(f"{target}: another process is writing it; wait for that one")
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise busy from None
     except OSError:
-        return  # no locks on this file system
+        return False
     try:
         same = os.fstat(handle).st_ino == path.stat().st_ino
     except FileNotFoundError:
         same = False
     if not same:  # its holder was done and removed it while this one was opening it
         raise busy
+    return True

@@ -42,7 +42,7 @@ class ColumnAppender:
     waveform_units, t0_ns, samples, force
         As for `cpunet.pulses.writing.PulseWriter`.
     attrs
-        Attributes of the column, such as where the pulses come from.
+        Attributes of the column's samples, such as where the pulses come from.
 
     Raises
     ------
@@ -130,7 +130,8 @@ class ColumnAppender:
                 pulses, t0_ns=self._t0_ns, units=self._units, samples=self._samples
             )
         }
-        content[self._name].attrs.update(self._attrs)
+        # of the samples: a table of waveforms with attributes of its own is read only once
+        content[self._name].values.attrs.update(self._attrs)
         for name, (values, units) in (columns or {}).items():
             array = Array(np.asarray(values), attrs={"units": units} if units else {})
             content[f"{self._name}_{name}"] = array

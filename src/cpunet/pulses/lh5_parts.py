@@ -124,10 +124,12 @@ def waveform_table(
 ) -> WaveformTable:
     """Waveforms as LH5 has them, with samples of this type, in chunks of whole traces."""
     n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
+    # not called "units": dspeed copies those to its buffer of the table, which the LH5 library
+    # then refuses to fill a second time
     values = ArrayOfEqualSizedArrays(
         nda=pulses.waveforms.astype(samples, copy=False),
         attrs={
-            "units": units,
+            "sample_units": units,
             "hdf5_settings": {
                 "chunks": (n_rows, pulses.length),
                 "compression": "gzip",

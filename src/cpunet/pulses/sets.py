@@ -109,7 +109,21 @@ def load_prepared(
             break
     if not n_kept:
         raise CpunetError(_nothing_left(source, sets))
-    return Prepared.concatenate(sets)
+    return _joined(sets, n_kept)
+
+
+def _joined(sets: list[Prepared], n: int) -> Prepared:
+    """Join blocks; the list lets go of the waveforms of each once they are copied."""
+    # memory that is taken as it is filled: at no time are all pulses there twice
+    waveforms = np.empty((n, sets[0].pulses.length), np.float32)
+    first = 0
+    for number, part in enumerate(sets):
+        waveforms[first : first + len(part)] = part.pulses.waveforms
+        first += len(part)
+        empty = np.empty((len(part), 0), np.float32)
+        sets[number] = replace(part, pulses=part.pulses.with_waveforms(empty))
+    joined = Prepared.concatenate(sets)
+    return replace(joined, pulses=joined.pulses.with_waveforms(waveforms))
 
 
 def _prepare_selected(
