@@ -3,8 +3,11 @@
 Run with ``python benchmarks/training_step.py --recipe paper``.  The plain step is eager float32
 PyTorch on the same networks: six passes one by one, a loop over pulses in each L1 loss, and a
 number fetched for every loss.  Each step runs in a process of its own; they take turns, so that
-what else the machine does falls on both, and medians are compared.  Both are steps without an
+what else the machine does falls on all, and medians are compared.  All are steps without an
 update of the discriminators, of which `paper` has one in 30.
+
+``--steps ours bf16 compiled bf16-compiled`` compares ours as the recipe has it with other
+precisions and torch.compile, and ``--device cuda`` does so on a GPU.
 """
 
 from __future__ import annotations
@@ -164,24 +167,38 @@ def plain_step(recipe: Recipe, sim: Tensor, data: Tensor) -> Callable[[], object
 
 def our_step(recipe: Recipe, sim: Tensor, data: Tensor) -> Callable[[], object]:
     keep_freed_memory()
-    step = Step(CycleGan(recipe).train(), recipe.cyclegan.training)
+    model = CycleGan(recipe).to(sim.device).train()
+    step = Step(model, recipe.cyclegan.training)
     return lambda: step._update_generators(sim, data)
 
 
-MAKERS = {"plain": plain_step, "ours": our_step}
+OURS: dict[str, list[str]] = {
+    "ours": [],
+    "bf16": ["training.precision=bf16"],
+    "compiled": ["training.compiled=true"],
+    "bf16-compiled": ["training.precision=bf16", "training.compiled=true"],
+}
 
 
-def work(name: str, recipe_name: str, threads: int, line: Connection) -> None:
+def wait(device: str) -> None:
+    """Until a GPU has done what it was given."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def work(name: str, recipe_name: str, threads: int, device: str, line: Connection) -> None:
     """Do what the line says: "step", "share" or "flop"."""
     torch.set_num_threads(threads)
+    torch.set_default_device(device)
     torch.manual_seed(0)
-    recipe = load_recipe(recipe_name)
+    recipe = load_recipe(recipe_name, OURS.get(name, []))
     batch, length = recipe.cyclegan.training.batch_size, recipe.preparation.length
     rng = np.random.default_rng(0)
     ramps = (np.arange(length) - length / 2) / rng.uniform(20, 90, (2, batch, 1, 1)) + 1
-    sim, data = torch.from_numpy(np.clip(ramps, 0, 1).astype(np.float32))
-    step = MAKERS[name](recipe, sim, data)
-    step()
+    sim, data = torch.from_numpy(np.clip(ramps, 0, 1).astype(np.float32)).to(device)
+    step = (our_step if name in OURS else plain_step)(recipe, sim, data)
+    for _ in range(3 if device != "cpu" or "compiled" in name else 1):
+        step()
     while (order := line.recv()) != "end":
         if order == "flop":
             with FlopCounterMode(display=False) as counter:
@@ -192,24 +209,31 @@ def work(name: str, recipe_name: str, threads: int, line: Connection) -> None:
         if order == "share":
             with profile(activities=[ProfilerActivity.CPU]) as told:
                 step()
+                wait(device)
             events = {event.key: event for event in told.key_averages()}
             everything = sum(event.self_cpu_time_total for event in events.values())
             inside = sum(events[k].cpu_time_total for k in CONVOLUTIONS if k in events)
             line.send(inside / everything)
         else:
             step()
+            wait(device)
             line.send(time.perf_counter() - begin)
+    if device.startswith("cuda"):
+        line.send(torch.cuda.max_memory_allocated() / 2**30)
+        return
     unit = 2**30 if sys.platform == "darwin" else 2**20
     line.send(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
 
 
-def gemm_rate() -> float:
+def gemm_rate(device: str) -> float:
     """GFLOP/s of a large product of matrices."""
-    a = torch.randn(2048, 2048)
+    a = torch.randn(2048, 2048, device=device)
     times = []
     for _ in range(5):
+        wait(device)
         begin = time.perf_counter()
         a @ a
+        wait(device)
         times.append(time.perf_counter() - begin)
     return 2 * 2048**3 / float(np.median(times)) / 1e9
 
@@ -219,47 +243,49 @@ def main() -> None:
     parser.add_argument("--recipe", default="paper")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--steps", nargs="+", choices=list(OURS), default=["ours"])
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     context = multiprocessing.get_context("spawn")
     lines: dict[str, Connection] = {}
-    for name in MAKERS:
+    for name in ("plain", *given.steps):
         lines[name], far = context.Pipe()
-        context.Process(
-            target=work, args=(name, given.recipe, given.threads, far), daemon=True
-        ).start()
+        arguments = (name, given.recipe, given.threads, given.device, far)
+        context.Process(target=work, args=arguments, daemon=True).start()
 
     def ask(name: str, order: str) -> float:
         lines[name].send(order)
         return lines[name].recv()
 
     flop = ask("plain", "flop")
-    times: dict[str, list[float]] = {name: [] for name in MAKERS}
+    times: dict[str, list[float]] = {name: [] for name in lines}
     rates = []
     for _ in range(given.repeats):
-        rates.append(gemm_rate())
-        for name in MAKERS:
+        rates.append(gemm_rate(given.device))
+        for name in lines:
             times[name].append(ask(name, "step"))
-        print(
-            "  ".join(f"{name} {values[-1]:.1f} s" for name, values in times.items()),
-            flush=True,
-        )
-    shares = {name: ask(name, "share") for name in MAKERS}
-    memory = {name: ask(name, "end") for name in MAKERS}
-    medians = {name: float(np.median(values)) for name, values in times.items()}
-    ratios = np.array(times["plain"]) / np.array(times["ours"])
+        print("  ".join(f"{name} {v[-1]:.3g} s" for name, v in times.items()), flush=True)
+    # what kernels are compiled to has no names to tell convolutions by, nor has a GPU's time
+    told = {n: ask(n, "share") for n in lines if given.device == "cpu" and "compiled" not in n}
+    memory = {name: ask(name, "end") for name in lines}
     rate = float(np.median(rates))
-    print(f"recipe {given.recipe}, {given.threads} thread(s), {given.repeats} turns")
-    print(f"{'step':<8}{'s':>8}{'convolutions':>14}{'peak GB':>9}")
-    for name, seconds in medians.items():
-        print(f"{name:<8}{seconds:>8.2f}{shares[name]:>14.0%}{memory[name]:>9.2f}")
+    print(f"recipe {given.recipe}, {given.device}, {given.threads} thread(s)")
     print(
-        f"ratio {medians['plain'] / medians['ours']:.2f} "
-        f"(turns {ratios.min():.2f} to {ratios.max():.2f})"
+        f"{'step':<14}{'s':>8}{'convolutions':>14}{'peak GB':>9}{'times as fast (turns)':>28}"
     )
+    plain = np.array(times["plain"])
+    for name, seconds in times.items():
+        share = f"{told[name]:.0%}" if name in told else "-"
+        ratios = plain / seconds
+        ratio = np.median(plain) / np.median(seconds)
+        print(
+            f"{name:<14}{np.median(seconds):>8.3g}{share:>14}{memory[name]:>9.2f}"
+            f"{f'{ratio:.2f} ({ratios.min():.2f} to {ratios.max():.2f})':>28}"
+        )
     print(
         f"plain arithmetic {flop:.0f} GFLOP; matrix products run at {rate:.0f} GFLOP/s: "
-        f"at least {flop / rate:.1f} s without fast convolutions"
+        f"at least {flop / rate:.2g} s without fast convolutions"
     )
 
 

@@ -14,6 +14,7 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.jobs import translate as translate_job
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import (
     InputFile,
     InputSet,
@@ -22,7 +23,7 @@ from cpunet.jobs.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.monitor import Advance, Monitor
-from cpunet.jobs.train import resolve_device, train_run
+from cpunet.jobs.train import train_run
 from cpunet.jobs.translate import translate_file
 from cpunet.jobs.truth import load_truth
 from cpunet.pulses.container import Pulses

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cpunet.networks.gru_discriminator import GruDiscriminator, InterpolatedEmbedding
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import GruConfig
+from cpunet.recipes.network_settings import GruConfig
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from cpunet.networks.positional_unet import PositionalUNet, Skip, positional_map
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import PunetConfig
+from cpunet.recipes.network_settings import PunetConfig
 
 
 @pytest.fixture(autouse=True)

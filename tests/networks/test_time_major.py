@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.tiled_convolution import convolve
 from cpunet.networks.time_major import FrozenUNet, translate
-from cpunet.recipes.schema import PunetConfig
+from cpunet.recipes.network_settings import PunetConfig
 
 
 @pytest.fixture(autouse=True)

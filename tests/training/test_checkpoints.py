@@ -43,6 +43,13 @@ VARIANTS = {
     ),
     "rare-judges": ("training.discriminator_interval=4", "training.average_decay=0.9"),
     "large-batches": ("training.batch_size=10", "generator.residual=true"),
+    "fast-step": ("generator.width=16", "training.discriminator_interval=2"),
+    "convolutional-judge": (
+        "discriminator={name: conv, width: 2, layers: 2, kernel: 3, current_gain: 5.0}",
+        "training.losses.gradient_penalty=1.0",
+        "training.discriminator_interval=1",
+        "training.precision=bf16",
+    ),
 }
 
 
@@ -73,7 +80,7 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
     return records
 
 
-@pytest.mark.parametrize(("variant", "stop"), [*zip(VARIANTS, (1, 2, 3, 4), strict=True)])
+@pytest.mark.parametrize(("variant", "stop"), [*zip(VARIANTS, (1, 2, 3, 4, 2, 3), strict=True)])
 def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, variant, stop):
     recipe = recipe_of(tiny, *VARIANTS[variant])
     expected, expected_records = straight(sets, recipe)

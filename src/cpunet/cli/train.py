@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import signal
+import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import fail, monitor, out
+from cpunet.errors import CpunetError
 from cpunet.jobs.monitor import Monitor
+
+if TYPE_CHECKING:  # torch takes seconds to import
+    from cpunet.training.team import Launch
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
@@ -66,6 +71,8 @@ def train(
     Example: cpunet train --sim sim.lh5 --data raw.lh5 --out run
 
     Example: cpunet train --recipe paper --sim sim.lh5 --data raw.lh5 --out run --resume
+
+    Example: torchrun --nproc-per-node 4 --no-python cpunet train --recipe paper … --out run
     """
     import torch
 
@@ -74,18 +81,26 @@ def train(
     from cpunet.recipes import load_recipe
     from cpunet.training.fast_step import keep_freed_memory
     from cpunet.training.loop import StoppedError
+    from cpunet.training.team import ToldElsewhereError, launch
 
     keep_freed_memory()
     if threads is not None:
         torch.set_num_threads(threads)
     shown = monitor()
-    with _StopRequest(shown) as stop:
+    launched = launch()
+    try:
+        chosen = load_recipe(recipe, set_values or ())
+    except CpunetError:
+        if _follows(launched):  # the process that leads says the same
+            raise typer.Exit(2) from None
+        raise
+    with _StopRequest(shown, launched) as stop:
         try:
             info = train_run(
                 InputFile(sim, sim_table, sim_energy, dt_ns=dt),
                 InputFile(data, data_table, data_energy, kev_per_adc, dt),
                 out_folder,
-                load_recipe(recipe, set_values or ()),
+                chosen,
                 peak=peak,
                 seed=seed,
                 device=device,
@@ -98,20 +113,32 @@ def train(
             )
         except StoppedError as stopped:
             fail(str(stopped))
-            raise typer.Exit(128 + stop.signal) from None
+            raise typer.Exit(stop.status) from None
+        except ToldElsewhereError as told:
+            stopped_too = isinstance(told.__cause__, StoppedError)
+            raise typer.Exit(stop.status if stopped_too else 2) from None
+    if _follows(launched):
+        return
     out.print(
         f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
     )
 
 
+def _follows(launched: Launch | None) -> bool:
+    return launched is not None and not launched.team.leads
+
+
 class _StopRequest:
     """Ctrl-C and batch systems stop a training between two iterations, with its state stored.
 
-    A second signal, or one before anyone asks whether to stop, acts as it did before.
+    A second signal, or one before anyone asks whether to stop, acts as it did before.  In a
+    team a second one says nothing new, since batch system and torchrun may both pass on the
+    first, and torchrun itself ends what goes on for too long.
     """
 
-    def __init__(self, shown: Monitor) -> None:
+    def __init__(self, shown: Monitor, launched: Launch | None) -> None:
         self.signal = 0
+        self._launched = launched
         self._shown = shown
         self._asked = False
         self._before: dict[int, signal._HANDLER] = {}
@@ -120,6 +147,11 @@ class _StopRequest:
         """Whether to stop."""
         self._asked = True
         return self.signal != 0
+
+    @property
+    def status(self) -> int:
+        """Of the process that stopped; in a team, the signal may have come to another one."""
+        return 128 + (self.signal or signal.SIGTERM)
 
     def __enter__(self) -> Self:
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -131,9 +163,16 @@ class _StopRequest:
             signal.signal(number, handler)
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
-        self.__exit__()
-        if self._asked:
+        if not self._asked:
+            if _follows(self._launched):
+                sys.exit(128 + number)  # the process that leads tells
+            self.__exit__()
+            signal.raise_signal(number)
+        elif self._launched is None:
+            self.__exit__()
             self.signal = number
             self._shown.note("stopping after this iteration; once more to stop at once")
-        else:
-            signal.raise_signal(number)
+        elif not self.signal:
+            self.signal = number
+            if not _follows(self._launched):
+                self._shown.note("stopping after this iteration")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
-from cpunet.recipes.schema import Config, Count, Fraction, NonNegative, Positive
+from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
 
 REFERENCE_KEV = 2614.5
 """Energy (keV) at which figures that depend on it are given: the full-energy peak."""

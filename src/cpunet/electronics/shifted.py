@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.schema import Config, NonNegative, Positive
+from cpunet.recipes.base import Config, NonNegative, Positive
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 

@@ -16,7 +16,8 @@ from cpunet.jobs.stand import write_stand
 from cpunet.jobs.stand_plan import Kind, StandPlan
 from cpunet.jobs.train import train_run
 from cpunet.jobs.validate import validate_run
-from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.simulation.geometry import Detector
 
 QUIET = Monitor()

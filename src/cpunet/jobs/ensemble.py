@@ -13,12 +13,14 @@ from typing import Any
 from cpunet.analysis.seed_scores import failed_seeds, seed_table
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.fingerprints import fingerprints
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Advance, Monitor
-from cpunet.jobs.train import resolve_device, train_run
+from cpunet.jobs.train import train_run
 from cpunet.jobs.workers import Link, Outcome, cores, default_jobs, work_off
-from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.checkpoints import require_same
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,

@@ -12,6 +12,7 @@ import numpy as np
 from cpunet.analysis.linearity import linearity_residual
 from cpunet.analysis.verdicts import summaries, verdict_table
 from cpunet.errors import CpunetError
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.energy_ranges import range_survivals, validation_selection
 from cpunet.jobs.inputs import (
     InputFile,
@@ -26,7 +27,6 @@ from cpunet.jobs.peak_sets import PeakSets, peak_sets
 from cpunet.jobs.pulse_tests import survivals
 from cpunet.jobs.rivals import rival_windows
 from cpunet.jobs.scoring import ByMethod, score_peak
-from cpunet.jobs.train import resolve_device
 from cpunet.jobs.truth import read_response
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import parse_selection

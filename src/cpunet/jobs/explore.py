@@ -15,10 +15,10 @@ from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing, written_aside
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import InputFile, load_measured
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.places import Places, place_pulses, settings_at
-from cpunet.jobs.train import resolve_device
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Rejection

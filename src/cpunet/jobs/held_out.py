@@ -21,7 +21,9 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
-from cpunet.recipes.schema import MatchingConfig, PunetConfig, Recipe
+from cpunet.recipes.network_settings import PunetConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.loop import Keeping, State, train
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import Deck

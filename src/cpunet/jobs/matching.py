@@ -17,7 +17,8 @@ from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import HybridConfig, Recipe, ResponseConfig
+from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.recipes.schema import Recipe
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import Record
 from cpunet.training.matching import fit_response

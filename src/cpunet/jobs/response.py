@@ -26,7 +26,8 @@ from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside, refuse_existing
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
-from cpunet.recipes.schema import PreparationConfig, ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 
 MARKER = "response.json"

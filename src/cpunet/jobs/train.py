@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -20,6 +18,7 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
+from cpunet.jobs.devices import enough_memory, peak_memory_mb
 from cpunet.jobs.inputs import (
     InputFile,
     InputSet,
@@ -29,9 +28,11 @@ from cpunet.jobs.inputs import (
 )
 from cpunet.jobs.matching import Sides, match
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.train_team import team_for
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes.schema import MatchingConfig, Recipe
-from cpunet.training.loop import Keeping, Record, train
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.loop import Keeping, Listener, Record, train
 from cpunet.training.run_folder import (
     INFO,
     append_losses,
@@ -42,6 +43,8 @@ from cpunet.training.run_folder import (
     weights_sha256,
     write_run,
 )
+from cpunet.training.team import Team
+from cpunet.training.team_state import require_same_everywhere, share_state
 from cpunet.training.tensorboard import LossBoard
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
@@ -68,6 +71,8 @@ def train_run(
 ) -> dict[str, Any]:
     """Train REN and IREN on the pulses of a peak and write the run folder.
 
+    Processes that torchrun started train one CycleGAN together; the one of rank 0 writes.
+
     Parameters
     ----------
     sim, data
@@ -82,7 +87,7 @@ def train_run(
     seed
         Of everything random.
     device
-        ``"cpu"``, ``"cuda"``, or ``"auto"`` for the GPU if there is one.
+        ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
     init
         Folder of a run of the same kind to start from, as of another detector or period.
     resume
@@ -99,38 +104,44 @@ def train_run(
     Returns
     -------
     dict
-        The content of ``run.json``.
+        The content of ``run.json``; empty in a process that did not write it.
 
     Raises
     ------
     CpunetError
         If the input cannot be used, the folder exists, there is an unfinished training of
-        another kind, the memory does not suffice, or the training diverges.
+        another kind, memory does not suffice, the training diverges or another process fails.
     StoppedError
         If `stop` asked for it.
     """
-    device = resolve_device(device)
-    selection = parse_selection(peak, recipe.peaks)
-    with _workplace(out, recipe, resume=resume, force=force) as folder:
-        sim_set = load_simulated(sim, recipe, selection, monitor)
-        data_set = load_measured(data, recipe, selection, monitor)
-        require_same_sampling(sim_set, data_set)
-        if init is not None:
-            _require_sampling(init, data_set)
-        sides = sim_set, data_set, data
-        job = _Job(recipe, peak, seed, device, init, *sides, folder, monitor)
-        with _enough_memory(recipe):
-            if isinstance(recipe.training, MatchingConfig):
-                model, info, recipe = job.match(tensorboard)
-            else:
-                model, info = job.train(resume, tensorboard, stop)
-        write_run(folder, model, recipe, info)
+    with team_for(recipe, device) as (team, device):
+        selection = parse_selection(peak, recipe.peaks)
+        told = monitor if team.leads else QUIET
+        with _workplace(out, recipe, team, resume=resume, force=force) as folder:
+            sim_set = load_simulated(sim, recipe, selection, told)
+            data_set = load_measured(data, recipe, selection, told)
+            require_same_sampling(sim_set, data_set)
+            if init is not None:
+                _require_sampling(init, data_set)
+            sides = sim_set, data_set, data
+            job = _Job(recipe, peak, seed, device, team, init, *sides, folder, told)
+            with enough_memory(recipe, team.size):
+                if isinstance(recipe.training, MatchingConfig):
+                    model, info, recipe = job.match(tensorboard)
+                elif team.leads:
+                    model, info = job.train(resume, tensorboard, stop)
+                else:
+                    job.help_train(stop)
+                    return {}
+            write_run(folder, model, recipe, info)
     return info
 
 
 def _workplace(
-    out: Path, recipe: Recipe, *, resume: bool, force: bool
+    out: Path, recipe: Recipe, team: Team, *, resume: bool, force: bool
 ) -> AbstractContextManager[Path]:
+    if not team.leads:  # another process writes there
+        return nullcontext(out)
     if not isinstance(recipe.training, MatchingConfig):
         return unfinished_folder(out, resume=resume, force=force)
     if resume:
@@ -145,10 +156,8 @@ def _require_sampling(init: Path, data: InputSet) -> None:
     """Raise a `CpunetError` if the run to start from had another sampling."""
     known_ns = float(read_info(init)["dt_ns"])
     if not np.isclose(known_ns, data.dt_ns):
-        raise CpunetError(
-            f"{init}: trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns; "
-            "resample them"
-        )
+        kinds = f"trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns"
+        raise CpunetError(f"{init}: {kinds}; resample them")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +168,7 @@ class _Job:
     peak: str
     seed: int
     device: str
+    team: Team
     init: Path | None
     sim: InputSet
     data: InputSet
@@ -191,10 +201,10 @@ class _Job:
         self, resume: bool, tensorboard: bool, stop: Callable[[], bool]
     ) -> tuple[nn.Module, dict[str, Any]]:
         """Train a CycleGAN, or go on; return it and the content of ``run.json``."""
-        run = UnfinishedRun(
-            self.folder, self._fingerprint(), self._environment(), self.monitor.note
-        )
-        start = run.begin(resume=resume)
+        fingerprint = self._fingerprint()
+        require_same_everywhere(self.team, fingerprint)
+        run = UnfinishedRun(self.folder, fingerprint, self._environment(), self.monitor.note)
+        start = share_state(self.team, run.begin(resume=resume))
         left = self.recipe.training.iterations - (start["iteration"] if start else 0)
         with (
             _losses_shown(self.folder, wanted=tensorboard) as show,
@@ -206,19 +216,29 @@ class _Job:
                 show(records)
                 advance(len(records))
 
-            model = train(
-                self.sim.prepared.pulses.waveforms,
-                self.data.prepared.pulses.waveforms,
-                self.recipe,
-                seed=self.seed,
-                device=self.device,
-                init=None if self.init is None else partial(fill_networks, self.init),
-                listener=listen,
-                keeping=Keeping(run.save, start, stop),
-            )
+            model = self._trained(Keeping(run.save, start, stop), listen)
         run.finish()
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
         return model, self._info(run.started, run.seconds) | resumed
+
+    def help_train(self, stop: Callable[[], bool]) -> None:
+        """Train with the process that leads, which keeps all."""
+        require_same_everywhere(self.team, self._fingerprint())
+        start = share_state(self.team, None)
+        self._trained(Keeping(lambda _state: None, start, stop), None)
+
+    def _trained(self, keeping: Keeping, listener: Listener | None) -> nn.Module:
+        return train(
+            self.sim.prepared.pulses.waveforms,
+            self.data.prepared.pulses.waveforms,
+            self.recipe,
+            seed=self.seed,
+            device=self.device,
+            init=None if self.init is None else partial(fill_networks, self.init),
+            listener=listener,
+            keeping=keeping,
+            team=self.team,
+        )
 
     def _fingerprint(self) -> dict[str, Any]:
         """All that determines the weights."""
@@ -240,6 +260,7 @@ class _Job:
         """What the last bits depend on."""
         return {
             "device": self.device,
+            "processes": self.team.size,
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
         }
@@ -251,10 +272,11 @@ class _Job:
             "seed": self.seed,
             "init": None if self.init is None else str(self.init),
             "device": self.device,
+            "processes": self.team.size,
             "threads": torch.get_num_threads(),
             "started": started,
             "seconds": round(seconds, 1),
-            "peak_memory_mb": _peak_memory_mb(self.device),
+            "peak_memory_mb": peak_memory_mb(self.device),
             "dt_ns": self.data.dt_ns,
             "versions": versions(),
             "sim": self.sim.provenance(),
@@ -275,41 +297,3 @@ def _losses_shown(folder: Path, *, wanted: bool) -> Iterator[Callable[[list[Reco
         yield board.add
     finally:
         board.close()
-
-
-@contextmanager
-def _enough_memory(recipe: Recipe) -> Iterator[None]:
-    """Turn an exhausted memory into a line that says which batch size to try."""
-    try:
-        yield
-    except (torch.cuda.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        # the CPU's allocator has no error of its own
-        known = isinstance(error, torch.cuda.OutOfMemoryError | MemoryError)
-        if not (known or "DefaultCPUAllocator" in str(error)):
-            raise
-        where = "GPU" if isinstance(error, torch.cuda.OutOfMemoryError) else "computer"
-        if isinstance(recipe.training, MatchingConfig):
-            remedy = f"--set training.max_pulses={max(100, recipe.training.max_pulses // 2)}"
-        else:
-            remedy = f"--set training.batch_size={max(2, recipe.training.batch_size // 2)}"
-        raise CpunetError(f"the {where}'s memory does not suffice; try {remedy}") from error
-
-
-def _peak_memory_mb(device: str) -> dict[str, float]:
-    """The most memory of this process so far, and of its tensors on the GPU."""
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    peak = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
-    if device.startswith("cuda"):
-        peak["gpu"] = torch.cuda.max_memory_allocated(device) / 2**20
-    return {where: round(mb, 1) for where, mb in peak.items()}
-
-
-def resolve_device(device: str) -> str:
-    """Turn ``"auto"`` into a device; refuse one that is not there."""
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise CpunetError("no GPU was found; use --device cpu or install a CUDA build of torch")
-    if device != "cpu" and not device.startswith("cuda"):
-        raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
-    return device

@@ -12,11 +12,11 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.memory import give_back_large_arrays
 from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.jobs.output_lock import only_writer
-from cpunet.jobs.train import resolve_device
 from cpunet.jobs.translate_options import Adc, TranslateOptions
 from cpunet.jobs.translation_blocks import (
     NOISE_ROWS,

@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing, written_aside
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.monitor import Advance, Monitor
-from cpunet.jobs.train import resolve_device
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.columns import TIME_UNITS

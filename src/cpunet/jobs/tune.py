@@ -19,11 +19,11 @@ import yaml
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.fingerprints import fingerprints
 from cpunet.jobs.held_out import HeldOut
 from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.train import resolve_device
 from cpunet.jobs.tuning_study import (
     REASON,
     SECONDS,

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.schema import GruConfig
+from cpunet.recipes.network_settings import GruConfig
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so
 # that the slope at one value points the way to a far one; with 1 to 16 cycles the
@@ -108,3 +108,7 @@ class GruDiscriminator(nn.Module):
     def probability(self, pulses: Tensor) -> Tensor:
         """Probability of being real, in [0, 1], shape (batch,)."""
         return torch.sigmoid(self(pulses))
+
+    def fix_statistics(self) -> None:
+        """Judge by the running statistics until the next ``train()``."""
+        self.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation

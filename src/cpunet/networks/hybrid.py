@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from cpunet.networks.linear_inverse import stretch
 from cpunet.networks.positional_unet import SLOPE, positional_map
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.recipes.schema import ResidualConfig
+from cpunet.recipes.network_settings import ResidualConfig
 
 BEFORE, AFTER = 64, 96  # samples about the half maximum; tail slopes are measured later
 FOLD = 8  # samples to a step

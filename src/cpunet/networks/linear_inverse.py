@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.schema import MatchingConfig
+from cpunet.recipes.training_settings import MatchingConfig
 
 AFTER = 170  # samples from the half maximum: charge and slow response have come by then
 LEAST_LEVEL = 1e-3  # what is below is no pulse

@@ -13,7 +13,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.schema import PunetConfig
+from cpunet.recipes.network_settings import PunetConfig
 
 FIRST_KERNEL, SECOND_KERNEL, SLOPE = 11, 7, 0.01
 

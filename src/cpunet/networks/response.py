@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.schema import ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
 
 # Samples of room around a window: what the response delays stays in the record.
 ROOM_BEFORE, ROOM_AFTER = 200, 400

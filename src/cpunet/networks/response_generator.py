@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
 from cpunet.networks.response import ElectronicsResponse
-from cpunet.recipes.schema import ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
 
 NOISE_BINS = 4097  # of a spectrum as `BaselineNoise` measures it
 

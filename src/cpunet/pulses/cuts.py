@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.preparation import FloatColumn, Prepared, Rejection
-from cpunet.recipes.schema import Config, CutConfig
+from cpunet.recipes.base import Config
+from cpunet.recipes.schema import CutConfig
 
 # Below this many pulses the MAD says nothing and no window is drawn.
 _FEWEST = 10

@@ -78,7 +78,11 @@ def recipe_from(settings: Any, source: str) -> Recipe:
 
 def _keys(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
     """Where in the YAML an error is: without the kind that pydantic puts after a choice."""
-    kinds = {"generator": ("punet", "response", "hybrid"), "training": ("cyclegan", "matching")}
+    kinds = {
+        "generator": ("punet", "response", "hybrid"),
+        "discriminator": ("gru", "conv"),
+        "training": ("cyclegan", "matching"),
+    }
     if len(location) > 1 and location[1] in kinds.get(str(location[0]), ()):
         return location[:1] + location[2:]
     return location

@@ -6,22 +6,21 @@ in the recipe that needs it is an error, and so is one that nobody reads.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cpunet.errors import CpunetError
-
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
-Fraction = Annotated[float, Field(ge=0, lt=1)]
-
-
-class Config(BaseModel):
-    """Base of all settings: unknown keys are refused, values never change."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+from cpunet.recipes.base import Config, Count, Positive
+from cpunet.recipes.network_settings import (
+    ConvConfig,
+    GruConfig,
+    HybridConfig,
+    PunetConfig,
+    ResidualConfig,
+    ResponseConfig,
+)
+from cpunet.recipes.training_settings import MatchingConfig, TrainingConfig
 
 
 class PeakConfig(Config):
@@ -78,201 +77,6 @@ class CutConfig(Config):
     baseline_sigmas: Positive
 
 
-class PunetConfig(Config):
-    """The Positional U-Net (paper, section 2.2.1).
-
-    ``residual`` makes the network a correction added to its input, zero at the
-    start of the training, instead of having it learn the identity first.
-    """
-
-    name: Literal["punet"]
-    width: Annotated[int, Field(ge=2, multiple_of=2)]
-    dropout: Fraction
-    residual: bool
-
-
-class ResponseConfig(Config):
-    """A differentiable readout chain, see `cpunet.networks.response`.
-
-    ``poles_ns`` and ``decay_us`` are where free times start.  ``slow_ns`` and
-    ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
-    times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
-    ``ringing_ns`` are where the frequency and the damping of a ringing start; none if null.
-    """
-
-    name: Literal["response"]
-    poles_ns: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=4)]
-    slow_ns: tuple[Positive, ...]
-    decay_us: Positive
-    fast_decays_us: tuple[Positive, ...]
-    ringing_mhz: Positive | None
-    ringing_ns: Positive
-
-
-class ResidualConfig(Config):
-    """A small network beside a matched response, see `cpunet.training.residual`.
-
-    ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
-    ``rate`` that falls to zero; the kept weights are a running average with
-    ``average_decay`` per iteration.  ``projections`` are the directions along which sets are
-    compared in an iteration, ``amplitude_weight`` weighs the density of the current
-    amplitude, ``size_weight`` the mean square of what is added, and ``slope_weight`` that of
-    its steps from sample to sample.  A ``held_out`` part of both sets judges: the distance of
-    these must fall by the fraction ``least_fall``, and by more than chance.
-    """
-
-    width: Annotated[int, Field(ge=2, multiple_of=2)]
-    iterations: Count
-    batch_size: Annotated[int, Field(ge=16)]
-    rate: Positive
-    average_decay: Fraction
-    projections: Count
-    amplitude_weight: NonNegative
-    size_weight: NonNegative
-    slope_weight: NonNegative
-    held_out: Annotated[float, Field(gt=0, lt=1)]
-    least_fall: Fraction
-
-
-class HybridConfig(ResponseConfig):
-    """A readout chain with a small network beside it, see `cpunet.networks.hybrid`."""
-
-    name: Literal["hybrid"]  # type: ignore[assignment]
-    residual: ResidualConfig
-
-
-class GruConfig(Config):
-    """The GRU discriminator with attention (paper, section 2.2.2).
-
-    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more
-    make it that many times faster, on the same embedded samples.  The table of
-    vectors spans ``value_range``, or each pulse's own minimum to maximum (the
-    paper's choice, blind to the pulse height) if that is null.
-    """
-
-    name: Literal["gru"]
-    embedding_rows: Annotated[int, Field(ge=2)]
-    embedding_dim: Count
-    hidden: Count
-    samples_per_step: Count
-    value_range: tuple[float, float] | None
-
-    @model_validator(mode="after")
-    def _range_is_not_empty(self) -> GruConfig:
-        if self.value_range is not None and not self.value_range[0] < self.value_range[1]:
-            raise ValueError("value_range must go from a lower to a higher value")
-        return self
-
-
-class LossConfig(Config):
-    """Weights of the eight losses and of the three windows of the L1 terms.
-
-    ``gradient_penalty`` weighs the mean squared gradient of the discriminators on
-    real and translated pulses (Mescheder et al. 2018, arXiv:1801.04406; 0 in the
-    paper): it keeps a discriminator from growing so steep that it throws the
-    generators off.
-    """
-
-    baseline_len: Count
-    rising_edge_len: Count
-    tail_len: Count
-    baseline_weight: NonNegative
-    rising_edge_weight: NonNegative
-    tail_weight: NonNegative
-    cycle_weight: NonNegative
-    identity_weight: NonNegative
-    adversarial_weight: NonNegative
-    gradient_penalty: NonNegative
-
-
-class TrainingConfig(Config):
-    """The loop: how long, how fast, how often.
-
-    The generators that are kept are running averages of the trained ones, with
-    ``average_decay`` per iteration (0: the last weights, as in the paper); their
-    batch-norm statistics are taken anew over ``statistics_batches``.
-    ``instance_noise`` is the RMS of white noise added to all that the discriminators
-    see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
-    paper): translations carry no electronic noise, and a discriminator that can tell
-    them by that alone teaches nothing about the shape.  After every
-    ``checkpoint_interval`` iterations all that a training needs to go on is stored.
-    """
-
-    method: Literal["cyclegan"]
-    iterations: Count
-    decay_start: Annotated[int, Field(ge=0)]
-    batch_size: Annotated[int, Field(ge=2)]
-    rate_generators: Positive
-    rate_discriminators: Positive
-    betas: tuple[Fraction, Fraction]
-    weight_decay: NonNegative
-    max_grad_norm: Positive
-    discriminator_interval: Count
-    instance_noise: NonNegative
-    average_decay: Fraction
-    statistics_batches: Count
-    log_interval: Count
-    checkpoint_interval: Count
-    losses: LossConfig
-
-
-class MatchingConfig(Config):
-    """A response matched to data by moments, see `cpunet.training.moments`.
-
-    Pulses are compared from ``before`` to ``after`` samples about their half maximum, once
-    the mean of ``baseline`` (samples before it, from and to) is 0 and that of the last
-    ``level_samples`` the level of the preparation.  ``segments`` are the edges, in samples
-    from the half maximum, of stretches whose means are compared; ``components`` the principal
-    components of the data that are, the first ``squares`` of them also in their squares;
-    ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
-    ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
-    ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
-    ``max_pulses`` bounds the sets, ``steps`` the iterations of a fit.  A fit that ends in the
-    wrong valley is begun again with the response's poles times the next of
-    ``start_factors``; the best of all is kept.  If it is still poor, a ringing is looked for at
-    ``ringing_mhz``.  The last steps average over up to ``noise_sets`` draws of the noise, if
-    there are so few pulses that ``max_pulses`` allows it.
-    """
-
-    method: Literal["matching"]
-    before: Count
-    after: Count
-    baseline: tuple[Count, Count]
-    level_samples: Count
-    segments: tuple[int, ...]
-    components: Count
-    squares: Count
-    amplitude_bins: Count
-    amplitude_width: Positive
-    clip: Positive
-    ridge: Fraction
-    max_pulses: Annotated[int, Field(ge=100)]
-    steps: Count
-    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    ringing_mhz: tuple[Positive, ...]
-    noise_sets: Count
-
-    @property
-    def iterations(self) -> int:
-        """The most steps of the training: every start, a ringing, and two last fits."""
-        return self.steps * (len(self.start_factors) + 3)
-
-    @model_validator(mode="after")
-    def _stretches_fit(self) -> MatchingConfig:
-        first, *rest = self.segments
-        if sorted({*self.segments}) != [*self.segments] or not rest:
-            raise ValueError("segments must be two samples or more, in rising order")
-        if first < -self.before or rest[-1] > self.after:
-            raise ValueError("segments must lie within before and after")
-        if not self.baseline[0] > self.baseline[1]:
-            raise ValueError("baseline goes from more samples before the edge to fewer")
-        if self.level_samples >= self.after:
-            raise ValueError("level_samples must be fewer than after")
-        if self.squares > self.components:
-            raise ValueError("squares must be no more than components")
-        return self
-
-
 class ScoreConfig(Config):
     """Histograms and resampling of the comparison of two distributions.
 
@@ -325,7 +129,7 @@ class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
     generator: PunetConfig
-    discriminator: GruConfig
+    discriminator: GruConfig | ConvConfig
     training: TrainingConfig
 
 
@@ -347,7 +151,7 @@ class Recipe(Config):
     generator: Annotated[
         PunetConfig | ResponseConfig | HybridConfig, Field(discriminator="name")
     ]
-    discriminator: GruConfig | None
+    discriminator: Annotated[GruConfig | ConvConfig, Field(discriminator="name")] | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
@@ -426,10 +230,17 @@ class Recipe(Config):
     def _networks_fit(self) -> Recipe:
         if self.discriminator is None:
             return self
-        length, step = self.preparation.length, self.discriminator.samples_per_step
-        if length % 16 or length % step:
+        length = self.preparation.length
+        if length % 16:
             raise ValueError(
                 f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
-                f"halve it four times) and of samples_per_step ({step})"
+                "halve it four times)"
             )
+        if isinstance(self.discriminator, GruConfig):
+            step = self.discriminator.samples_per_step
+            if length % step:
+                raise ValueError(
+                    f"a prepared pulse has {length} samples, no multiple of "
+                    f"samples_per_step ({step})"
+                )
         return self

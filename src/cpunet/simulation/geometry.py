@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from cpunet.recipes.schema import Config, NonNegative, Positive
+from cpunet.recipes.base import Config, NonNegative, Positive
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from cpunet.recipes.schema import Config, NonNegative, Positive
+from cpunet.recipes.base import Config, NonNegative, Positive
 
 
 class SimulationSettings(Config):

@@ -11,16 +11,21 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
+from cpunet.networks.conv_discriminator import ConvDiscriminator
 from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.time_major import fast_passes_pay
-from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.recipes.network_settings import ConvConfig, GruConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.fast_step import (
     fast_translations,
     judge_together,
     plain_translations,
 )
+from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
+from cpunet.training.team import ALONE, Team
 
 LOSS_NAMES = (
     "identity_data",
@@ -34,6 +39,9 @@ LOSS_NAMES = (
 )
 
 
+Discriminator = GruDiscriminator | ConvDiscriminator
+
+
 class CycleGan(nn.Module):
     """REN (sim → data), IREN (data → sim) and a discriminator for each side."""
 
@@ -42,12 +50,18 @@ class CycleGan(nn.Module):
         length, (generator, discriminator, _) = recipe.preparation.length, recipe.cyclegan
         self.ren = PositionalUNet(generator, length)
         self.iren = PositionalUNet(generator, length)
-        self.discriminator_data = GruDiscriminator(discriminator)
-        self.discriminator_sim = GruDiscriminator(discriminator)
+        self.discriminator_data = _discriminator(discriminator)
+        self.discriminator_sim = _discriminator(discriminator)
 
     def generator_parameters(self) -> list[nn.Parameter]:
         """Parameters of REN and IREN."""
         return list(chain(self.ren.parameters(), self.iren.parameters()))
+
+
+def _discriminator(config: GruConfig | ConvConfig) -> Discriminator:
+    if isinstance(config, ConvConfig):
+        return ConvDiscriminator(config)
+    return GruDiscriminator(config)
 
 
 class Step:
@@ -62,17 +76,32 @@ class Step:
         What is trained, and how.
     fast
         Whether to take the passes of `cpunet.training.fast_step`; as it pays if None.
+    team
+        Who trains, each on its own batches; see also `cpunet.training.team_norm`.
     """
 
     def __init__(
-        self, model: CycleGan, config: TrainingConfig, *, fast: bool | None = None
+        self,
+        model: CycleGan,
+        config: TrainingConfig,
+        *,
+        fast: bool | None = None,
+        team: Team = ALONE,
     ) -> None:
         self.model = model
         self.config = config
+        self.team = team
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
         self.noise = config.instance_noise
-        self.fast = fast_passes_pay(model.ren, device.type) if fast is None else fast
+        self.ren, self.iren = (
+            generator_pass(network, config.precision, compiled=config.compiled)
+            for network in (model.ren, model.iren)
+        )
+        # fast passes have batch norms of their own, which know no team
+        plain = config.compiled or config.precision != "float32" or team.size > 1
+        pays = fast_passes_pay(model.ren, device.type) and not plain
+        self.fast = pays if fast is None else fast
 
         def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
             return AdamW(
@@ -117,7 +146,8 @@ class Step:
     def __call__(self, iteration: int, sim: Tensor, data: Tensor) -> dict[str, Tensor]:
         """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
 
-        Discriminator losses are there only in iterations that update them.
+        Discriminator losses are there only in iterations that update them.  In a team, losses
+        are the means of all processes'.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
         losses, fake_data, fake_sim = self._update_generators(sim, data)
@@ -127,15 +157,17 @@ class Step:
             )
         for schedule in self.schedules:
             schedule.step()
-        return {name: loss.detach() for name, loss in losses.items()}
+        return self.team.mean({name: loss.detach() for name, loss in losses.items()})
 
     def generator_losses(
         self, sim: Tensor, data: Tensor
     ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """Return the six losses of the generators and the two translated batches."""
         model, weights = self.model, self.weights
-        translations = fast_translations if self.fast else plain_translations
-        done = translations(model.ren, model.iren, sim, data)
+        if self.fast:
+            done = fast_translations(model.ren, model.iren, sim, data)
+        else:
+            done = plain_translations(self.ren, self.iren, sim, data)
         judged_data, judged_sim = self._judged(
             (model.discriminator_data, self._noisy(done.fake_data)),
             (model.discriminator_sim, self._noisy(done.fake_sim)),
@@ -150,10 +182,11 @@ class Step:
         }
         return losses, done.fake_data, done.fake_sim
 
-    def _judged(self, *pairs: tuple[GruDiscriminator, Tensor]) -> list[Tensor]:
+    def _judged(self, *pairs: tuple[Discriminator, Tensor]) -> list[Tensor]:
         """Logits of the pulses of each discriminator."""
-        if self.fast:
-            return judge_together(*pairs)
+        grus = [(n, pulses) for n, pulses in pairs if isinstance(n, GruDiscriminator)]
+        if self.fast and len(grus) == len(pairs):
+            return judge_together(*grus)
         return [network(pulses) for network, pulses in pairs]
 
     def total(self, losses: dict[str, Tensor]) -> Tensor:
@@ -172,10 +205,11 @@ class Step:
         discriminators = (model.discriminator_data, model.discriminator_sim)
         for network in discriminators:  # judged by fixed judges
             network.requires_grad_(False)
-            network.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
+            network.fix_statistics()
         losses, fake_data, fake_sim = self.generator_losses(sim, data)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
+        self.team.average_gradients(model.generator_parameters())
         clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
         self.generators.step()
         for network in discriminators:
@@ -189,7 +223,7 @@ class Step:
         return pulses + self.noise * torch.randn_like(pulses)
 
     def _discriminator_loss(
-        self, network: GruDiscriminator, real: Tensor, fake: Tensor
+        self, network: Discriminator, real: Tensor, fake: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the adversarial loss and the gradient penalty."""
         weight = self.config.losses.gradient_penalty
@@ -213,6 +247,7 @@ class Step:
             loss, penalty = self._discriminator_loss(network, real, fake)
             optimiser.zero_grad(set_to_none=True)
             (loss + penalty).backward()  # type: ignore[no-untyped-call]
+            self.team.average_gradients(network.parameters())
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss

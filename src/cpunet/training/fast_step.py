@@ -17,6 +17,7 @@ from cpunet.networks.gru_chains import run_together
 from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.time_major import translate
+from cpunet.training.generator_pass import Pass
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _LARGE = -1, -3, 2**31 - 1  # of glibc's malloc.h
 
@@ -32,9 +33,7 @@ class Translations(NamedTuple):
     cycled_data: Tensor
 
 
-def plain_translations(
-    ren: PositionalUNet, iren: PositionalUNet, sim: Tensor, data: Tensor
-) -> Translations:
+def plain_translations(ren: Pass, iren: Pass, sim: Tensor, data: Tensor) -> Translations:
     """The six passes one by one."""
     fake_data, fake_sim = ren(sim), iren(data)
     return Translations(

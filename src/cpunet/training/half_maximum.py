@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cpunet.networks.linear_inverse import stretch
-from cpunet.recipes.schema import MatchingConfig
+from cpunet.recipes.training_settings import MatchingConfig
 
 
 def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,17 +8,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.sampling import Deck
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
+from cpunet.training.team import ALONE, Team
+from cpunet.training.team_norm import share_norms
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
@@ -40,9 +44,9 @@ class Keeping:
         before a stop, always after the listener has had all records before it.  The
         tensors go on changing once it returns.
     start
-        A state to go on from.
+        A state to go on from; the same in all processes of a team.
     stop
-        Asked after each iteration whether to stop there.
+        Asked after each iteration whether to stop there; a team stops if any process should.
     """
 
     save: Callable[[State], None]
@@ -63,11 +67,13 @@ def train(
     init: Callable[[CycleGan], None] | None = None,
     listener: Listener | None = None,
     keeping: Keeping = NOTHING_KEPT,
+    team: Team = ALONE,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
     The same seed on the same machine gives the same weights, whether the training was
-    interrupted and went on or not.
+    interrupted and went on or not.  The processes of a team train on the same sets, end with
+    the same weights, and those are what one process gives, up to rounding and the noise drawn.
 
     Parameters
     ----------
@@ -78,7 +84,7 @@ def train(
     seed
         Of the initial weights, the dealing of batches, dropout and latent noise.
     device
-        ``"cpu"`` or ``"cuda"``.
+        ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
         Fills the networks with weights to start from, in place of the closed-form start.
     listener
@@ -86,11 +92,13 @@ def train(
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``.
     keeping
         Where the state goes and comes from, and whether to stop.
+    team
+        Who trains; `listener` and ``keeping.save`` are called where it leads.
 
     Raises
     ------
     CpunetError
-        If a set is empty or a loss becomes NaN or infinite.
+        If a set is empty, a team cannot share the batches, or a loss becomes NaN or infinite.
     StoppedError
         If `keeping` asked to stop.
     """
@@ -101,7 +109,7 @@ def train(
     with _seeded(seed, device):
         model = CycleGan(recipe).to(device).train()
         decks = [
-            Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, seed=side)
+            Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team)
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
         if init is not None:
@@ -109,11 +117,15 @@ def train(
         else:
             sim_side, data_side = (deck.pulses for deck in decks)
             match_skips(model, sim_side, data_side, recipe.preparation.samples_before)
-        training = _Training(model, decks, config, device)
+        team.follow(model.state_dict().values())
+        share_norms(model, team)
+        training = _Training(model, decks, config, device, team)
+        if team.size > 1:
+            _reseed(seed, team.rank, 0)
         if keeping.start is not None:
-            training.load_state_dict(keeping.start)
+            training.load_state_dict(keeping.start, seed)
         try:
-            _iterate(training, listener, keeping)
+            _iterate(training, listener if team.leads else None, keeping)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
@@ -133,11 +145,16 @@ class _Training:
     """All that changes from iteration to iteration."""
 
     def __init__(
-        self, model: CycleGan, decks: list[Deck], config: TrainingConfig, device: str
+        self,
+        model: CycleGan,
+        decks: list[Deck],
+        config: TrainingConfig,
+        device: str,
+        team: Team,
     ) -> None:
-        self.model, self.decks, self.config = model, decks, config
+        self.model, self.decks, self.config, self.team = model, decks, config, team
         self.device = torch.device(device)
-        self.step = Step(model, config)
+        self.step = Step(model, config, team=team)
         average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
         self.generators = (model.ren, model.iren)
         self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
@@ -159,9 +176,14 @@ class _Training:
 
     def state_dict(self) -> State:
         """Return all that the next iterations depend on, but the pulses and the settings."""
-        random = {"cpu": torch.get_rng_state()}
+        own = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
-            random["cuda"] = torch.cuda.get_rng_state(self.device)
+            own["cuda"] = torch.cuda.get_rng_state(self.device)
+        of_all = {where: self.team.gathered(state) for where, state in own.items()}
+        random = [
+            {where: states[rank] for where, states in of_all.items()}
+            for rank in range(self.team.size)
+        ]
         return {
             "iteration": self.iteration,
             "model": self.model.state_dict(),
@@ -171,8 +193,8 @@ class _Training:
             "random": random,
         }
 
-    def load_state_dict(self, state: State) -> None:
-        """Go on where a training of the same pulses and settings was."""
+    def load_state_dict(self, state: State, seed: int) -> None:
+        """Go on where a training of the same pulses, settings and seed was."""
         self.iteration = state["iteration"]
         self.model.load_state_dict(state["model"])
         for averaged, own in zip(self.averages, state["averages"], strict=True):
@@ -180,9 +202,14 @@ class _Training:
         self.step.load_state_dict(state["step"])
         for deck, own in zip(self.decks, state["decks"], strict=True):
             deck.load_state_dict(own)
-        torch.set_rng_state(state["random"]["cpu"])
-        if self.device.type == "cuda" and "cuda" in state["random"]:
-            torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
+        random = state["random"]
+        rank = self.team.rank
+        if rank >= len(random):  # of a larger team than before
+            _reseed(seed, rank, self.iteration)
+            return
+        torch.set_rng_state(random[rank]["cpu"])
+        if self.device.type == "cuda" and "cuda" in random[rank]:
+            torch.cuda.set_rng_state(random[rank]["cuda"], self.device)
 
 
 def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -> None:
@@ -192,7 +219,7 @@ def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -
         pending.append(training.advance())
         done = training.iteration
         last = done == config.iterations
-        stop = keeping.stop() and not last
+        stop = training.team.any(keeping.stop()) and not last
         keep = last or stop or done % config.checkpoint_interval == 0
         # values are fetched in bunches: each fetch makes a GPU wait
         if keep or len(pending) == config.log_interval:
@@ -203,7 +230,9 @@ def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -
                 listener(records)
         if keep:
             _require_finite_weights(training)
-            keeping.save(training.state_dict())
+            state = training.state_dict()
+            if training.team.leads:
+                keeping.save(state)
         if stop:
             raise StoppedError(
                 f"stopped after {done} of {config.iterations} iterations; go on with --resume"
@@ -239,6 +268,12 @@ def _require_finite_weights(training: _Training) -> None:
 def _deck_seeds(seed: int) -> Iterator[int]:
     # far apart, so that neighbouring seeds share no deck
     yield from (2 * seed + 1_000_003, 2 * seed + 2_000_004)
+
+
+def _reseed(seed: int, rank: int, iteration: int) -> None:
+    """Let each process of a team draw noise of its own."""
+    (mixed,) = np.random.SeedSequence([seed, rank, iteration]).generate_state(1, np.uint64)
+    torch.manual_seed(int(mixed))
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from cpunet.recipes.schema import LossConfig
+from cpunet.recipes.training_settings import LossConfig
 
 
 def window_weights(config: LossConfig) -> Tensor:

@@ -22,7 +22,9 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE, ElectronicsResponse
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes.schema import MatchingConfig, Recipe, ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Fit, Listener, levenberg_marquardt
 from cpunet.training.moments import FEWEST, Moments
 from cpunet.training.response_problem import ResponseProblem

@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
-from cpunet.recipes.schema import MatchingConfig, PreparationConfig
+from cpunet.recipes.schema import PreparationConfig
+from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.half_maximum import at_half_maximum
 
 SIGMA_PER_MAD = 1.4826

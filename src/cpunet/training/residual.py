@@ -25,7 +25,8 @@ from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
-from cpunet.recipes.schema import Recipe, ResidualConfig
+from cpunet.recipes.network_settings import ResidualConfig
+from cpunet.recipes.schema import Recipe
 from cpunet.training.half_maximum import at_half_maximum
 from cpunet.training.matching import DELAY
 from cpunet.training.moments import EDGE, Moments

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 
 from cpunet.networks.response import ElectronicsResponse
-from cpunet.recipes.schema import ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.response_problem import ResponseProblem
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cpunet.training.team import ALONE, Team
+
 
 class Deck:
     """Deal batches from a set of pulses like cards, reshuffled when too few are left.
@@ -21,11 +23,20 @@ class Deck:
         Pulses per batch; sets smaller than that are dealt with replacement.
     seed
         Of the order of the cards.
+    team
+        Who trains: all deal the same batches, and each takes its share.
+
+    Raises
+    ------
+    CpunetError
+        If a batch cannot be shared equally.
     """
 
-    def __init__(self, pulses: Tensor, batch_size: int, seed: int) -> None:
+    def __init__(self, pulses: Tensor, batch_size: int, seed: int, team: Team = ALONE) -> None:
         self.pulses = pulses
         self.batch_size = batch_size
+        share = team.share_of(batch_size)
+        self._own = slice(team.rank * share, (team.rank + 1) * share)
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
 
@@ -39,7 +50,7 @@ class Deck:
         self._random.set_state(state["random"])
 
     def deal(self) -> Tensor:
-        """Return the next batch, shape (batch, 1, samples)."""
+        """Return the own share of the next batch, shape (share, 1, samples)."""
         n = len(self.pulses)
         if n < self.batch_size:
             chosen = torch.randint(n, (self.batch_size,), generator=self._random)
@@ -48,4 +59,4 @@ class Deck:
                 self._order = torch.randperm(n, generator=self._random)
             chosen = self._order[: self.batch_size]
             self._order = self._order[self.batch_size :]
-        return self.pulses[chosen.to(self.pulses.device)]
+        return self.pulses[chosen[self._own].to(self.pulses.device)]

@@ -23,7 +23,7 @@ def refresh_batch_statistics(network: nn.Module, deck: Deck, batches: int) -> No
     network
         A generator; its mode (training or evaluation) is left as it was.
     deck
-        Pulses of the side that it translates.
+        Pulses of the side that it translates; in a team, that of the batch norms.
     batches
         How many batches to average over.
     """

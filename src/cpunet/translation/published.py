@@ -10,7 +10,7 @@ from torch import Tensor
 from cpunet.errors import CpunetError
 from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
-from cpunet.recipes.schema import GruConfig, PunetConfig
+from cpunet.recipes.network_settings import GruConfig, PunetConfig
 
 # Their names → ours, of layers; the ninth positional map is never used.
 LAYERS = (

@@ -23,7 +23,8 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
-from cpunet.recipes.schema import HybridConfig, PunetConfig, Recipe
+from cpunet.recipes.network_settings import HybridConfig, PunetConfig
+from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.translation.backends import (
     Backend,

@@ -1,0 +1,61 @@
+"""What a job computes on, and whether its memory suffices."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
+
+
+def resolve_device(device: str) -> str:
+    """Turn ``"auto"`` into a device; refuse one that is not there."""
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise CpunetError("no GPU was found; use --device cpu or install a CUDA build of torch")
+    if device != "cpu" and not device.startswith("cuda"):
+        raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
+    return device
+
+
+@contextmanager
+def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
+    """Turn an exhausted memory into a line that says which batch size to try.
+
+    Parameters
+    ----------
+    recipe
+        What is trained inside.
+    processes
+        How many share a batch.
+    """
+    try:
+        yield
+    except (torch.cuda.OutOfMemoryError, MemoryError, RuntimeError) as error:
+        # the CPU's allocator has no error of its own
+        known = isinstance(error, torch.cuda.OutOfMemoryError | MemoryError)
+        if not (known or "DefaultCPUAllocator" in str(error)):
+            raise
+        where = "GPU" if isinstance(error, torch.cuda.OutOfMemoryError) else "computer"
+        if isinstance(recipe.training, MatchingConfig):
+            remedy = f"--set training.max_pulses={max(100, recipe.training.max_pulses // 2)}"
+        else:
+            half = recipe.training.batch_size // 2 // processes * processes
+            remedy = f"--set training.batch_size={max(2, processes, half)}"
+        raise CpunetError(f"the {where}'s memory does not suffice; try {remedy}") from error
+
+
+def peak_memory_mb(device: str) -> dict[str, float]:
+    """The most memory of this process so far, and of its tensors on the GPU."""
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    peak = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
+    if device.startswith("cuda"):
+        peak["gpu"] = torch.cuda.max_memory_allocated(device) / 2**20
+    return {where: round(mb, 1) for where, mb in peak.items()}

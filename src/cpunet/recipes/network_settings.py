@@ -1,0 +1,116 @@
+"""Settings of the networks: generators, discriminators, readout chains."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
+
+
+class PunetConfig(Config):
+    """The Positional U-Net (paper, section 2.2.1).
+
+    ``residual`` makes the network a correction added to its input, zero at the
+    start of the training, instead of having it learn the identity first.
+    """
+
+    name: Literal["punet"]
+    width: Annotated[int, Field(ge=2, multiple_of=2)]
+    dropout: Fraction
+    residual: bool
+
+
+class ResponseConfig(Config):
+    """A differentiable readout chain, see `cpunet.networks.response`.
+
+    ``poles_ns`` and ``decay_us`` are where free times start.  ``slow_ns`` and
+    ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
+    times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
+    ``ringing_ns`` are where the frequency and the damping of a ringing start; none if null.
+    """
+
+    name: Literal["response"]
+    poles_ns: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=4)]
+    slow_ns: tuple[Positive, ...]
+    decay_us: Positive
+    fast_decays_us: tuple[Positive, ...]
+    ringing_mhz: Positive | None
+    ringing_ns: Positive
+
+
+class ResidualConfig(Config):
+    """A small network beside a matched response, see `cpunet.training.residual`.
+
+    ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
+    ``rate`` that falls to zero; the kept weights are a running average with
+    ``average_decay`` per iteration.  ``projections`` are the directions along which sets are
+    compared in an iteration, ``amplitude_weight`` weighs the density of the current
+    amplitude, ``size_weight`` the mean square of what is added, and ``slope_weight`` that of
+    its steps from sample to sample.  A ``held_out`` part of both sets judges: the distance of
+    these must fall by the fraction ``least_fall``, and by more than chance.
+    """
+
+    width: Annotated[int, Field(ge=2, multiple_of=2)]
+    iterations: Count
+    batch_size: Annotated[int, Field(ge=16)]
+    rate: Positive
+    average_decay: Fraction
+    projections: Count
+    amplitude_weight: NonNegative
+    size_weight: NonNegative
+    slope_weight: NonNegative
+    held_out: Annotated[float, Field(gt=0, lt=1)]
+    least_fall: Fraction
+
+
+class HybridConfig(ResponseConfig):
+    """A readout chain with a small network beside it, see `cpunet.networks.hybrid`."""
+
+    name: Literal["hybrid"]  # type: ignore[assignment]
+    residual: ResidualConfig
+
+
+class GruConfig(Config):
+    """The GRU discriminator with attention (paper, section 2.2.2).
+
+    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more
+    make it that many times faster, on the same embedded samples.  The table of
+    vectors spans ``value_range``, or each pulse's own minimum to maximum (the
+    paper's choice, blind to the pulse height) if that is null.
+    """
+
+    name: Literal["gru"]
+    embedding_rows: Annotated[int, Field(ge=2)]
+    embedding_dim: Count
+    hidden: Count
+    samples_per_step: Count
+    value_range: tuple[float, float] | None
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> GruConfig:
+        if self.value_range is not None and not self.value_range[0] < self.value_range[1]:
+            raise ValueError("value_range must go from a lower to a higher value")
+        return self
+
+
+class ConvConfig(Config):
+    """A discriminator of convolutions, see `cpunet.networks.conv_discriminator`.
+
+    Each of ``layers`` halves the pulse; the first has ``width`` channels, each further one
+    twice as many, up to eight times ``width``.  ``current_gain`` scales the steps from sample
+    to sample, which are seen beside the pulse.
+    """
+
+    name: Literal["conv"]
+    width: Count
+    layers: Annotated[int, Field(ge=1, le=9)]
+    kernel: Annotated[int, Field(ge=3)]
+    current_gain: Positive
+
+    @model_validator(mode="after")
+    def _kernel_has_a_middle(self) -> ConvConfig:
+        if self.kernel % 2 == 0:
+            raise ValueError("kernel must be odd")
+        return self

@@ -1,0 +1,121 @@
+"""Settings of the two ways of training: a CycleGAN, and a response matched by moments."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
+
+
+class LossConfig(Config):
+    """Weights of the eight losses and of the three windows of the L1 terms.
+
+    ``gradient_penalty`` weighs the mean squared gradient of the discriminators on
+    real and translated pulses (Mescheder et al. 2018, arXiv:1801.04406; 0 in the
+    paper): it keeps a discriminator from growing so steep that it throws the
+    generators off.
+    """
+
+    baseline_len: Count
+    rising_edge_len: Count
+    tail_len: Count
+    baseline_weight: NonNegative
+    rising_edge_weight: NonNegative
+    tail_weight: NonNegative
+    cycle_weight: NonNegative
+    identity_weight: NonNegative
+    adversarial_weight: NonNegative
+    gradient_penalty: NonNegative
+
+
+class TrainingConfig(Config):
+    """The loop: how long, how fast, how often.
+
+    The generators that are kept are running averages of the trained ones, with
+    ``average_decay`` per iteration (0: the last weights, as in the paper); their
+    batch-norm statistics are taken anew over ``statistics_batches``.
+    ``instance_noise`` is the RMS of white noise added to all that the discriminators
+    see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
+    paper): translations carry no electronic noise, and a discriminator that can tell
+    them by that alone teaches nothing about the shape.  After every
+    ``checkpoint_interval`` iterations all that a training needs to go on is stored.
+    ``precision`` is that of the generators' passes; ``compiled`` has torch.compile fuse them.
+    """
+
+    method: Literal["cyclegan"]
+    iterations: Count
+    decay_start: Annotated[int, Field(ge=0)]
+    batch_size: Annotated[int, Field(ge=2)]
+    rate_generators: Positive
+    rate_discriminators: Positive
+    betas: tuple[Fraction, Fraction]
+    weight_decay: NonNegative
+    max_grad_norm: Positive
+    discriminator_interval: Count
+    instance_noise: NonNegative
+    average_decay: Fraction
+    statistics_batches: Count
+    log_interval: Count
+    checkpoint_interval: Count
+    precision: Literal["float32", "bf16"]
+    compiled: bool
+    losses: LossConfig
+
+
+class MatchingConfig(Config):
+    """A response matched to data by moments, see `cpunet.training.moments`.
+
+    Pulses are compared from ``before`` to ``after`` samples about their half maximum, once
+    the mean of ``baseline`` (samples before it, from and to) is 0 and that of the last
+    ``level_samples`` the level of the preparation.  ``segments`` are the edges, in samples
+    from the half maximum, of stretches whose means are compared; ``components`` the principal
+    components of the data that are, the first ``squares`` of them also in their squares;
+    ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
+    ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
+    ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
+    ``max_pulses`` bounds the sets, ``steps`` the iterations of a fit.  A fit that ends in the
+    wrong valley is begun again with the response's poles times the next of
+    ``start_factors``; the best of all is kept.  If it is still poor, a ringing is looked for at
+    ``ringing_mhz``.  The last steps average over up to ``noise_sets`` draws of the noise, if
+    there are so few pulses that ``max_pulses`` allows it.
+    """
+
+    method: Literal["matching"]
+    before: Count
+    after: Count
+    baseline: tuple[Count, Count]
+    level_samples: Count
+    segments: tuple[int, ...]
+    components: Count
+    squares: Count
+    amplitude_bins: Count
+    amplitude_width: Positive
+    clip: Positive
+    ridge: Fraction
+    max_pulses: Annotated[int, Field(ge=100)]
+    steps: Count
+    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    ringing_mhz: tuple[Positive, ...]
+    noise_sets: Count
+
+    @property
+    def iterations(self) -> int:
+        """The most steps of the training: every start, a ringing, and two last fits."""
+        return self.steps * (len(self.start_factors) + 3)
+
+    @model_validator(mode="after")
+    def _stretches_fit(self) -> MatchingConfig:
+        first, *rest = self.segments
+        if sorted({*self.segments}) != [*self.segments] or not rest:
+            raise ValueError("segments must be two samples or more, in rising order")
+        if first < -self.before or rest[-1] > self.after:
+            raise ValueError("segments must lie within before and after")
+        if not self.baseline[0] > self.baseline[1]:
+            raise ValueError("baseline goes from more samples before the edge to fewer")
+        if self.level_samples >= self.after:
+            raise ValueError("level_samples must be fewer than after")
+        if self.squares > self.components:
+            raise ValueError("squares must be no more than components")
+        return self

@@ -1,0 +1,39 @@
+"""A generator's forward pass, in the precision and the form that a recipe asks for.
+
+Weights, optimiser, losses and discriminators stay in float32 whatever the passes are in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Pass = Callable[[Tensor], Tensor]
+
+
+def generator_pass(
+    network: nn.Module, precision: Literal["float32", "bf16"], *, compiled: bool
+) -> Pass:
+    """Make a function that is the network's ``forward``, shape (batch, 1, samples) to the same.
+
+    Parameters
+    ----------
+    network
+        A generator; it is left as it is.
+    precision
+        ``"bf16"`` does convolutions and their gradients in bfloat16 (torch.autocast).
+    compiled
+        Whether torch.compile makes fused kernels of it, at the first call: half a minute.
+    """
+    run: Pass = torch.compile(network) if compiled else network
+    if precision == "float32":
+        return run
+
+    def in_bf16(pulses: Tensor) -> Tensor:
+        with torch.autocast(pulses.device.type, torch.bfloat16):
+            return run(pulses).to(pulses.dtype)
+
+    return in_bf16

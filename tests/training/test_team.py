@@ -1,0 +1,440 @@
+"""Two processes that train together give what one gives with batches of twice the size.
+
+One start of two processes does all the work of this module; the tests compare what they found.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import multiprocessing
+import os
+import runpy
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from cpunet.errors import CpunetError
+from cpunet.recipes import load_recipe
+from cpunet.training.cyclegan import LOSS_NAMES, CycleGan, Step
+from cpunet.training.loop import Keeping, StoppedError, train
+from cpunet.training.sampling import Deck
+from cpunet.training.team import ALONE, Team, ToldElsewhereError, launch, meeting
+from cpunet.training.team_norm import TeamNorm, share_norms
+from cpunet.training.team_state import require_same_everywhere, share_state
+
+SIZE = 2
+PROCESS = "one of a team"  # the name of this module in a process of a team
+STEPS = 3
+PENALTIES = (0.0, 0.3)
+SHORT = ("training.iterations=2", "training.log_interval=1", "training.statistics_batches=1")
+QUIET = ("generator.dropout=0.0", "training.instance_noise=0.0")
+CLIPPED = ("training.max_grad_norm=0.5", "training.discriminator_interval=2")
+NOISY = ("training.iterations=3", "training.instance_noise=0.1", "generator.dropout=0.2")
+
+Found = dict[str, Any]
+
+
+# --- what is computed, by one process or by each of a team ---------------------------------
+
+
+def own_half(batch: Tensor, team: Team) -> Tensor:
+    return batch.chunk(team.size)[team.rank]
+
+
+def norm_found(team: Team, shape: tuple[int, ...], momentum: float | None) -> Found:
+    """Output, first and second derivatives and running statistics of a batch norm."""
+    random = torch.Generator().manual_seed(4)
+    x, weight = (torch.randn(shape, generator=random, dtype=torch.float64) for _ in range(2))
+    norm = nn.BatchNorm1d(shape[1], momentum=momentum).double()
+    with torch.no_grad():
+        norm.weight.copy_(torch.tensor([0.5, 1.5, -2.0]))
+        norm.bias.copy_(torch.tensor([0.1, 0.2, 0.3]))
+    network = nn.Sequential(norm)
+    share_norms(network, team)
+    own, own_weight = own_half(20 + 3 * x, team).requires_grad_(), own_half(weight, team)
+    for _ in range(2):
+        y = network(own)
+    (slope,) = torch.autograd.grad((own_weight * y.sin()).sum(), own, create_graph=True)
+    (curved,) = torch.autograd.grad(slope.square().sum(), own, retain_graph=True)
+    slope.square().mean().backward()
+    team.average_gradients(network.parameters())
+    return {
+        "of pulses": {"y": y.detach(), "slope": slope.detach(), "curved": curved},
+        "same": {"weight": norm.weight.grad, "bias": norm.bias.grad} | network.state_dict(),
+    }
+
+
+def quiet(model: CycleGan) -> None:
+    """Make outputs depend on the input alone, and rounding small."""
+    model.double()
+    for network in (model.ren, model.iren):
+        nn.init.zeros_(network.latent_log_variance.weight)
+        nn.init.constant_(network.latent_log_variance.bias, -200.0)
+
+
+def steps_found(team: Team, overrides: list[str], sets) -> Found:
+    """Losses and gradients of the first step, and the weights after a few."""
+    recipe = load_recipe("paper", overrides)
+    torch.manual_seed(2)
+    model = CycleGan(recipe).train()
+    quiet(model)
+    share_norms(model, team)
+    step = Step(model, recipe.cyclegan.training, fast=False, team=team)
+    found: Found = {}
+    for number in range(STEPS):
+        batches = [
+            own_half(torch.from_numpy(np.roll(s, number, 0)[:8])[:, None].double(), team)
+            for s in sets
+        ]
+        losses = step(number, *batches)
+        if not number:
+            gradients = {name: p.grad.clone() for name, p in model.named_parameters()}
+            found |= {"losses": losses, "gradients": gradients}
+    return found | {"weights": copy.deepcopy(model.state_dict())}
+
+
+def training_found(team: Team, overrides: list[str], sets) -> Found:
+    """A training from its start to its end, in float64: records and weights."""
+    recipe = load_recipe("paper", overrides)
+    records: list[Any] = []
+
+    doubled = [pulses.astype(np.float64) for pulses in sets]
+    model = train(*doubled, recipe, seed=3, init=quiet, listener=records.extend, team=team)
+    losses = [[r["losses"][n] for n in LOSS_NAMES[:6]] for r in records]
+    return {"weights": model.state_dict(), "losses": torch.tensor(losses, dtype=torch.float64)}
+
+
+def resumed_found(team: Team, overrides: list[str], sets) -> Found:
+    """Weights of a noisy training in one go, and of one that process 1 has stopped."""
+    recipe = load_recipe("paper", overrides)
+    whole = train(*sets, recipe, seed=5, team=team).state_dict()
+    states: list[Any] = []
+    asked: list[int] = []
+
+    def stop() -> bool:
+        asked.append(0)
+        return team.rank == team.size - 1 and len(asked) == 1
+
+    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)), stop=stop)
+    with pytest.raises(StoppedError, match=r"^stopped after 1 of 3 iterations"):
+        train(*sets, recipe, seed=5, keeping=keeping, team=team)
+    kept = len(states)
+    start = share_state(team, states[-1] if states else None)
+    keeping = Keeping(lambda _state: None, start)
+    again = train(*sets, recipe, seed=5, keeping=keeping, team=team).state_dict()
+    return {"whole": whole, "again": again, "kept": kept, "random": start["random"]}
+
+
+# --- a process of a team --------------------------------------------------------------------
+
+
+def message(act: Callable[[], Any]) -> str:
+    with pytest.raises(CpunetError) as error:
+        act()
+    return str(error.value)
+
+
+def work(folder: Path, job: dict[str, Any]) -> None:
+    """All that a process of the team does."""
+    torch.set_num_threads(1)
+    sets = [np.load(folder / f"{side}.npy") for side in ("sim", "data")]
+    found: Found = {}
+    launched = launch()
+    assert launched is not None
+    rank = launched.team.rank
+    try:
+        with meeting(launched) as join:
+            team = join("cpu")
+            found["any"] = [team.any(False), team.any(team.rank == 1), team.any(True)]
+            found["told"] = [len(team.told(b"")), team.told(b"of 0" * (1 - team.rank))]
+            for name, arguments in job["norms"].items():
+                found[name] = norm_found(team, *arguments)
+            for name, overrides in job["steps"].items():
+                found[name] = steps_found(team, overrides, sets)
+            found["training"] = training_found(team, job["training"], sets)
+            found["resumed"] = resumed_found(team, job["resumed"], sets)
+            found["others"] = message(
+                lambda: require_same_everywhere(team, {"seed": team.rank})
+            )
+            require_same_everywhere(team, {"seed": 1})
+            sets[1][5] = np.nan  # of a pulse that one process is dealt
+            training_found(team, job["training"], sets)
+    except CpunetError as error:
+        found["diverged"] = [type(error).__name__, str(error)]
+    torch.save(found, folder / f"found-{rank}.pt")
+
+    os.environ["MASTER_PORT"] = str(job["port"])
+    lost: list[Any] = []
+    try:
+        with meeting(launched) as join:
+            team = join("cpu")
+            team.any(False)
+            if rank == 1:
+                os._exit(9)
+            began = time.monotonic()
+            team.any(False)
+    except CpunetError as error:
+        lost = [type(error).__name__, str(error), time.monotonic() - began]
+    (folder / f"lost-{rank}.json").write_text(json.dumps(lost))
+
+
+def work_on_gpus(folder: Path, job: dict[str, Any]) -> None:
+    """A training on a GPU per process."""
+    sets = [np.load(folder / f"{side}.npy") for side in ("sim", "data")]
+    launched = launch()
+    assert launched is not None
+    device = f"cuda:{launched.local_rank}"
+    recipe = load_recipe("paper", job["recipe"])
+    with torch.cuda.device(device), meeting(launched) as join:
+        team = join(device)
+        model = train(*sets, recipe, seed=3, device=device, team=team)
+    torch.save(model.cpu().state_dict(), folder / f"found-{launched.team.rank}.pt")
+
+
+# --- the tests ------------------------------------------------------------------------------
+
+
+def free_ports(n: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(n)]
+    ports = [s.getsockname()[1] for s in sockets]
+    for s in sockets:
+        s.close()
+    return ports
+
+
+@pytest.fixture(scope="module")
+def job() -> dict[str, Any]:
+    from_conftest = runpy.run_path(str(Path(__file__).with_name("conftest.py")))
+    tiny = [*from_conftest["TINY"], *QUIET]
+    return {
+        "norms": {"pulses": ((6, 3, 5), 0.1), "vectors": ((6, 3), None)},
+        "steps": {
+            f"penalty {p}": [*tiny, *CLIPPED, f"training.losses.gradient_penalty={p}"]
+            for p in PENALTIES
+        },
+        "training": [*tiny, "training.average_decay=0.5", "generator.residual=true", *SHORT],
+        "resumed": [*tiny, *NOISY],
+    }
+
+
+@pytest.fixture(scope="module")
+def sides() -> list[np.ndarray]:
+    random, time_ = np.random.default_rng(1), np.arange(64)
+    width = random.uniform(1, 4, (20, 1))
+    edges = 1 / (1 + np.exp(-(time_ - 32 + 3 * width) / width))
+    data = edges[11:] * np.exp(-np.clip(time_ - 32, 0, None) / 150)
+    data += random.normal(0, 0.003, data.shape)
+    return [edges[:11].astype(np.float32), data.astype(np.float32)]
+
+
+def run_pair(folder: Path, sides, job: dict[str, Any], doing: Callable[..., None]) -> list[int]:
+    """Let two processes do their work; their statuses."""
+    for side, pulses in zip(("sim", "data"), sides, strict=True):
+        np.save(folder / f"{side}.npy", pulses)
+    first, second = map(str, free_ports(2))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["cpunet.cli.main", "cpunet.jobs.train", "torch._dynamo"])
+    told = {"WORLD_SIZE": str(SIZE), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": first}
+    processes = []
+    for rank in range(SIZE):
+        given = {
+            "ENVIRONMENT": told | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            "CALL": (doing.__name__, folder, job | {"port": second}),
+        }
+        processes.append(
+            context.Process(target=runpy.run_path, args=(__file__, given, PROCESS))
+        )
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(300)
+        process.kill()
+    return [process.exitcode for process in processes]
+
+
+@pytest.fixture(scope="module")
+def folder(job, sides, tmp_path_factory) -> Path:
+    """What the two processes found."""
+    folder = tmp_path_factory.mktemp("team")
+    assert run_pair(folder, sides, job, work) == [0, 9]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(folder) -> list[Found]:
+    return [torch.load(folder / f"found-{rank}.pt") for rank in range(SIZE)]
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("name", ["pulses", "vectors"])
+def test_a_norm_of_a_team_is_that_of_all_its_pulses(job, found, name):
+    alone = norm_found(ALONE, *job["norms"][name])
+    for part, expected in alone["of pulses"].items():
+        whole = torch.cat([one[name]["of pulses"][part] for one in found])
+        torch.testing.assert_close(whole, expected, rtol=1e-9, atol=1e-9)
+    for one in found:
+        assert one[name]["same"].keys() == alone["same"].keys()
+        for part, expected in alone["same"].items():
+            torch.testing.assert_close(one[name]["same"][part], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_norm_of_a_team_has_the_same_names_and_evaluates_the_same():
+    plain = nn.Sequential(nn.Conv1d(1, 3, 3), nn.BatchNorm1d(3))
+    plain(torch.randn(5, 1, 9))
+    shared = copy.deepcopy(plain)
+    share_norms(shared, Team(0, 2))
+    assert isinstance(shared[1], TeamNorm)
+    assert isinstance(copy.deepcopy(shared)[1], TeamNorm)  # as for running averages
+    assert [n for n, _ in shared.named_parameters()] == [n for n, _ in plain.named_parameters()]
+    x = torch.randn(4, 1, 9)
+    assert torch.equal(shared.eval()(x), plain.eval()(x))
+    other = nn.Sequential(nn.Conv1d(1, 3, 3), nn.BatchNorm1d(3))
+    other.load_state_dict(shared.state_dict())
+    shared.load_state_dict(plain.state_dict())
+    assert same(other.state_dict(), plain.state_dict())
+
+
+def test_alone_all_norms_stay_as_they_are():
+    network = nn.Sequential(nn.BatchNorm1d(3))
+    share_norms(network, ALONE)
+    assert type(network[0]) is nn.BatchNorm1d
+
+
+@pytest.mark.parametrize("penalty", PENALTIES)
+def test_steps_are_those_of_one_process(job, found, sides, penalty):
+    name = f"penalty {penalty}"
+    alone = steps_found(ALONE, job["steps"][name], sides)
+    for one in found:
+        assert one[name]["losses"].keys() == alone["losses"].keys() == set(LOSS_NAMES)
+        for part in ("losses", "gradients"):
+            for key, expected in alone[part].items():
+                torch.testing.assert_close(
+                    one[name][part][key], expected, rtol=1e-9, atol=1e-12
+                )
+        for key, expected in alone["weights"].items():
+            torch.testing.assert_close(
+                one[name]["weights"][key], expected, rtol=1e-6, atol=1e-7
+            )
+    assert same(found[0][name]["weights"], found[1][name]["weights"])
+
+
+def test_a_training_is_that_of_one_process(job, found, sides):
+    alone = training_found(ALONE, job["training"], sides)
+    first, second = (one["training"] for one in found)
+    assert same(first["weights"], second["weights"])
+    assert len(second["losses"]) == 0  # one process alone tells
+    torch.testing.assert_close(first["losses"], alone["losses"], rtol=1e-6, atol=1e-7)
+    for key, expected in alone["weights"].items():
+        torch.testing.assert_close(first["weights"][key], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_resumed_team_ends_with_the_same_bits(found):
+    first, second = (one["resumed"] for one in found)
+    assert (first["kept"], second["kept"]) == (1, 0)
+    for one in (first, second):
+        assert same(one["whole"], one["again"])
+    assert same(first["whole"], second["whole"])
+    noises = [random["cpu"] for random in second["random"]]
+    assert len(noises) == SIZE
+    assert not torch.equal(*noises)
+
+
+def test_a_state_goes_on_in_a_team_of_another_size(found, job, sides):
+    recipe = load_recipe("paper", job["resumed"])
+    states: list[Any] = []
+    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)), stop=lambda: True)
+    with pytest.raises(StoppedError):
+        train(*sides, recipe, seed=5, keeping=keeping)
+    (state,) = states
+    assert len(state["random"]) == 1
+    of_two = found[0]["resumed"]["random"]
+    keeping = Keeping(lambda _state: None, state | {"random": of_two})
+    model = train(*sides, recipe, seed=5, keeping=keeping)
+    assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
+
+
+def test_what_is_told_and_asked(found):
+    for one in found:
+        assert one["any"] == [False, True, True]
+        assert one["told"] == [0, b"of 0"]
+
+
+def test_other_settings_in_one_process(found):
+    assert [one["others"] for one in found] == 2 * [
+        "process 1 has other settings or pulses than process 0; start all with the same "
+        "options and files"
+    ]
+
+
+def test_an_error_of_all_is_told_once(found):
+    kinds = {one["diverged"][0] for one in found}
+    assert kinds == {CpunetError.__name__, ToldElsewhereError.__name__}
+    for one in found:
+        assert one["diverged"][1].startswith("training diverged: ")
+
+
+def test_a_process_that_dies_ends_the_other(folder):
+    kind, text, seconds = json.loads((folder / "lost-0.json").read_text())
+    assert kind == CpunetError.__name__
+    assert text == (
+        "another process of this training ended or cannot be reached; go on with --resume"
+    )
+    assert seconds < 30
+
+
+def test_the_shares_of_a_deck_are_the_batch():
+    pulses = torch.arange(20.0)[:, None, None]
+    whole, *shares = (
+        Deck(pulses, 6, 1, team) for team in (ALONE, *(Team(r, 3) for r in range(3)))
+    )
+    for _ in range(5):
+        batch = whole.deal()
+        assert torch.equal(torch.cat([share.deal() for share in shares]), batch)
+    with pytest.raises(
+        CpunetError, match=r"batch_size=6 cannot be shared equally by 4 proc.*multiple of 4"
+    ):
+        Deck(pulses, 6, 1, Team(0, 4))
+
+
+@pytest.mark.parametrize("missing", ["MASTER_ADDR", "MASTER_PORT", "LOCAL_RANK"])
+def test_half_a_launch(monkeypatch, missing):
+    told = {"RANK": "1", "LOCAL_RANK": "0", "WORLD_SIZE": "3", "MASTER_PORT": "1"}
+    for name, value in (told | {"MASTER_ADDR": "127.0.0.1"}).items():
+        monkeypatch.setenv(name, value)
+    launched = launch()
+    assert launched is not None
+    assert (launched.team, launched.local_rank) == (Team(1, 3), 0)
+    monkeypatch.delenv(missing)
+    with pytest.raises(CpunetError, match=f"but not {missing}; start with torchrun"):
+        launch()
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert launch() is None
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < SIZE, reason="fewer than two CUDA devices")
+@pytest.mark.parametrize("penalty", PENALTIES)
+def test_a_training_on_two_gpus(job, sides, tmp_path, penalty):
+    recipe = [*job["training"], f"training.losses.gradient_penalty={penalty}"]
+    assert run_pair(tmp_path, sides, {"recipe": recipe}, work_on_gpus) == [0, 0]
+    first, second = (torch.load(tmp_path / f"found-{rank}.pt") for rank in range(SIZE))
+    assert same(first, second)
+    assert all(bool(torch.isfinite(value).all()) for value in first.values())
+
+
+if __name__ == PROCESS:
+    given = globals()
+    os.environ.update(given["ENVIRONMENT"])
+    name, *arguments = given["CALL"]
+    given[name](*arguments)
