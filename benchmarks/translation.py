@@ -1,12 +1,14 @@
-"""Translation of prepared pulses on one core: readout chain with noise, and U-Nets.
+"""Translation of prepared pulses: readout chain with noise, and U-Nets.
 
-Run with ``python benchmarks/translation.py``; each rate is the median of three.  The U-Net of
-recipe `paper` in eager float32 is what the others are compared with; it and the one with fast
-convolutions take turns.
+Run with ``python benchmarks/translation.py``, on one core, or with ``--threads 2``; each rate
+is the median of three.  The U-Net of recipe `paper` in eager float32 is what the others are
+compared with; it and the one with fast convolutions take turns.  With ``--device cuda`` there
+is but one way for a U-Net; ``--pulses 4096`` then keeps it busy.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +19,7 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.networks.time_major import FrozenUNet
+from cpunet.networks.time_major import FrozenUNet, fast_passes_pay
 from cpunet.recipes import load_recipe
 from cpunet.translation.backends import NetworkBackend, ResponseBackend
 
@@ -43,11 +45,15 @@ def rate(translate: Callable[[], object], n: int) -> float:
     return n / float(np.median(times))
 
 
-def unets(pulses: np.ndarray) -> tuple[float, float, float]:
+def unets(pulses: np.ndarray, device: str) -> tuple[float, float, float]:
     """Pulses per second of the large U-Net, eager and fast, and how far they are apart."""
     torch.manual_seed(0)
-    network = PositionalUNet(load_recipe("paper").cyclegan.generator, 800).eval()
-    batch = torch.from_numpy(pulses)[:, None]
+    network = PositionalUNet(load_recipe("paper").cyclegan.generator, 800).eval().to(device)
+    batch = torch.from_numpy(pulses)[:, None].to(device)
+    if not fast_passes_pay(network, device):
+        with torch.inference_mode():  # to the host, so that all is done
+            eager = rate(lambda: network(batch, mean=True).cpu(), len(pulses))
+        return eager, eager, 0.0
     ways = (partial(network, batch), partial(FrozenUNet(network).translate, batch))
     times: tuple[list[float], list[float]] = ([], [])
     with torch.inference_mode():
@@ -62,9 +68,14 @@ def unets(pulses: np.ndarray) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--pulses", type=int, default=32, help="of a batch of the large U-Net")
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
     fast = load_recipe("fast")
-    chain = ResponseGenerator(fast.matching.generator, DT_NS)
+    chain = ResponseGenerator(fast.matching.generator, DT_NS).to(given.device)
     chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
     response = ResponseBackend(chain, fast.preparation)
     pulses, energies = windows(8192), np.full(8192, FEP_KEV)
@@ -79,9 +90,11 @@ def main() -> None:
         noisy = rate(lambda: with_noise(True), len(pulses))
         clean = rate(lambda: with_noise(False), len(pulses))
         recipe = load_recipe("small")
-        network = NetworkBackend(PositionalUNet(recipe.cyclegan.generator, 800))
+        unet = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
+        network, generator = NetworkBackend(unet), torch.Generator(given.device)
         small = rate(partial(network, pulses[:512], None, True, generator), 512)
-    plain, fast_unet, distance = unets(pulses[:32])
+    plain, fast_unet, distance = unets(windows(given.pulses), given.device)
+    print(f"{given.device}, {given.threads} thread(s)")
     print(f"{'method':<34}{'pulses/s':>10}{'ratio':>8}")
     for name, value in (
         ("readout chain, with noise", noisy),
