@@ -16,12 +16,14 @@ from cpunet.electronics.noise import coloured_noise
 from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.response import linear_response
 from cpunet.errors import CpunetError
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE, ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import matching
 from cpunet.training.matching import GOOD_FIT, Fit, fit_response
+from cpunet.training.moments import Moments
+from cpunet.training.response_problem import ResponseProblem
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
 KEV, NOISE_KEV = 2614.5, 1.95
@@ -233,14 +235,44 @@ def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> 
     rings = measured_with(chain)
     short = ("training.start_factors=[1]", "training.noise_sets=1")
     response, fit = rings.fit(0, *short)
-    numbers = response.describe()
+    numbers, errors = response.describe(), fit.errors
     assert fit.chi_square < GOOD_FIT * fit.moments
-    assert numbers["ringing_mhz"] == pytest.approx(6.0, rel=0.02)
-    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.3)  # with its damping
-    assert np.sort(response.log_poles_ns.detach().exp()) == pytest.approx([35, 55], rel=0.03)
+    assert abs(np.log(numbers["ringing_mhz"] / 6.0)) < 4 * errors["log_ringing.1"] < 0.12
+    assert abs(numbers["ringing_sine"] - 0.25) < 4 * errors["ringing.1"] < 0.16
+    poles = np.sort(response.log_poles_ns.detach().numpy())
+    pole_errors = sorted((errors["log_poles_ns.1"], errors["log_poles_ns.2"]), reverse=True)
+    assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
+    assert max(pole_errors) < 0.15  # a ringing and the poles undo each other in part
     assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
     # and none where there is none
     assert "ringing_mhz" not in near.response.describe()
+
+
+def test_a_ringing_is_found_with_few_pulses() -> None:
+    """Derivatives far from it promise no more than a fifth of chi-square."""
+    ringing = {"frequency_MHz": 5.0, "fraction": 0.285, "damping_ns": 160.0}
+    rings = measured_with(Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing}))
+    few = Problem(rings.sim, rings.data[:250], rings.noise)
+    response, fit = few.fit(0, "training.start_factors=[1]", "training.noise_sets=1")
+    assert fit.chi_square < GOOD_FIT * fit.moments
+    assert response.describe()["ringing_mhz"] == pytest.approx(5.0, rel=0.03)
+
+
+def test_derivatives_leave_the_response_as_it_is(problem: Problem) -> None:
+    recipe = load_recipe("fast", FEW)
+    generator, training = recipe.matching
+    sim = torch.from_numpy(problem.sim.waveforms[:64])
+    asked = ResponseProblem(
+        ElectronicsResponse(generator, DT_NS),
+        Moments.of_data(problem.data.waveforms, training, recipe.preparation),
+        sim,
+        torch.zeros(64, ROOM_BEFORE + sim.shape[1] + ROOM_AFTER),
+        last=ROOM_BEFORE + recipe.preparation.samples_before + 100,
+    )
+    vector = asked.vector()
+    columns = asked.derivatives(vector, asked.deviations(vector), [0, 2])
+    assert columns.shape == (len(asked.wanted), 2)
+    assert torch.equal(asked.vector(), vector)
 
 
 def test_too_few_pulses_are_refused(problem: Problem) -> None:

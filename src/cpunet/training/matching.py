@@ -37,8 +37,9 @@ DELAY = 100
 GOOD_FIT = 1.6
 # A wrong valley gives three per moment; this is another detector.
 HOPELESS_FIT = 20.0
-# A ringing must lower chi-square to this part of it, or there is none.
-RINGS = 0.7
+# A ringing must lower chi-square to this part of it, or there is none; derivatives far from
+# where it would be promise less.
+RINGS, PROMISES = 0.7, 0.9
 # Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
 # deviations from which on that is not as it is simulated.
 ONSET, OFF = -15, 4.0
@@ -186,7 +187,7 @@ def _ringing_if_better(
     if config.ringing_mhz is not None:
         return problem, fit
     response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
-    if response is None or promised > RINGS * fit.chi_square:
+    if response is None or promised > PROMISES * fit.chi_square:
         return problem, fit
     best, steps = (problem, fit), fit.steps
     # from where the fit without ringing ended, first as if that were near, then as if far

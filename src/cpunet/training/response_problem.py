@@ -143,4 +143,5 @@ class ResponseProblem:
             moved = vector.clone()
             moved[i] += self.steps[i]
             columns.append((self.deviations(moved) - deviations) / self.steps[i])
+        self.set(vector)
         return torch.stack(columns, dim=1)
