@@ -198,7 +198,10 @@ def simulate(
     from cpunet.simulation.hit_readers import Transform
 
     if (hits is None) == (events is None):
-        raise CpunetError("give either --hits FILE or --events N (for the gamma Monte Carlo)")
+        raise CpunetError(
+            "give either --hits FILE or --events N (for the gamma Monte Carlo); pulse-shape "
+            "libraries are made by cpunet library make"
+        )
     peaks = load_recipe("small").peaks
     source: HitSource
     if hits is not None:
