@@ -16,11 +16,13 @@ settings.load_profile("cpunet")
 
 
 def pytest_configure() -> None:
-    """Give each process its own compiled code.
+    """Give each process its own compiled code, and those that it starts one thread.
 
     Two that write the same cache at once, as in a fresh checkout, may read what the other has
-    half written, and crash.
+    half written, and crash.  The last bits of a training depend on the number of threads, and
+    a server that processes are forked from keeps that of the first test that needs it.
     """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         caches = Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba"
         os.environ.setdefault("NUMBA_CACHE_DIR", str(caches / worker))
