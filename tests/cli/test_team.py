@@ -85,6 +85,7 @@ def words(stand, tiny, tmp_path) -> list[object]:
     return ["train", *stand.inputs, "--out", out, *tiny, *settings, "--threads", "1"]
 
 
+@pytest.mark.slow
 def test_a_team_trains_and_goes_on(words, tmp_path, command):
     told, run = tmp_path / "told", tmp_path / "out" / "run"
     done = pair(told, *words)
