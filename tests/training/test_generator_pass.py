@@ -35,7 +35,8 @@ def outcome(tiny, sets, *settings: str) -> tuple[Tensor, Tensor]:
     return translated.detach(), gradient
 
 
-@pytest.mark.slow  # two minutes of compiling
+@pytest.mark.slow  # minutes of compiling
+@pytest.mark.filterwarnings("ignore")  # torch's compiler warns of what it does itself
 def test_a_compiled_pass_is_the_plain_one(tiny, sets):
     for found, expected in zip(
         outcome(tiny, sets, "training.compiled=true"), outcome(tiny, sets), strict=True
