@@ -237,12 +237,14 @@ def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> 
     response, fit = rings.fit(0, *short)
     numbers, errors = response.describe(), fit.errors
     assert fit.chi_square < GOOD_FIT * fit.moments
-    assert abs(np.log(numbers["ringing_mhz"] / 6.0)) < 4 * errors["log_ringing.1"] < 0.12
-    assert abs(numbers["ringing_sine"] - 0.25) < 4 * errors["ringing.1"] < 0.16
+    assert numbers["ringing_mhz"] == pytest.approx(6.0, rel=0.02)
+    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.2)  # with its damping
+    # both poles together; each of them is known to its error only, beside a ringing
     poles = np.sort(response.log_poles_ns.detach().numpy())
     pole_errors = sorted((errors["log_poles_ns.1"], errors["log_poles_ns.2"]), reverse=True)
+    assert poles.mean() == pytest.approx(np.log([35, 55]).mean(), abs=0.03)
     assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
-    assert max(pole_errors) < 0.15  # a ringing and the poles undo each other in part
+    assert max(pole_errors) < 0.1
     assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
     # and none where there is none
     assert "ringing_mhz" not in near.response.describe()
