@@ -34,7 +34,8 @@ class Fit:
     steps
         Steps taken.
     errors
-        Standard deviations of the parameters, by name, as their curvature gives them.
+        Standard deviations of the parameters, by name, as the curvature where the fit ended
+        gives them.
     pulls
         Deviation of each moment in its standard deviations, by name.
     data_left_out
@@ -70,7 +71,7 @@ def levenberg_marquardt(
     CpunetError
         If chi-square is not finite in the end.
     """
-    vector, taken, curvature = problem.vector(), 0, torch.eye(1, dtype=torch.float64)
+    vector, taken = problem.vector(), 0
     rounds = [(clip, ROUNDS_EACH) for clip in FIRST_CLIPS if coarse]
     for clip, most in [*rounds, (None, steps - ROUNDS_EACH * len(rounds))]:
         problem.clip = clip
@@ -102,9 +103,11 @@ def levenberg_marquardt(
             "the fit of the response diverged; check that the sets hold single pulses of one "
             "detector (cpunet info), or train on other energies (--peak)"
         )
+    # the last curvature may be that before the last step, which can be a long one
+    jacobian = problem.jacobian(vector, residuals)
+    covariance = torch.linalg.inv(jacobian.T @ jacobian)
     problem.set(vector)
     pulls = problem.pulls(vector)
-    covariance = torch.linalg.inv(curvature)
     return Fit(
         chi_square=cost,
         moments=len(pulls),
