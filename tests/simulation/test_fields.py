@@ -10,8 +10,15 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.field_cache import cache_file
-from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.fields import (
+    FieldMaps,
+    compute_fields,
+    scaled_to_depletion,
+    superposed_fields,
+)
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
+from cpunet.simulation.superposition import NOT_IN_PARTS, solve
 
 COARSE = ["grid_mm=0.5"]
 
@@ -99,7 +106,8 @@ def test_solved_once() -> None:
     assert second.temperature_K == 100
     np.testing.assert_array_equal(first.potential_V, second.potential_V)
     assert same(first, compute_fields(detector))
-    compute_fields(detector.model_copy(update={"bias_V": 3900.0}), progress=steps.append)
+    thicker = detector.model_copy(update={"li_thickness": 1.1})
+    compute_fields(thicker, progress=steps.append)
     assert steps
 
 
@@ -107,7 +115,7 @@ def test_solved_once() -> None:
 def test_a_damaged_cache_is_solved_anew(damage: str) -> None:
     detector = read_detector("icpc", COARSE)
     first = compute_fields(detector)
-    path = cache_file(detector.fingerprint(exclude=("name", "temperature_K")))
+    path = cache_file(detector.fingerprint(exclude=NOT_IN_PARTS))
     whole = path.read_bytes()
     if damage == "other":
         np.savez(path, r_mm=np.zeros(3))
@@ -130,3 +138,76 @@ def test_a_cache_that_cannot_be_written_is_none(
 def test_no_cache_leaves_nothing_behind(cache_folder: Path) -> None:
     compute_fields(read_detector("icpc", COARSE), cache=False)
     assert not cache_folder.exists()
+
+
+PARTS: dict[str, list[str]] = {
+    "plain": [],
+    "charged": ["surface_charge_1e10_per_cm2=-0.02"],
+    "grounded": ["vacuum_gap=1", "surface_charge_1e10_per_cm2=0.02"],
+}
+
+
+@pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
+def test_any_bias_and_impurity_from_one_solution(more: list[str]) -> None:
+    detector = read_detector("ppc", [*COARSE, *more])
+    solution = solve(detector)
+    steps: list[str] = []
+    for bias, scale in ((2500.0, 1.0), (3100.0, 1.2), (2200.0, 0.6)):
+        fields = superposed_fields(
+            solution, bias_V=bias, impurity_scale=scale, temperature_K=80
+        )
+        # solved for on its own, the impurities written down as they are
+        changed = {"impurity_z0_1e10_per_cm3": -0.8, "impurity_gradient_1e10_per_cm4": 0.08}
+        changed = {key: scale * value for key, value in changed.items()} | {"bias_V": bias}
+        alone = compute_fields(detector.model_copy(update=changed), cache=False)
+        assert fields.temperature_K == 80
+        for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm", "weighting_potential"):
+            np.testing.assert_allclose(getattr(fields, name), getattr(alone, name), atol=1e-6)
+        assert fields.depletion_V == pytest.approx(alone.depletion_V, abs=1)
+        changed = {"bias_V": bias, "impurity_scale": scale}
+        again = compute_fields(detector.model_copy(update=changed), progress=steps.append)
+        np.testing.assert_array_equal(again.potential_V, fields.potential_V)
+    assert not steps
+
+
+def test_undepleted_parts_are_not_superposed() -> None:
+    solution = solve(read_detector("ppc", COARSE))
+    depletion = solution.depletion_V(1.3)
+    for volts in (depletion + 1, depletion - 1):
+        if volts > depletion:
+            assert solution.potential_V(volts, 1.3).max() == pytest.approx(volts)
+            continue
+        with pytest.raises(CpunetError, match="does not deplete it; give at least the dep"):
+            superposed_fields(solution, bias_V=volts, impurity_scale=1.3, temperature_K=90)
+
+
+@pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("measured", [1200.0, 2500.0])
+def test_impurities_are_scaled_to_the_measured_depletion(
+    more: list[str], measured: float
+) -> None:
+    detector = read_detector("ppc", [*COARSE, *more, f"measured_depletion_V={measured}"])
+    scaled = scaled_to_depletion(detector)
+    assert Detector.model_validate(scaled.model_dump()) == scaled
+    # the bias is what the depletion was measured at: just depleted
+    fields = compute_fields(scaled)
+    assert fields.depletion_V == pytest.approx(measured, abs=1)
+    # and a solution of these impurities alone says so too
+    values = detector.model_dump()
+    for key in ("impurity_z0_1e10_per_cm3", "impurity_gradient_1e10_per_cm4"):
+        values[key] *= scaled.impurity_scale
+    alone = compute_fields(Detector.model_validate(values), cache=False)
+    assert alone.depletion_V == pytest.approx(measured, abs=1)
+
+
+def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
+    detector = read_detector("ppc", COARSE)
+    with pytest.raises(CpunetError, match="no measured_depletion_V .* give"):
+        scaled_to_depletion(detector)
+    values = {"measured_depletion_V": 2000.0, "surface_charge_1e10_per_cm2": -0.8}
+    with pytest.raises(CpunetError, match=r"2000 V do not deplete it even with 0.001"):
+        scaled_to_depletion(detector.model_copy(update=values))
+    pure = {"impurity_z0_1e10_per_cm3": 0.0, "impurity_gradient_1e10_per_cm4": 0.0}
+    values = {"measured_depletion_V": 2000.0, **pure}
+    with pytest.raises(CpunetError, match="even with 1000 times .* correct .* impurity_z0"):
+        scaled_to_depletion(detector.model_copy(update=values))

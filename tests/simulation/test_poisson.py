@@ -120,7 +120,8 @@ def test_surface_charge_bends_the_potential_down() -> None:
     plain = Hemispheres(**values(0.2))
     charged = Hemispheres(**values(0.2), surface_charge_1e10_per_cm2=-0.1)
     grid = make_grid(plain)
-    without, with_it = (solve_potentials(d, grid).impurities for d in (plain, charged))
+    found = [solve_potentials(d, grid) for d in (plain, charged)]
+    without, with_it = (potentials.impurities + potentials.surface for potentials in found)
     assert (with_it <= without + 1e-9).all()
     assert with_it[25, 0] < without[25, 0] - 1
 

@@ -46,11 +46,7 @@ class Shift(Config):
             If there can be no such detector.
         """
         values = detector.model_dump()
-        for key in values:
-            # the radial factor and power are relative to the others
-            if key.startswith("impurity_") and not key.startswith("impurity_radial_"):
-                values[key] *= self.impurity_factor
-        values["impurity_radial_add_1e10_per_cm3"] *= self.impurity_factor
+        values["impurity_scale"] *= self.impurity_factor
         values["temperature_K"] += self.temperature_K
         try:
             return Detector.model_validate(values)

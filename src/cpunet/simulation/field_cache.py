@@ -1,57 +1,59 @@
-"""Solved maps on disk, so that each detector is solved once."""
+"""Solved potentials on disk, so that each detector is solved once."""
 
 from __future__ import annotations
 
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import platformdirs
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.simulation.grid import Grid
+from cpunet.simulation.poisson import Potentials
 
-# part of the name: maps of an older solver are not taken
-SOLVER_VERSION = 1
+# part of the name: what an older solver found is not taken
+SOLVER_VERSION = 2
 
-_NUMBERS = ("grid_mm", "capacitance_pF", "depletion_V")
-_ARRAYS = (
-    "r_mm",
-    "z_mm",
-    "potential_V",
-    "e_r_V_per_cm",
-    "e_z_V_per_cm",
-    "weighting_potential",
-    "point_type",
-)
+_OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
+_OF_NODES = ("point_contact", "bias", "impurities", "surface")
 
 
 def cache_file(key: str) -> Path:
-    """Where the maps of a detector with fingerprint `key` are kept."""
+    """Where the potentials of a detector with fingerprint `key` are kept."""
     folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
     return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
 
 
-def load(key: str) -> dict[str, Any] | None:
-    """Take the maps of `key` from the cache; None if they are not there or damaged."""
+def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
+    """Take grid, potentials and depletion voltage (V) of `key` from the cache.
+
+    None if they are not there or damaged.
+    """
     try:
         # opened here: numpy leaves a damaged file open
         with cache_file(key).open("rb") as file, np.load(file, allow_pickle=False) as kept:
-            maps: dict[str, Any] = {name: kept[name] for name in _ARRAYS}
-            maps |= {name: float(kept[name]) for name in _NUMBERS}
+            axes = {name: kept[name] for name in _OF_GRID}
+            nodes = {name: kept[name] for name in _OF_NODES}
+            capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None  # solved anew, and written over
-    shape = (len(maps["r_mm"]), len(maps["z_mm"]))
-    whole = all(maps[name].shape == shape for name in _ARRAYS[2:])
-    return maps if whole else None
+    shape = (len(axes["r_mm"]), len(axes["z_mm"]))
+    if any(values.shape != shape for values in (axes["region"], *nodes.values())):
+        return None
+    grid = Grid(step_mm=step_mm, **axes)
+    return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
 
 
-def store(key: str, maps: dict[str, Any]) -> None:
-    """Keep `maps` in the cache, whole or not at all; a cache that cannot be written is none."""
+def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
+    """Keep them in the cache, whole or not at all; a cache that cannot be written is none."""
+    arrays = {name: getattr(grid, name) for name in _OF_GRID}
+    arrays |= {name: getattr(potentials, name) for name in _OF_NODES}
+    numbers = {"capacitance_pF": potentials.capacitance_pF, "depletion_V": depletion_V}
     try:
         with written_aside(cache_file(key)) as aside:
-            np.savez(aside, **maps)
+            np.savez(aside, **arrays, **numbers)
     except CpunetError:
         return  # a read-only home must not stop a simulation

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.simulation import field_cache
-from cpunet.simulation.depletion import HIGHEST_BIAS_V, depletion_voltage
 from cpunet.simulation.geometry import DITCH, LI_CONTACT, Detector, FloatArray, RegionArray
-from cpunet.simulation.grid import Grid, make_grid, point_types
-from cpunet.simulation.poisson import solve_potentials
-
-Progress = Callable[[str], None]
+from cpunet.simulation.grid import Grid, point_types
+from cpunet.simulation.superposition import Progress, Superposition, solve
 
 _V_PER_CM = 10.0  # of 1 V / mm
-# neither matters to the fields
-_NOT_IN_FIELDS = ("name", "temperature_K")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,57 +47,73 @@ def compute_fields(
     ----------
     detector
         Geometry, impurities and bias.
-    cache
-        Keep the maps on disk (in ``$CPUNET_CACHE``, or the user's cache folder) and
-        take them from there if the same detector was solved before.
-    progress
-        Called with a few words as each part starts.
+    cache, progress
+        As for `cpunet.simulation.superposition.solve`.
 
     Raises
     ------
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    key = detector.fingerprint(exclude=_NOT_IN_FIELDS)
-    if cache and (kept := field_cache.load(key)) is not None:
-        return FieldMaps(**kept, temperature_K=detector.temperature_K)
-    say = progress or (lambda _: None)
-    grid = make_grid(detector)
-    say(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
-    potentials = solve_potentials(detector, grid)
-    say("depletion voltage")
-    depletion = depletion_voltage(potentials.bias, potentials.impurities, grid.region)
-    _refuse_undepleted(detector, depletion)
-    potential = detector.bias_V * potentials.bias + potentials.impurities
+    solution = solve(detector, cache=cache, progress=progress)
+    return superposed_fields(
+        solution,
+        bias_V=detector.bias_V,
+        impurity_scale=detector.impurity_scale,
+        temperature_K=detector.temperature_K,
+    )
+
+
+def superposed_fields(
+    solution: Superposition, *, bias_V: float, impurity_scale: float, temperature_K: float
+) -> FieldMaps:
+    """Fields at a bias and with scaled impurities, without solving again.
+
+    Raises
+    ------
+    CpunetError
+        If the detector is not fully depleted.
+    """
+    grid, detector = solution.grid, solution.detector
+    potential = solution.potential_V(bias_V, impurity_scale)
     e_r, e_z = electric_field(potential, grid, mirror=not _charged_face(detector))
-    maps: dict[str, Any] = {
-        "r_mm": grid.r_mm,
-        "z_mm": grid.z_mm,
-        "grid_mm": detector.grid_mm,
-        "potential_V": potential,
-        "e_r_V_per_cm": e_r,
-        "e_z_V_per_cm": e_z,
-        "weighting_potential": potentials.point_contact,
-        "point_type": point_types(grid),
-        "capacitance_pF": potentials.capacitance_pF,
-        "depletion_V": depletion,
-    }
-    if cache:
-        field_cache.store(key, maps)
-    return FieldMaps(**maps, temperature_K=detector.temperature_K)
+    return FieldMaps(
+        r_mm=grid.r_mm,
+        z_mm=grid.z_mm,
+        grid_mm=grid.step_mm,
+        potential_V=potential,
+        e_r_V_per_cm=e_r,
+        e_z_V_per_cm=e_z,
+        weighting_potential=solution.potentials.point_contact,
+        point_type=point_types(grid),
+        temperature_K=temperature_K,
+        capacitance_pF=solution.potentials.capacitance_pF,
+        depletion_V=solution.depletion_V(impurity_scale),
+    )
 
 
-def _refuse_undepleted(detector: Detector, depletion_V: float) -> None:
-    if depletion_V == float("inf"):
+def scaled_to_depletion(
+    detector: Detector, *, cache: bool = True, progress: Progress | None = None
+) -> Detector:
+    """The detector with its impurities scaled so that it depletes at the measured voltage.
+
+    The densities that a crystal's maker measures are good to some 10 %, while the
+    depletion voltage is known to a few volts.  `cache` and `progress` are those of
+    `compute_fields`.
+
+    Raises
+    ------
+    CpunetError
+        If the detector has no ``measured_depletion_V``, or no scale leads to it.
+    """
+    measured = detector.measured_depletion_V
+    if not measured:
         raise CpunetError(
-            f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
-            "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
+            f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
+            "add it to the file, or give measured_depletion_V=VALUE"
         )
-    if detector.bias_V < depletion_V:
-        raise CpunetError(
-            f"detector {detector.name}: bias_V = {detector.bias_V:g} does not deplete it; "
-            f"give at least the depletion voltage, {np.ceil(depletion_V):.0f} V"
-        )
+    solution = solve(detector, cache=cache, progress=progress)
+    return detector.model_copy(update={"impurity_scale": solution.scale_of_depletion(measured)})
 
 
 def _charged_face(detector: Detector) -> bool:

@@ -37,10 +37,11 @@ class Detector(Config):
     outer and, unless ``inner_taper_angle_deg`` is given, for the bore's taper.
     ``vacuum_gap`` is the distance of a grounded plane below z = 0.
 
-    The net impurity is, in 1e10/cm3 with z and r in cm,
-    ``z0 + gradient z + quadratic (1 - (2 z / L - 1)^2)``, times
-    ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``;
-    it is negative for p-type germanium.
+    The net impurity is, in 1e10/cm3 with z and r in cm, ``z0 + gradient z
+    + quadratic (1 - (2 z / L - 1)^2) + exponential exp(-z / exponential_length)``, times
+    ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``,
+    all times ``impurity_scale``; it is negative for p-type germanium.
+    ``measured_depletion_V`` is what that scale can be found from (0: not known).
 
     ``siggen_conventions`` places the lithium boundary on tapers, the ditch's walls (half
     a grid step wider) and charge in the ditch as fieldgen does, so that pulses agree with
@@ -72,11 +73,15 @@ class Detector(Config):
     impurity_z0_1e10_per_cm3: float
     impurity_gradient_1e10_per_cm4: float = 0.0
     impurity_quadratic_1e10_per_cm3: float = 0.0
+    impurity_exponential_1e10_per_cm3: float = 0.0
+    impurity_exponential_length_mm: float = 0.0
     impurity_radial_add_1e10_per_cm3: float = 0.0
     impurity_radial_mult: NonNegative = 1.0
     impurity_radial_power: Positive = 2.0
+    impurity_scale: Positive = 1.0
     surface_charge_1e10_per_cm2: float = 0.0
     bias_V: Positive
+    measured_depletion_V: NonNegative = 0.0
     temperature_K: Annotated[float, Field(ge=40, le=120)]
     grid_mm: Annotated[float, Field(ge=0.02, le=1)] = 0.1
     siggen_conventions: bool = True
@@ -127,8 +132,18 @@ class Detector(Config):
             yield "ditch_depth reaches the bore (bore_length) or the top"
         if self.grid_mm > self.point_contact_radius / 2:
             yield "grid_mm does not resolve point_contact_radius; at most half of it"
+        exponential = self.impurity_exponential_1e10_per_cm3
+        if (exponential != 0) != (self.impurity_exponential_length_mm != 0):
+            yield (
+                "impurity_exponential_1e10_per_cm3 and impurity_exponential_length_mm must "
+                "both be given, or both be 0"
+            )
         z = np.linspace(0, length, 101)
-        if self.impurity_1e10_per_cm3(np.array([[0.0], [radius]]), z).max() > 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [radius]]), z)
+        if not np.isfinite(impurity).all():
+            yield "impurity_… is not finite; correct impurity_exponential_length_mm"
+        if impurity.max() > 0:
             yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
 
     @property
@@ -157,9 +172,12 @@ class Detector(Config):
             + self.impurity_quadratic_1e10_per_cm3
             * (1 - (2 * z / self.crystal_length - 1) ** 2)
         )
+        if length_mm := self.impurity_exponential_length_mm:
+            axial = axial + self.impurity_exponential_1e10_per_cm3 * np.exp(-z / length_mm)
         radial = (r / self.crystal_radius) ** self.impurity_radial_power
         scaled = axial * (1 + (self.impurity_radial_mult - 1) * radial)
-        return np.asarray(scaled + self.impurity_radial_add_1e10_per_cm3 * radial)
+        total = scaled + self.impurity_radial_add_1e10_per_cm3 * radial
+        return np.asarray(self.impurity_scale * total)
 
     def inside(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Where `r`, `z` (mm) lie in the germanium, lithium layer and surfaces included.

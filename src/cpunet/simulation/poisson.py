@@ -34,19 +34,20 @@ class Potentials:
     """What the electrodes and the charges add to the potential; arrays (nr, nz).
 
     ``point_contact`` is the potential with 1 on the point contact and 0 elsewhere (the
-    weighting potential), ``bias`` that with 1 on the lithium, ``impurities`` that of
-    the charges in V with all electrodes at 0, and ``capacitance_pF`` the point
-    contact's own.
+    weighting potential), ``bias`` that with 1 on the lithium, ``impurities`` and
+    ``surface`` those of the impurities and of a charge on z = 0 in V with all
+    electrodes at 0, and ``capacitance_pF`` the point contact's own.
     """
 
     point_contact: FloatArray
     bias: FloatArray
     impurities: FloatArray
+    surface: FloatArray
     capacitance_pF: float
 
 
 def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
-    """Solve for the two electrodes and for the impurities on the nodes of `grid`."""
+    """Solve for the two electrodes and for the charges on the nodes of `grid`."""
     r_flux, z_flux, to_ground = conductances(detector, grid)
     free = grid.free
     # contacts are known: their columns go to the right-hand side
@@ -61,11 +62,14 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     point_contact = solved((grid.region == POINT_CONTACT).astype(float), nothing)
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
     impurities = solved(nothing, charges(detector, grid))
+    surface = nothing
+    if detector.surface_charge_1e10_per_cm2:
+        surface = solved(nothing, surface_charges(detector, grid))
     energy = (r_flux * np.diff(point_contact, axis=0) ** 2).sum()
     energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
     energy += (to_ground * point_contact[:, 0] ** 2).sum()
     capacitance = float(2 * np.pi * PF_PER_MM * energy)
-    return Potentials(point_contact, bias, impurities, capacitance)
+    return Potentials(point_contact, bias, impurities, surface, capacitance)
 
 
 def _solver(
@@ -131,7 +135,7 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
 
 
 def charges(detector: Detector, grid: Grid) -> FloatArray:
-    """Charge over the vacuum's permittivity in each node's ring, per unit angle, in V mm."""
+    """Impurities' charge over the vacuum's permittivity in each ring, per rad, in V mm."""
     germanium = _germanium_in_cells(detector, grid)
     if detector.siggen_conventions:
         # there the ditch holds the charge that N / 16 of germanium would hold
@@ -144,12 +148,17 @@ def charges(detector: Detector, grid: Grid) -> FloatArray:
     volume[:, 1:] += by_column
     volume[:, :-1] += by_column
     impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
-    charge = VOLT_PER_MM2 * impurity * volume
-    if detector.surface_charge_1e10_per_cm2:
-        # 1e10 / cm2 over 1 mm is 10 times 1e10 / cm3
-        face = (inner + outer) * (grid.region[:, 0] > LI_CONTACT)
-        charge[:, 0] += 10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face
-    return np.asarray(charge)
+    return np.asarray(VOLT_PER_MM2 * impurity * volume)
+
+
+def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
+    """The same of the charge on the passivated face, z = 0."""
+    inner, outer = _half_rings(grid)
+    charge = np.zeros(grid.region.shape)
+    face = (inner + outer) * (grid.region[:, 0] > LI_CONTACT)
+    # 1e10 / cm2 over 1 mm is 10 times 1e10 / cm3
+    charge[:, 0] = 10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face
+    return charge
 
 
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,157 @@
+"""One solution of a detector for every bias and every scale of its impurities.
+
+With space charge everywhere the potential is linear in its causes,
+``V = bias w + scale u + q`` (`w`: 1 on the lithium contact; `u`: of the impurities as
+given; `q`: of a charge on the surface), so that neither bias nor scale needs another
+solution.  Where a part of the detector is not depleted this does not hold: such a
+potential has a pocket (see `cpunet.simulation.depletion`), and is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.simulation import field_cache
+from cpunet.simulation.depletion import HIGHEST_BIAS_V, depletion_voltage, has_pocket
+from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.grid import Grid, make_grid
+from cpunet.simulation.poisson import Potentials, solve_potentials
+
+Progress = Callable[[str], None]
+
+# none of them matters to the parts of the potential
+NOT_IN_PARTS = ("name", "temperature_K", "bias_V", "impurity_scale", "measured_depletion_V")
+
+_SCALE_RESOLUTION = 1e-5
+_LARGEST_SCALE = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """What the bias, the impurities and a surface charge each add to the potential.
+
+    Parameters
+    ----------
+    detector
+        As solved for; its bias and its ``impurity_scale`` do not enter.
+    grid, potentials
+        The nodes, and the parts of the potential on them.
+    unit_depletion_V
+        Depletion voltage with the impurities as given, ``impurity_scale`` 1.
+    """
+
+    detector: Detector
+    grid: Grid
+    potentials: Potentials
+    unit_depletion_V: float
+
+    def potential_V(self, bias_V: float, impurity_scale: float = 1.0) -> FloatArray:
+        """Potential (nr, nz) at a bias, with all impurities scaled.
+
+        Raises
+        ------
+        CpunetError
+            If the detector is not depleted: nothing can be superposed there.
+        """
+        potential = self._sum(bias_V, impurity_scale)
+        if has_pocket(potential, self.grid.region):
+            self._refuse(bias_V, impurity_scale)
+        return potential
+
+    def depletion_V(self, impurity_scale: float = 1.0) -> float:
+        """Smallest bias that depletes the detector; infinite if there is none."""
+        if not self.detector.surface_charge_1e10_per_cm2:
+            # without another charge all of V scales together
+            return impurity_scale * self.unit_depletion_V
+        return depletion_voltage(
+            self.potentials.bias, self._sum(0.0, impurity_scale), self.grid.region
+        )
+
+    def scale_of_depletion(self, depletion_V: float) -> float:
+        """Scale of the impurities with which the detector just depletes at `depletion_V`.
+
+        Raises
+        ------
+        CpunetError
+            If no scale does that.
+        """
+        low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
+        what = f"detector {self.detector.name}: {depletion_V:g} V"
+        if self._pocket(depletion_V, low):
+            raise CpunetError(
+                f"{what} do not deplete it even with {low:g} of its impurities; correct "
+                "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
+            )
+        if not self._pocket(depletion_V, high):
+            raise CpunetError(
+                f"{what} deplete it even with {high:g} times its impurities; correct "
+                "measured_depletion_V or impurity_z0_1e10_per_cm3"
+            )
+        while high / low > 1 + _SCALE_RESOLUTION:
+            middle = math.sqrt(low * high)
+            if self._pocket(depletion_V, middle):
+                high = middle
+            else:
+                low = middle
+        return low
+
+    def _sum(self, bias_V: float, impurity_scale: float) -> FloatArray:
+        parts = self.potentials
+        return bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
+
+    def _pocket(self, bias_V: float, impurity_scale: float) -> bool:
+        return has_pocket(self._sum(bias_V, impurity_scale), self.grid.region)
+
+    def _refuse(self, bias_V: float, impurity_scale: float) -> None:
+        depletion, name = self.depletion_V(impurity_scale), self.detector.name
+        if depletion == float("inf"):
+            raise CpunetError(
+                f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
+                "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
+            )
+        raise CpunetError(
+            f"detector {name}: bias_V = {bias_V:g} does not deplete it; "
+            f"give at least the depletion voltage, {np.ceil(depletion):.0f} V"
+        )
+
+
+def solve(
+    detector: Detector, *, cache: bool = True, progress: Progress | None = None
+) -> Superposition:
+    """Solve for the parts of a detector's potential, or take them from the cache.
+
+    Parameters
+    ----------
+    detector
+        Geometry and impurities.
+    cache
+        Keep the parts on disk (in ``$CPUNET_CACHE``, or the user's cache folder) and
+        take them from there if the same detector was solved before, at any bias and with
+        any scale of its impurities.
+    progress
+        Called with a few words as each part starts.
+
+    Raises
+    ------
+    CpunetError
+        If the grid is too fine.
+    """
+    key = detector.fingerprint(exclude=NOT_IN_PARTS)
+    unit = detector.model_copy(update={"impurity_scale": 1.0})
+    if cache and (kept := field_cache.load(key, detector.grid_mm)) is not None:
+        return Superposition(unit, *kept)
+    say = progress or (lambda _: None)
+    grid = make_grid(unit)
+    say(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
+    potentials = solve_potentials(unit, grid)
+    say("depletion voltage")
+    fixed = potentials.impurities + potentials.surface
+    depletion = depletion_voltage(potentials.bias, fixed, grid.region)
+    if cache:
+        field_cache.store(key, grid, potentials, depletion)
+    return Superposition(unit, grid, potentials, depletion)
