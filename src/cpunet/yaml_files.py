@@ -1,7 +1,8 @@
-"""What every reader of YAML needs: the package's own files by name, and a text's fields."""
+"""What every reader of YAML and JSON needs: the package's own files by name, texts' fields."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -20,13 +21,37 @@ def yaml_names(folder: Traversable) -> list[str]:
     )
 
 
+def parsed(text: str) -> Any:
+    r"""What a text of YAML or JSON holds.
+
+    Raises
+    ------
+    yaml.YAMLError
+        If it is neither.
+
+    Examples
+    --------
+    >>> parsed("bias_V: 4000"), parsed('{\n\t"bias_V": 4000\n}')
+    ({'bias_V': 4000}, {'bias_V': 4000})
+    """
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        # JSON may be indented by tabs, which YAML refuses
+        try:
+            return json.loads(text)
+        except ValueError:
+            pass
+        raise
+
+
 def yaml_fields(text: str, source: str, *, invalid: str, empty: str) -> dict[str, Any]:
     """Fields of a YAML text.
 
     Parameters
     ----------
     text
-        YAML, or JSON, which is a part of it.
+        YAML or JSON.
     source
         What the errors begin with, such as ``"detector V01.yaml"``.
     invalid, empty
@@ -43,7 +68,7 @@ def yaml_fields(text: str, source: str, *, invalid: str, empty: str) -> dict[str
     {'bias_V': 4000}
     """
     try:
-        fields = yaml.safe_load(text)
+        fields = parsed(text)
     except yaml.YAMLError as error:
         raise CpunetError(f"{source}: {invalid} ({' '.join(str(error).split())})") from error
     if not isinstance(fields, Mapping):

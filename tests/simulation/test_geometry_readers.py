@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 import yaml
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import detector_names, read_detector
+
+Array = npt.NDArray[np.float64]
 
 SIGGEN = """
 # general
@@ -132,6 +137,155 @@ def test_a_legend_diode(tmp_path: Path, suffix: str) -> None:
     assert (detector.outer_taper_length, detector.taper_angle_deg) == (5, 45)
     assert (detector.bias_V, detector.li_thickness) == (3500, 0.7)
     assert detector.impurity_1e10_per_cm3(0, [0, 15]) == pytest.approx([-1.2, -1.0])
+
+
+CRYSTAL: dict[str, Any] = {
+    "impurity_curve": {
+        "model": "parabolic_exponential_boule",
+        "parameters": {"a": 9.0, "b": 0.05, "c": -1e-4, "n": 0.3, "l": 60.0, "m": 20.0},
+        "corrections": {"scale": 1.2, "offset": -0.4},
+    },
+    "slices": {"A": {"detector_offset_in_mm": 90.0}, "B": {"detector_offset_in_mm": 40}},
+}
+
+
+def acceptors_1e9(z_boule: Array, *, a: float, b: float, **more: float) -> Array:
+    """The curve of the metadata, in their own unit and frame."""
+    curve = a + b * z_boule + more.get("c", 0) * z_boule**2
+    if more.get("n"):
+        curve = curve + more["n"] * np.exp((z_boule - more["l"]) / more["m"])
+    return curve
+
+
+def metadata(folder: Path, crystal: dict[str, Any] | None, diode: dict[str, Any]) -> Path:
+    """A diode without impurities of its own, and the crystal in its place beside it."""
+    (folder / "diodes").mkdir()
+    (folder / "crystals").mkdir()
+    if crystal is not None:
+        written(folder / "crystals", "B99000.yaml", yaml.safe_dump(crystal))
+    return written(folder / "diodes", "B99000A.yaml", yaml.safe_dump(diode))
+
+
+def without_impcc(**changed: Any) -> dict[str, Any]:
+    array = {"value_in_1e9e/cm3": [0.0, 0.0], "dist_from_contact_in_mm": [0, 0.0]}
+    return {**DIODE, "production": {"impcc": {"array": array}}, **changed}
+
+
+@pytest.mark.parametrize("keys", ["abcnlm", "abnlm", "abc", "ab"])
+def test_impurities_of_the_crystal(tmp_path: Path, keys: str) -> None:
+    names = {"abcnlm": "parabolic_exponential", "abnlm": "linear_exponential"}
+    names |= {"abc": "parabolic", "ab": "linear"}
+    parameters = {key: CRYSTAL["impurity_curve"]["parameters"][key] for key in keys}
+    curve = {"model": f"{names[keys]}_boule", "parameters": parameters}
+    crystal = {**CRYSTAL, "impurity_curve": {**CRYSTAL["impurity_curve"], **curve}}
+    path = metadata(tmp_path, crystal, DIODE)
+    z = np.linspace(0, 30, 7)
+    # z of the boule runs from its seed end to the point contact, 90 mm from there
+    expected = -(1.2 * acceptors_1e9(90 - z, **parameters) - 0.4) / 10
+    found = read_detector(path, ["temperature_K=90"]).impurity_1e10_per_cm3(0, z)
+    assert found == pytest.approx(expected, rel=1e-12)
+    # another slice, without corrections, from a file that is given
+    plain = {"slices": crystal["slices"], "impurity_curve": curve}
+    other = written(tmp_path, "any.json", json.dumps(plain, indent="\t"))
+    diode = without_impcc(production={"slice": "B"})
+    path = written(tmp_path / "diodes", "B99000A.yaml", yaml.safe_dump(diode))
+    found = read_detector(path, ["temperature_K=90"], other).impurity_1e10_per_cm3(0, z)
+    assert found == pytest.approx(-acceptors_1e9(40 - z, **parameters) / 10, rel=1e-12)
+
+
+def test_the_public_metadata(reference_data: Path) -> None:
+    diodes = reference_data / "legend-metadata" / "diodes"
+    icpc = read_detector(diodes / "V99000A.yaml", ["temperature_K=90"])
+    assert (icpc.bias_V, icpc.measured_depletion_V, icpc.li_thickness) == (4000, 4000, 0.75)
+    curve = acceptors_1e9(np.array([80.0, 0.0]), a=8.438, b=0.03898)
+    assert icpc.impurity_1e10_per_cm3(0, [0, 80]) == pytest.approx(-curve / 10)
+    bege = read_detector(diodes / "B99000A.yaml", ["temperature_K=90"])
+    parameters = {"a": 8.878, "b": 0.05814, "c": -6.66e-5, "n": 0.008353}
+    curve = acceptors_1e9(np.array([40.0, 0.0]), **parameters, l=99.46, m=1.623)
+    assert bege.impurity_1e10_per_cm3(0, [0, 40]) == pytest.approx(-curve / 10)
+    said = refused(diodes / "P99000A.yaml", "temperature_K=90")
+    assert "there is no" in said
+    assert "crystals/P99000.yaml); give the crystal's file with --crystal" in said
+    ppc = read_detector(
+        diodes / "P99000A.yaml",
+        ["temperature_K=90"],
+        reference_data / "legend-metadata" / "crystals" / "V99000.yaml",
+    )
+    # where the site knows no voltage (0), the manufacturer's counts
+    assert (ppc.bias_V, ppc.measured_depletion_V) == (3000, 3000)
+    assert "type 'coax' is not simulated" in refused(diodes / "C99000A.yaml")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("impurity_curve.model", "spline_boule", "impurity_curve.model 'spline_boule'"),
+        ("impurity_curve.parameters.b", None, "no impurity_curve.parameters.b"),
+        ("impurity_curve.parameters.b", "much", "parameters.b = 'much' is no number"),
+        ("impurity_curve.parameters.m", 0, "impurity_curve.parameters.m = 0"),
+        ("impurity_curve.parameters.m", 0.01, "impurity_curve.parameters.m = 0.01"),
+        ("impurity_curve.corrections.scale", True, "corrections.scale = True is no number"),
+        ("slices.A", None, "no slices.A.detector_offset_in_mm"),
+    ],
+)
+def test_wrong_crystals_name_the_field(
+    tmp_path: Path, place: str, value: object, said: str
+) -> None:
+    crystal = copy.deepcopy(CRYSTAL)
+    *folders, last = place.split(".")
+    node = crystal
+    for key in folders:
+        node = node[key]
+    node[last] = value
+    path = metadata(tmp_path, crystal, DIODE)
+    with pytest.raises(CpunetError) as caught:
+        read_detector(path, ["temperature_K=90"])
+    message = str(caught.value)
+    assert message.startswith(f"crystal {tmp_path / 'crystals' / 'B99000.yaml'}: ")
+    assert said in message
+    assert "--crystal" in message
+    assert "\n" not in message
+
+
+def test_what_the_metadata_lack_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    site = {"manufacturer": {"recommended_voltage_in_V": 0, "dl_thickness_in_mm": None}}
+    path = metadata(tmp_path, {"name": "000"}, without_impcc(characterization=site))
+    given = ["temperature_K=90", "li_thickness=1", "bias_V=3000"]
+    said = refused(path, *given)
+    assert "B99000.yaml has no impurity_curve); give the crystal's file" in said
+    given += ["impurity_z0_1e10_per_cm3=-1"]
+    assert read_detector(path, given).bias_V == 3000
+    assert "combined_0vbb_analysis.fccd_in_mm.value nor" in refused(path, *given[2:])
+    said = refused(path, given[0], given[1], given[3])
+    assert "l200_site.recommended_voltage_in_V nor" in said
+    assert said.endswith("give --set bias_V=VALUE")
+    assert "temperature_K (LEGEND diodes do not tell it)" in refused(path, *given[1:])
+    assert capfd.readouterr() == ("", "")
+
+
+def test_points_of_a_line_at_one_distance(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    array = {"value_in_1e9e/cm3": [8.0, 9.0], "dist_from_contact_in_mm": [0, 0.0]}
+    path = metadata(tmp_path, None, {**DIODE, "production": {"impcc": {"array": array}}})
+    assert "at different distances; correct it" in refused(path, "temperature_K=90")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_crystal_belongs_to_a_diode(tmp_path: Path) -> None:
+    path = metadata(tmp_path, CRYSTAL, DIODE)
+    with pytest.raises(CpunetError, match="leave out --crystal"):
+        read_detector("icpc", crystal=path)
+    with pytest.raises(CpunetError, match=r"crystal .*nowhere\.yaml: cannot be read"):
+        read_detector(path, ["temperature_K=90"], tmp_path / "nowhere.yaml")
+
+
+def test_json_indented_by_tabs(tmp_path: Path) -> None:
+    text = json.dumps(DIODE, indent="\t")
+    path = written(tmp_path, "B99000A.json", text)
+    assert read_detector(path, ["temperature_K=90"]).bias_V == 3500
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,7 @@ def explore(
     data: Data = None,
     points: Points = 400,
     set_values: Set = None,
+    crystal: options.Crystal = None,
     settings_file: SettingsFile = None,
     data_table: options.DataTable = None,
     data_energy: options.DataEnergy = None,
@@ -63,7 +64,7 @@ def explore(
         measured = InputFile(data, data_table, data_energy, kev_per_adc, dt)
     told = explore_runs(
         runs,
-        read_detector(detector, set_values or ()),
+        read_detector(detector, set_values or (), crystal),
         out_file,
         data=measured,
         points=points,

@@ -29,6 +29,8 @@ def fields(
     detector: DetectorFile,
     out_file: Out = None,
     set_values: Set = None,
+    crystal: options.Crystal = None,
+    impurity_from: options.ImpurityFrom = options.Impurities.file,
     paths: Paths = True,
     force: options.Force = False,
 ) -> None:
@@ -40,8 +42,9 @@ def fields(
     from cpunet.simulation.geometry_readers import read_detector
 
     told = describe_fields(
-        read_detector(detector, set_values or ()),
+        read_detector(detector, set_values or (), crystal),
         out_file,
+        impurity_from=impurity_from.value,
         paths=paths,
         force=force,
         monitor=monitor(),

@@ -57,6 +57,7 @@ def make(
     length_ns: Length = None,
     settings: SettingsFile = None,
     set_values: Set = None,
+    crystal: options.Crystal = None,
     force: options.Force = False,
 ) -> None:
     """Simulate the charge pulse of every place in a detector.
@@ -73,7 +74,7 @@ def make(
     if settings is None:
         dt, length_ns = dt or DT_NS, length_ns or LENGTH_NS
     counts = write_library(
-        read_detector(detector, set_values or ()),
+        read_detector(detector, set_values or (), crystal),
         out_file,
         settings=load_settings(settings, {"dt_ns": dt, "length_ns": length_ns}),
         grid_mm=grid_mm,

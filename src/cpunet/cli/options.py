@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+class Impurities(StrEnum):
+    """What the detector's impurities are taken from."""
+
+    file = "file"
+    depletion = "depletion"
+
 
 Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
@@ -41,4 +50,18 @@ Truth = Annotated[
 ]
 Rivals = Annotated[
     bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
+]
+Crystal = Annotated[
+    Path | None,
+    typer.Option(
+        "--crystal",
+        help="LEGEND's file of the crystal's impurities; found in ../crystals by default.",
+    ),
+]
+ImpurityFrom = Annotated[
+    Impurities,
+    typer.Option(
+        "--impurity-from",
+        help="depletion: scale them so that the detector depletes at measured_depletion_V.",
+    ),
 ]

@@ -94,7 +94,7 @@ Exact = Annotated[
     typer.Option(
         "--exact/--library",
         help="Drift every hit, or interpolate between pulses of a grid (for many hits).",
-        show_default="exact below a million hits",
+        show_default="exact below 200,000 hits",
         rich_help_panel=PULSES,
     ),
 ]
@@ -140,6 +140,15 @@ Diffusion = Annotated[
         "--diffusion/--no-diffusion", show_default="diffusion", rich_help_panel=PULSES
     ),
 ]
+DiffusionConstant = Annotated[
+    str | None,
+    typer.Option(
+        help="D/(v/E) in V mm/cm, temperature (kT/e, 0.078 at 90 K) or siggen (with its "
+        "roundings).",
+        show_default="0.12",
+        rich_help_panel=PULSES,
+    ),
+]
 CloudFwhm = Annotated[
     float | None,
     typer.Option(
@@ -164,6 +173,8 @@ def simulate(
     peak: Peak = None,
     window_kev: WindowKev = 0.5,
     set_values: Set = None,
+    crystal: options.Crystal = None,
+    impurity_from: options.ImpurityFrom = options.Impurities.file,
     temperature: Temperature = None,
     hits_detector: HitTable = None,
     origin: Origin = None,
@@ -176,6 +187,7 @@ def simulate(
     dt: Dt = None,
     length: Length = None,
     diffusion: Diffusion = None,
+    diffusion_constant: DiffusionConstant = None,
     cloud_fwhm_mm: CloudFwhm = None,
     self_repulsion: SelfRepulsion = None,
     exact: Exact = None,
@@ -188,7 +200,7 @@ def simulate(
 
     Example: cpunet simulate --detector icpc --events FEP=10000,DEP=3000 --out sim.lh5
 
-    Example: cpunet simulate --detector V01.json --hits stp.lh5 --flip-z --out sim.lh5
+    Example: cpunet simulate --detector V01.yaml --hits stp.lh5 --flip-z --out sim.lh5
     """
     from cpunet.jobs.hit_sources import GammaSource, HitFile, energy_windows
     from cpunet.jobs.simulate import simulate_file
@@ -221,14 +233,16 @@ def simulate(
         "dt_ns": dt,
         "length_ns": length,
         "diffusion": diffusion,
+        "diffusion_constant": diffusion_constant,
         "cloud_fwhm_mm": cloud_fwhm_mm,
         "self_repulsion": self_repulsion,
     }
     summary = simulate_file(
-        read_detector(detector, overrides),
+        read_detector(detector, overrides, crystal),
         source,
         out_file,
         load_settings(settings_file, values),
+        impurity_from=impurity_from.value,
         windows=tuple(chosen or energy_windows(",".join(peaks), peaks, window_kev)),
         mode="auto" if exact is None else "exact" if exact else "library",
         cluster_mm=cluster_mm,

@@ -10,7 +10,8 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.files import refuse_existing, written_aside
 from cpunet.jobs.monitor import Monitor
-from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.jobs.simulate import ImpurityFrom, solved
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import LI_CONTACT, Detector, FloatArray
 from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE
 
@@ -23,6 +24,7 @@ def describe_fields(
     detector: Detector,
     picture: Path | None = None,
     *,
+    impurity_from: ImpurityFrom = "file",
     paths: bool = True,
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -35,6 +37,9 @@ def describe_fields(
         Geometry, impurities and bias.
     picture
         File to make, ``.png``, ``.pdf`` or ``.svg``; None for none.
+    impurity_from
+        ``"depletion"`` scales the impurities so that the detector depletes at its
+        ``measured_depletion_V``.
     paths
         Draw drift paths.
     force
@@ -45,8 +50,9 @@ def describe_fields(
     Returns
     -------
     dict
-        Text by name, with units: capacitance, depletion voltage, bias, and the lowest and
-        highest field in the bulk.
+        Text by name, with units: capacitance, depletion voltage (and the measured one, if
+        known), the scale of the impurities if it is not 1, bias, and the lowest and highest
+        field in the bulk.
 
     Raises
     ------
@@ -58,8 +64,7 @@ def describe_fields(
         if picture.suffix.lower() not in FORMATS:
             raise CpunetError(f"{picture}: pictures are made as {', '.join(FORMATS)}")
         refuse_existing(picture, force=force)
-    with monitor.stage(f"Fields of {detector.name}"):
-        fields = compute_fields(detector)
+    detector, fields = solved(detector, impurity_from, monitor)
     told = _told(detector, fields)
     if picture is not None:
         # matplotlib and the compiled drift are needed for the picture alone
@@ -80,10 +85,13 @@ def _told(detector: Detector, fields: FieldMaps) -> dict[str, str]:
     bulk &= fields.point_type < DITCH_EDGE
     bulk &= fields.point_type != CONTACT_EDGE
     bulk &= detector.active(fields.r_mm[:, None], fields.z_mm[None, :])
+    measured, scale = detector.measured_depletion_V, detector.impurity_scale
     return {
         "detector": detector.name,
         "capacitance": f"{fields.capacitance_pF:.3f} pF",
         "depletion voltage": f"{fields.depletion_V:.0f} V",
+        **({"measured depletion": f"{measured:g} V"} if measured else {}),
+        **({"impurity_scale": f"{scale:.6g}"} if scale != 1 else {}),
         "bias": f"{detector.bias_V:g} V",
         "lowest field": _at(fields, np.where(bulk, strength, np.inf), np.argmin),
         "highest field": _at(fields, np.where(bulk, strength, -np.inf), np.argmax),

@@ -27,6 +27,9 @@ _ROUND_EVENTS = 1000
 _GAMMAS_PER_EVENT = 100_000
 # Each round under way holds some ten MB of hits.
 _MOST_WORKERS = 8
+# Shares of hits outside the crystal: up to the first, rounding at its surface may be the
+# reason; beyond the second, these are no hits of this detector.
+_STRAY, _MISPLACED = 1e-3, 0.9
 
 
 class Window(NamedTuple):
@@ -95,7 +98,8 @@ class HitFile:
         Raises
         ------
         CpunetError
-            As `read_hits`; also if no event is in a window, or no hit in the crystal.
+            As `read_hits`; also if no event is in a window, or nearly no hit in the
+            crystal.
         """
         hits = read_hits(
             self.path,
@@ -109,9 +113,8 @@ class HitFile:
             if not hits.n_events:
                 names = ", ".join(window.name for window in self.windows)
                 raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
-        self._require_inside(hits, detector)
         blocks = (hits[i : i + BLOCK_EVENTS] for i in range(0, hits.n_events, BLOCK_EVENTS))
-        return OpenHits(hits.n_events, blocks)
+        return OpenHits(hits.n_events, blocks, self._outside(hits, detector))
 
     def provenance(self) -> dict[str, Any]:
         """What the output tells of its hits."""
@@ -123,18 +126,28 @@ class HitFile:
             "windows_kev": _by_name(self.windows),
         }
 
-    def _require_inside(self, hits: Hits, detector: Detector) -> None:
-        if detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).any():
-            return
+    def _outside(self, hits: Hits, detector: Detector) -> str:
+        """What there is to say of hits outside the crystal; refused if nearly all are."""
+        inside = detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
+        n, total = int((~inside).sum()), len(inside)
+        if n <= _STRAY * total:
+            return ""
         spans = (
             f"{axis} {values.min():.4g} to {values.max():.4g}"
             for axis, values in zip("xyz", (hits.x_mm, hits.y_mm, hits.z_mm), strict=True)
         )
-        raise CpunetError(
-            f"{self.path}: all {len(hits.edep_kev)} hits lie outside {detector.name} "
+        share = f"all {total}" if n == total else f"{n} of {total} ({n / total:.1%})"
+        text = (
+            f"{self.path}: {share} hits lie outside {detector.name} "
             f"(radius {detector.crystal_radius:g}, z 0 to {detector.crystal_length:g} mm); "
-            f"they span {', '.join(spans)} mm; move them with --origin and --flip-z"
+            f"they span {', '.join(spans)} mm; "
         )
+        if n > _MISPLACED * total:
+            raise CpunetError(
+                f"{text}move them with --origin and --flip-z, or choose others with "
+                "--hits-detector"
+            )
+        return f"{text}their energy is lost; check --origin, --flip-z and --hits-detector"
 
 
 @dataclass(frozen=True)
@@ -215,10 +228,11 @@ class GammaSource:
 
 @dataclass(frozen=True, eq=False)
 class OpenHits:
-    """The number of events, and the events in blocks, to be taken once."""
+    """The number of events, the events in blocks, to be taken once, and a warning if any."""
 
     n_events: int
     blocks: Iterator[Hits]
+    warning: str = ""
 
 
 HitSource = HitFile | GammaSource

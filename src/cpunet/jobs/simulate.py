@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,7 @@ from cpunet.jobs.simulation_summary import Clock, Summary
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import EventPulses, simulate_events
-from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.fields import FieldMaps, compute_fields, scaled_to_depletion
 from cpunet.simulation.gammas import with_resolution
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
@@ -31,6 +31,7 @@ from cpunet.simulation.settings import SimulationSettings
 
 QUIET = Monitor()
 Mode = Literal["exact", "library", "auto"]
+ImpurityFrom = Literal["file", "depletion"]
 
 # Building the library takes as long as drifting so many hits. From there on it is faster,
 # but its pulses deviate by up to `library_tolerance`.
@@ -58,6 +59,7 @@ def simulate_file(
     settings: SimulationSettings,
     *,
     windows: tuple[Window, ...] = (),
+    impurity_from: ImpurityFrom = "file",
     mode: Mode = "auto",
     cluster_mm: float = 0.05,
     resolution: Resolution | None = None,
@@ -85,6 +87,9 @@ def simulate_file(
         Of the drift and the pulses.
     windows
         In which the summary counts pulses.
+    impurity_from
+        ``"depletion"`` scales the detector's impurities so that it depletes at its
+        ``measured_depletion_V``.
     mode
         ``"exact"`` drifts every hit, ``"library"`` interpolates between pre-computed
         pulses; ``"auto"`` takes the library from `LIBRARY_FROM_HITS` hits on.
@@ -109,7 +114,9 @@ def simulate_file(
     _check(cluster_mm, resolution)
     opened = source.open(detector)
     clock.lap("reading")
-    fields = _solve(detector, monitor)
+    if opened.warning:
+        monitor.note(f"warning: {opened.warning}")
+    detector, fields = solved(detector, impurity_from, monitor)
     clock.lap("fields")
     summary = Summary()
     blocks = _merged(opened.blocks, detector, cluster_mm, summary)
@@ -133,6 +140,8 @@ def simulate_file(
             )
         summary.seconds = clock.seconds
         made = _made(detector, source, settings, cluster_mm, resolution, seed, summary)
+        made["impurity_from"] = impurity_from
+        made["depletion_V"] = fields.depletion_V
         writer.annotate({"simulation": json.dumps(made)})
     return summary
 
@@ -144,9 +153,20 @@ def _check(cluster_mm: float, resolution: Resolution | None) -> None:
         resolution.smear(np.zeros(0), seed=0)
 
 
-def _solve(detector: Detector, monitor: Monitor) -> FieldMaps:
+def solved(
+    detector: Detector, impurity_from: ImpurityFrom, monitor: Monitor
+) -> tuple[Detector, FieldMaps]:
+    """The detector with the impurities wanted, and its fields."""
     with monitor.stage(f"Fields of {detector.name}"):
-        return compute_fields(detector)
+        if impurity_from == "depletion":
+            detector = scaled_to_depletion(detector)
+        fields = compute_fields(detector)
+    if impurity_from == "depletion":
+        monitor.note(
+            f"{detector.name}: impurities times {detector.impurity_scale:.4g}, so that it "
+            f"depletes at the measured {detector.measured_depletion_V:g} V"
+        )
+    return detector, fields
 
 
 def _resolved(mode: Mode, expected_hits: float) -> Literal["exact", "library"]:
@@ -241,7 +261,7 @@ def _made(
     resolution: Resolution | None,
     seed: int,
     summary: Summary,
-) -> Mapping[str, Any]:
+) -> dict[str, Any]:
     """How the file was made, to be kept in it."""
     return {
         "cpunet": cpunet.__version__,

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.yaml_files import yaml_fields
 
 
 def load_settings(
@@ -51,12 +51,13 @@ def load_settings(
 
 def _mapping(path: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise CpunetError(f"{path}: cannot be read ({reason}); give a YAML file") from error
-    except yaml.YAMLError as error:
-        raise CpunetError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(content, dict):
-        raise CpunetError(f"{path}: holds no settings; write lines such as dt_ns: 16")
-    return content
+    return yaml_fields(
+        text,
+        str(path),
+        invalid="not YAML",
+        empty="holds no settings; write lines such as dt_ns: 16",
+    )

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
+from cpunet.yaml_files import parsed
 
 
 def recipe_names() -> list[str]:
@@ -55,7 +56,7 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
             f"recipe {name!r}: neither a file nor one of {', '.join(recipe_names())}"
         )
     try:
-        settings = yaml.safe_load(text)
+        settings = parsed(text)
     except yaml.YAMLError as error:
         raise CpunetError(
             f"recipe {name}: not YAML ({' '.join(str(error).split())})"

@@ -17,8 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 # siggen's rounded value, in all that is compared with it
 _SIGGEN_FWHM_PER_SIGMA = 2.355
-# 2.355**2 kT/e in siggen (V mm/cm, rounded there), with kT/e 0.12 after Jacoboni et al.,
-# PRB 24 (1981) 1014
+# 2.355**2 times 0.12 V mm/cm, rounded there
 _SIGGEN_DIFFUSION = 0.67
 _BOLTZMANN_V_PER_K = 8.617333e-5
 _SMALLEST_FWHM_MM = 0.01
@@ -26,14 +25,17 @@ _MAX_REPULSION = 0.05
 _CUT_FWHM = 2.0
 
 
-def diffusion_constant(mode: str, temperature_K: float) -> float:
+def diffusion_constant(chosen: float | str, temperature_K: float) -> float:
     """Growth of FWHM**2 / 2 per ns in units of v/E: mm2/ns over (mm/ns)/(V/cm).
 
-    ``mode`` is ``"temperature"`` (Einstein relation, D = kT/e v/E) or ``"siggen"``.
+    ``chosen`` is D/(v/E) in V mm/cm, ``"temperature"`` (Einstein relation, kT/e) or
+    ``"siggen"``; see `cpunet.simulation.settings.SimulationSettings`.
     """
-    if mode == "siggen":
+    if chosen == "siggen":
         return _SIGGEN_DIFFUSION
-    return FWHM_PER_SIGMA**2 * _BOLTZMANN_V_PER_K * temperature_K * 10.0
+    if chosen == "temperature":
+        chosen = _BOLTZMANN_V_PER_K * temperature_K * 10.0
+    return FWHM_PER_SIGMA**2 * float(chosen)
 
 
 def repulsion_constant(energy_kev: float) -> float:

@@ -51,9 +51,10 @@ def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> N
     """Keep them in the cache, whole or not at all; a cache that cannot be written is none."""
     arrays = {name: getattr(grid, name) for name in _OF_GRID}
     arrays |= {name: getattr(potentials, name) for name in _OF_NODES}
-    numbers = {"capacitance_pF": potentials.capacitance_pF, "depletion_V": depletion_V}
+    arrays["capacitance_pF"] = np.array(potentials.capacitance_pF)
+    arrays["depletion_V"] = np.array(depletion_V)
     try:
         with written_aside(cache_file(key)) as aside:
-            np.savez(aside, **arrays, **numbers)
+            np.savez(aside, allow_pickle=False, **arrays)
     except CpunetError:
         return  # a read-only home must not stop a simulation

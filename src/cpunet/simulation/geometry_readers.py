@@ -12,12 +12,18 @@ from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.legend_crystal import impurity_values
+from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
 from cpunet.yaml_files import yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
+_Z0 = "impurity_z0_1e10_per_cm3"
+
+# why a file does not give a field
+_Hints = dict[str, str]
 
 
 def detector_names() -> list[str]:
@@ -25,7 +31,9 @@ def detector_names() -> list[str]:
     return yaml_names(_FOLDER)
 
 
-def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
+def read_detector(
+    path: str | Path, overrides: Iterable[str] = (), crystal: str | Path | None = None
+) -> Detector:
     """Read a detector, and add or override single values.
 
     Parameters
@@ -35,13 +43,16 @@ def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
         LEGEND diode (YAML or JSON, with a ``geometry``), or, by any other suffix, a
         siggen or fieldgen configuration.
     overrides
-        ``"bias_V=3500"`` and the like.  They also give what a file does not hold: most
-        LEGEND diodes lack ``temperature_K``, some the impurities.
+        ``"bias_V=3500"`` and the like.  They also give what a file does not hold: LEGEND
+        diodes lack ``temperature_K``.
+    crystal
+        LEGEND's file of the crystal that a diode was cut from, with its impurities.  By
+        default ``crystals/V99000.yaml`` beside the folder of ``V99000A.yaml``.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read, or the detector is impossible.
+        If a file cannot be read, or the detector is impossible.
 
     Examples
     --------
@@ -50,10 +61,18 @@ def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
     (96.0, 3500.0)
     """
     name = str(path)
+    hints: _Hints = {}
     if name in detector_names():
-        values = _mapping((_FOLDER / f"{name}.yaml").read_text("utf-8"), name)
+        values = _mapping((_FOLDER / f"{name}.yaml").read_text("utf-8"), f"detector {name}")
     else:
         values = _from_file(Path(path))
+    if "geometry" in values:
+        values, hints = _legend(values, Path(path), crystal)
+    elif crystal is not None:
+        raise CpunetError(
+            f"detector {name}: only LEGEND metadata take their impurities from another "
+            "file; leave out --crystal"
+        )
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
@@ -65,7 +84,7 @@ def read_detector(path: str | Path, overrides: Iterable[str] = ()) -> Detector:
     try:
         return Detector.model_validate({"name": Path(name).stem, **values})
     except ValidationError as error:
-        raise CpunetError(f"detector {name}: {_first_problem(error)}") from error
+        raise CpunetError(f"detector {name}: {_first_problem(error, hints)}") from error
 
 
 def _from_file(path: Path) -> dict[str, Any]:
@@ -79,23 +98,57 @@ def _from_file(path: Path) -> dict[str, Any]:
         raise CpunetError(f"detector {path}: cannot be read as text ({error})") from error
     if path.suffix.lower() not in _MAPPINGS:
         return siggen_values(text, str(path))
-    values = _mapping(text, str(path))
-    return legend_values(values, str(path)) if "geometry" in values else values
+    return _mapping(text, f"detector {path}")
 
 
-def _mapping(text: str, name: str) -> dict[str, Any]:
+def _legend(
+    diode: dict[str, Any], path: Path, crystal: str | Path | None
+) -> tuple[dict[str, Any], _Hints]:
+    """Values of a LEGEND diode and its crystal, and why some are missing."""
+    values = legend_values(diode, str(path))
+    crystal_name, slice_name = crystal_and_slice(diode, path.stem)
+    places = [
+        folder / f"{crystal_name}{suffix}"
+        for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
+        for suffix in _MAPPINGS
+    ]
+    found = Path(crystal) if crystal else next((p for p in places if p.is_file()), None)
+    hints = {field: why for field in Detector.model_fields if (why := why_missing(field))}
+    hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
+    if found is None:
+        return values, hints
+    try:
+        text = found.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CpunetError(f"crystal {found}: cannot be read as text ({error})") from error
+    content = _mapping(text, f"crystal {found}")
+    hints[_Z0] = f"production.impcc is empty or 0, and {found} has no impurity_curve"
+    if content.get("impurity_curve") is None and crystal is None:
+        return values, hints
+    length = values["crystal_length"]
+    if not isinstance(length, int | float):
+        return values, hints  # refused with the rest of the geometry
+    # the curve is of all the crystal: nothing of a line through a few points remains
+    values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
+    return values | impurity_values(content, f"crystal {found}", slice_name, length), hints
+
+
+def _mapping(text: str, source: str) -> dict[str, Any]:
     return yaml_fields(
         text,
-        f"detector {name}",
+        source,
         invalid="no valid YAML or JSON",
         empty="holds no keys; see the examples in detectors/",
     )
 
 
-def _first_problem(error: ValidationError) -> str:
+def _first_problem(error: ValidationError, hints: _Hints) -> str:
     """The first of pydantic's complaints in a line that names the key."""
     first = error.errors(include_url=False)[0]
     key = ".".join(map(str, first["loc"]))
+    if first["type"] == "missing" and key in hints:
+        crystal = "give the crystal's file with --crystal, or " if key == _Z0 else "give "
+        return f"no {key} ({hints[key]}); {crystal}--set {key}=VALUE"
     if first["type"] == "missing":
         return f"no {key}; add it to the file, or give {key}=VALUE"
     if first["type"] == "extra_forbidden":

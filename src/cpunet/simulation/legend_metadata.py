@@ -38,22 +38,44 @@ _REQUIRED = (
     "pp_contact.radius_in_mm",
     "pp_contact.depth_in_mm",
 )
-_BIAS = (
-    "characterization.l200_site.recommended_voltage_in_V",
-    "characterization.manufacturer.recommended_voltage_in_V",
+# the detector's field, and where it is; the first that is above 0 counts
+_MEASURED = {
+    "bias_V": (
+        "characterization.l200_site.recommended_voltage_in_V",
+        "characterization.manufacturer.recommended_voltage_in_V",
+    ),
+    "measured_depletion_V": (
+        "characterization.l200_site.depletion_voltage_in_V",
+        "characterization.manufacturer.depletion_voltage_in_V",
+    ),
+    "li_thickness": (
+        "characterization.combined_0vbb_analysis.fccd_in_mm.value",
+        "characterization.manufacturer.dl_thickness_in_mm",
+    ),
+}
+_NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
+_SIMULATED = ("icpc", "bege", "ppc")
+_IMPCC = (
+    "production.impcc.array needs equally long value_in_1e9e/cm3 and "
+    "dist_from_contact_in_mm at different distances; correct it, or remove it and give the "
+    "crystal's file with --crystal"
 )
-_LITHIUM = (
-    "characterization.combined_0vbb_analysis.fccd_in_mm.value",
-    "characterization.manufacturer.dl_thickness_in_mm",
-)
+
+
+def why_missing(field: str) -> str:
+    """Why a diode does not give a field of `Detector`; empty for those it need not give."""
+    if field in _MEASURED:
+        return f"neither {' nor '.join(_MEASURED[field])} is above 0"
+    return "LEGEND diodes do not tell it" if field == "temperature_K" else ""
 
 
 def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Fields of `Detector` from a LEGEND diode; those it does not hold are left out.
 
-    Impurities come from ``production.impcc`` (a straight line through its points,
-    net acceptors counted as negative), the bias and the lithium's thickness
-    from ``characterization``.
+    Bias, measured depletion voltage and the lithium's thickness (the full charge
+    collection depth, FCCD) come from ``characterization``, where 0 means unknown;
+    impurities from ``production.impcc`` (a straight line through its points, net
+    acceptors counted as negative), unless all its values are 0.
 
     Raises
     ------
@@ -61,9 +83,12 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
         If the geometry has a key that is not known (as without its unit), lacks one, or
         is not axially symmetric.
     """
-    if diode.get("type") not in (None, "icpc", "bege", "ppc"):
+    kind = diode.get("type")
+    if kind is not None and kind not in _SIMULATED:
+        why = f" ({_NOT_SIMULATED[kind]})" if kind in _NOT_SIMULATED else ""
         raise CpunetError(
-            f"detector {name}: type {diode['type']!r} is not simulated; icpc, bege and ppc are"
+            f"detector {name}: type {kind!r} is not simulated{why}; give one of type "
+            f"{', '.join(_SIMULATED)}"
         )
     geometry = _flat(diode["geometry"], name)
     for key in _REQUIRED:
@@ -81,11 +106,17 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     outer, inner = (geometry.get(f"groove.radius_in_mm.{x}", 0) for x in ("outer", "inner"))
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = _number(outer, name) - _number(inner, name)
-    for field, places in (("bias_V", _BIAS), ("li_thickness", _LITHIUM)):
+    for field, places in _MEASURED.items():
         found = [v for v in (_at(diode, p) for p in places) if isinstance(v, int | float)]
-        if found:
-            values[field] = found[0]
+        if known := [v for v in found if v > 0]:
+            values[field] = known[0]
     return values | _impurities(diode, name)
+
+
+def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
+    """Name of the crystal that a diode was cut from, and its slice: V99000A is A of V99000."""
+    diode_name = str(diode.get("name", name))
+    return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
 
 
 def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
@@ -96,12 +127,16 @@ def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
     try:
         value = -np.abs(np.array(table[key], float)) / 10  # 1e9 to 1e10 / cm3
         z_cm = np.array(table["dist_from_contact_in_mm"], float) / 10
-        slope, offset = np.polyfit(z_cm, value, 1) if len(z_cm) > 1 else (0.0, value[0])
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise CpunetError(
-            f"detector {name}: production.impcc.array needs equally long "
-            "value_in_1e9e/cm3 and dist_from_contact_in_mm; correct or remove it"
-        ) from error
+    except (KeyError, ValueError, TypeError) as error:
+        raise CpunetError(f"detector {name}: {_IMPCC}") from error
+    if not np.any(value):
+        return {}  # placeholders: today's files have the impurities with the crystal
+    apart = len(np.unique(z_cm)) == len(z_cm)
+    if value.shape != z_cm.shape or value.ndim != 1 or not apart:
+        raise CpunetError(f"detector {name}: {_IMPCC}")
+    slope, offset = np.polyfit(z_cm, value, 1) if len(z_cm) > 1 else (0.0, value[0])
+    if not np.isfinite([slope, offset]).all():
+        raise CpunetError(f"detector {name}: {_IMPCC}")
     return {
         "impurity_z0_1e10_per_cm3": float(offset),
         "impurity_gradient_1e10_per_cm4": float(slope),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cpunet.recipes.base import Config, NonNegative, Positive
 
@@ -23,8 +24,11 @@ class SimulationSettings(Config):
     diffusion
         Let the charge cloud grow by diffusion.
     diffusion_constant
-        ``"temperature"``: kT/e at the crystal's temperature; ``"siggen"``: siggen's
-        0.12 V mm/cm, and its rounding of the cloud's duration to whole steps.
+        D/(v/E), diffusivity over mobility, in V mm/cm.  The 0.12 of siggen follows the
+        longitudinal diffusion measured at the fields of a detector, where carriers are
+        hotter than the crystal.  ``"temperature"``: kT/e at the crystal's temperature
+        (0.078 at 90 K), the limit of weak fields; ``"siggen"``: 0.12 with siggen's
+        roundings, of the number and of the cloud's duration to whole steps.
     cloud_fwhm_mm
         Width of the charge cloud when it is set free.
     self_repulsion
@@ -46,7 +50,7 @@ class SimulationSettings(Config):
     dt_ns: Positive = 16.0
     length_ns: Positive = 3600.0
     diffusion: bool = True
-    diffusion_constant: Literal["temperature", "siggen"] = "temperature"
+    diffusion_constant: Positive | Literal["temperature", "siggen"] = 0.12
     cloud_fwhm_mm: NonNegative = 0.1
     self_repulsion: bool = False
     library_grid_mm: Positive = 2.0
@@ -69,6 +73,17 @@ class SimulationSettings(Config):
     def steps_per_sample(self) -> int:
         """Steps of the drift in one sample."""
         return round(self.dt_ns / self.step_ns)
+
+    @field_validator("diffusion_constant", mode="before")
+    @classmethod
+    def _known_diffusion(cls, value: Any) -> Any:
+        try:
+            known = value in ("temperature", "siggen") or 0 < float(value) < math.inf
+        except (TypeError, ValueError):
+            known = False
+        if not known or isinstance(value, bool):
+            raise ValueError("give a number above 0 in V mm/cm, temperature or siggen")
+        return value
 
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:
