@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,24 +20,27 @@ from cpunet.simulation.gammas import (
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.processes import compton_energy
 from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
 
 
-@dataclass(frozen=True)
-class Crystal:
+def crystal(**changed: float) -> Detector:
     """The crystal of the Geant4 reference: a cylinder with a bore."""
-
-    crystal_length: float = 96.0
-    crystal_radius: float = 40.5
-    bore_length: float = 69.9
-    bore_radius: float = 5.0
-    bore_bullet_radius: float = 0.0
-    outer_taper_length: float = 0.0
-    inner_taper_length: float = 0.0
-    taper_angle_deg: float = 0.0
-    wrap_around_radius: float = 14.0
-    ditch_depth: float = 0.0
-    ditch_thickness: float = 3.0
+    values: dict[str, float] = {
+        "crystal_length": 96.0,
+        "crystal_radius": 40.5,
+        "bore_length": 69.9,
+        "bore_radius": 5.0,
+        "wrap_around_radius": 14.0,
+        "point_contact_length": 2.0,
+        "point_contact_radius": 2.3,
+        "li_thickness": 1.0,
+        "impurity_z0_1e10_per_cm3": -1.8,
+        "bias_V": 4000.0,
+        "temperature_K": 90.0,
+    }
+    return Detector.model_validate(values | changed)
 
 
 LINES = {
@@ -52,7 +54,7 @@ GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199,
 
 def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, GammaStatistics]:
     return simulate_gammas(
-        Crystal(),
+        crystal(),
         source_height_mm=height,
         source_radius_mm=5,
         n_primaries=n,
@@ -117,13 +119,62 @@ def test_sites_agree_with_geant4() -> None:
 
 def test_hits_lie_in_germanium_and_never_exceed_the_line() -> None:
     hits, seen = run(20, 5_000)
-    shape = CrystalShape.of(Crystal())
+    shape = CrystalShape.of(crystal())
     assert all(
         in_germanium(shape, *place)
         for place in hits.position_mm[:: max(len(hits.edep_kev) // 3000, 1)]
     )
     assert hits.energy_kev.max() <= TL208_KEV + 1e-6
     assert hits.n_events == seen.spectrum.sum()
+
+
+# each shape has something at both ends, with walls beside the grid's lines
+SHAPES: dict[str, Detector] = {name: read_detector(name) for name in detector_names()} | {
+    "bullets": crystal(top_bullet_radius=6, bottom_bullet_radius=9, bore_bullet_radius=3),
+    "tapers": crystal(
+        outer_taper_length=60, taper_angle_deg=12, inner_taper_length=69.9,
+        inner_taper_angle_deg=5, bore_bullet_radius=4.5, bottom_taper_length=11,
+        bottom_taper_angle_deg=35,
+    ),
+    "ditch": crystal(
+        ditch_depth=3.3, ditch_thickness=5.5, bottom_bullet_radius=7, outer_taper_length=30,
+        taper_angle_deg=8, siggen_conventions=False,
+    ),
+    "low": crystal(
+        crystal_length=30, bore_length=0, bore_radius=0, ditch_depth=2, ditch_thickness=3,
+        top_bullet_radius=4, bottom_taper_length=5, bottom_taper_angle_deg=60, grid_mm=0.5,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
+def test_the_transport_has_the_outline_of_the_detector(detector: Detector) -> None:
+    shape, rng = CrystalShape.of(detector), np.random.default_rng(2)
+    # half of the places lie near the bottom, the top or the wall
+    u = rng.random((3, 4000))
+    z = (u[0] * 1.02 - 0.01) * detector.crystal_length
+    z[:1000] = u[0, :1000] * 12 - 0.5
+    r = detector.crystal_radius * 1.01 * np.sqrt(u[1])
+    r[1000:2000] = detector.crystal_radius - 9.5 + 10 * u[1, 1000:2000]
+    phi = 2 * np.pi * u[2]
+    mine = [
+        in_germanium(shape, *p) for p in zip(r * np.cos(phi), r * np.sin(phi), z, strict=True)
+    ]
+    # surfaces belong to the detector, and rounding may put a place on either side of them
+    nearly = detector.inside(r[:, None] + [-1e-5, 1e-5, 0, 0], z[:, None] + [0, 0, -1e-5, 1e-5])
+    clear = nearly.all(axis=1) | ~nearly.any(axis=1)
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(np.array(mine)[clear], detector.inside(r, z)[clear])
+
+
+@pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
+def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
+    for height in (1.0, 80.0):
+        hits, _ = simulate_gammas(
+            detector, source_height_mm=height, source_radius_mm=20, n_primaries=20_000, seed=7
+        )
+        assert len(hits.edep_kev) > 100_000
+        assert detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).all()
 
 
 def test_the_same_seed_gives_the_same_events() -> None:
@@ -181,12 +232,13 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
 
 def test_tapers_bore_and_ditch_are_cut_out() -> None:
     shape = CrystalShape.of(
-        Crystal(
+        crystal(
             bore_bullet_radius=5,
             outer_taper_length=35,
             inner_taper_length=20,
             taper_angle_deg=10,
             ditch_depth=2,
+            ditch_thickness=3,
         )
     )
     inside = {(0, 20): True, (0, 26.2): False, (4.5, 26.2): True, (4.5, 50): False}

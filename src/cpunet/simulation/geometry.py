@@ -94,9 +94,11 @@ class Detector(Config):
 
     def _problems(self) -> Iterable[str]:
         length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        top_radius = radius - self.outer_taper_length * math.tan(self._angles[0])
-        bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(self._angles[1])
-        bottom_radius = radius - self.bottom_taper_length * math.tan(self._angles[2])
+        top_radius = radius - self.outer_taper_length * math.tan(self.taper_angles_rad[0])
+        bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(
+            self.taper_angles_rad[1]
+        )
+        bottom_radius = radius - self.bottom_taper_length * math.tan(self.taper_angles_rad[2])
         ditch_inner = self.wrap_around_radius - self.ditch_thickness
         if 2 * li >= min(length, radius):
             yield "li_thickness leaves nothing of the crystal"
@@ -147,7 +149,7 @@ class Detector(Config):
             yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
 
     @property
-    def _angles(self) -> tuple[float, float, float]:
+    def taper_angles_rad(self) -> tuple[float, float, float]:
         """Angles of the outer, bore and bottom tapers in rad."""
         inner = self.inner_taper_angle_deg
         inner = self.taper_angle_deg if inner is None else inner
@@ -242,7 +244,7 @@ class Detector(Config):
         return np.asarray(within)
 
     def _outer_radius(self, z: FloatArray, shift: float) -> FloatArray:
-        top, _, bottom = self._angles
+        top, _, bottom = self.taper_angles_rad
         into_top = z - (self.crystal_length - self.outer_taper_length)
         into_bottom = self.bottom_taper_length - z
         straight = np.full_like(z, self.crystal_radius - shift)
@@ -268,7 +270,7 @@ class Detector(Config):
         radius = np.full_like(z, self.bore_radius + shift)
         if self.inner_taper_length:
             into_taper = z - (self.crystal_length - self.inner_taper_length)
-            radius += self._taper(into_taper, self._angles[1], shift)
+            radius += self._taper(into_taper, self.taper_angles_rad[1], shift)
         across, along = r - (self.bore_radius - bullet), end + bullet - z
         corner = (across > 0) & (along > 0)
         rounded = np.hypot(across, along) <= bullet + shift

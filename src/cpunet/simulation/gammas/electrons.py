@@ -45,14 +45,20 @@ def put_photon(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float) -> bool:
-    """Whether everything within `reach` (mm) surely is germanium (bore and ditch aside)."""
+    """Whether everything within `reach` (mm) surely is germanium: false nearby a surface."""
     r = math.sqrt(x * x + y * y)
-    narrowing = max(z + reach - shape.outer_taper_start, 0.0) * shape.taper_slope
     if z - reach < shape.ditch_depth or z + reach > shape.length:
         return False
-    if r + reach > shape.radius - narrowing:
+    narrowing = max(z + reach - shape.outer_taper_start, 0.0) * shape.outer_taper_slope
+    if z + reach > shape.length - shape.top_bullet:
+        narrowing = max(narrowing, shape.top_bullet)
+    if z - reach < shape.bottom_bullet:
+        narrowing = max(narrowing, shape.bottom_bullet)
+    below = max(shape.bottom_taper_end - z + reach, 0.0) * shape.bottom_taper_slope
+    if r + reach > shape.radius - narrowing - below:
         return False
-    widest = shape.bore_radius + (shape.length - shape.inner_taper_start) * shape.taper_slope
+    widest = shape.bore_radius
+    widest += (shape.length - shape.inner_taper_start) * shape.inner_taper_slope
     return z + reach < shape.bore_end or r - reach > widest
 
 

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
-from cpunet.simulation.gammas.shape import CrystalDimensions, CrystalShape
+from cpunet.simulation.gammas.shape import CrystalShape
 from cpunet.simulation.gammas.transport import MOST_HITS, Source, simulate_block
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 
 TL208_KEV = 2614.511
@@ -52,7 +53,7 @@ class GammaStatistics:
 
 
 def simulate_gammas(
-    detector: CrystalDimensions,
+    detector: Detector,
     *,
     source_height_mm: float,
     source_radius_mm: float,
@@ -73,7 +74,7 @@ def simulate_gammas(
     Parameters
     ----------
     detector
-        Dimensions of the crystal in mm.
+        The crystal; its lithium layer is germanium like the rest.
     source_height_mm, source_radius_mm
         Height of the disc above the crystal's top (z = crystal length), and its radius.
     n_primaries

@@ -3,36 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numba
 
-
-class CrystalDimensions(Protocol):
-    """What the transport needs to know of a detector; lengths in mm."""
-
-    @property
-    def crystal_length(self) -> float: ...
-    @property
-    def crystal_radius(self) -> float: ...
-    @property
-    def bore_length(self) -> float: ...
-    @property
-    def bore_radius(self) -> float: ...
-    @property
-    def bore_bullet_radius(self) -> float: ...
-    @property
-    def outer_taper_length(self) -> float: ...
-    @property
-    def inner_taper_length(self) -> float: ...
-    @property
-    def taper_angle_deg(self) -> float: ...
-    @property
-    def wrap_around_radius(self) -> float: ...
-    @property
-    def ditch_depth(self) -> float: ...
-    @property
-    def ditch_thickness(self) -> float: ...
+from cpunet.simulation.geometry import Detector
 
 
 class CrystalShape(NamedTuple):
@@ -45,30 +20,42 @@ class CrystalShape(NamedTuple):
     radius: float
     bore_radius: float
     bore_end: float
-    bullet_radius: float
+    bore_bullet: float
     outer_taper_start: float
+    outer_taper_slope: float
     inner_taper_start: float
-    taper_slope: float
+    inner_taper_slope: float
+    bottom_taper_end: float
+    bottom_taper_slope: float
+    top_bullet: float
+    bottom_bullet: float
     ditch_inner: float
     ditch_outer: float
     ditch_depth: float
 
     @classmethod
-    def of(cls, detector: CrystalDimensions) -> CrystalShape:
-        """The outline of a detector, Li layer included; other bullets are left out."""
+    def of(cls, detector: Detector) -> CrystalShape:
+        """The outline of a detector, lithium layer included: that of `Detector.inside`."""
         length = detector.crystal_length
+        outer, inner, bottom = (math.tan(angle) for angle in detector.taper_angles_rad)
+        ditch_inner, ditch_outer, ditch_depth = detector.ditch_walls
         return cls(
             length=float(length),
             radius=float(detector.crystal_radius),
             bore_radius=float(detector.bore_radius),
             bore_end=float(length - detector.bore_length),
-            bullet_radius=float(min(detector.bore_bullet_radius, detector.bore_radius)),
+            bore_bullet=float(detector.bore_bullet_radius),
             outer_taper_start=float(length - detector.outer_taper_length),
+            outer_taper_slope=outer,
             inner_taper_start=float(length - detector.inner_taper_length),
-            taper_slope=math.tan(math.radians(detector.taper_angle_deg)),
-            ditch_inner=float(detector.wrap_around_radius - detector.ditch_thickness),
-            ditch_outer=float(detector.wrap_around_radius),
-            ditch_depth=float(detector.ditch_depth),
+            inner_taper_slope=inner,
+            bottom_taper_end=float(detector.bottom_taper_length),
+            bottom_taper_slope=bottom,
+            top_bullet=float(detector.top_bullet_radius),
+            bottom_bullet=float(detector.bottom_bullet_radius),
+            ditch_inner=float(ditch_inner),
+            ditch_outer=float(ditch_outer),
+            ditch_depth=float(ditch_depth),
         )
 
 
@@ -78,7 +65,7 @@ def in_germanium(shape: CrystalShape, x: float, y: float, z: float) -> bool:
     if z < 0.0 or z > shape.length:
         return False
     r = math.sqrt(x * x + y * y)
-    if r > shape.radius - max(z - shape.outer_taper_start, 0.0) * shape.taper_slope:
+    if r > _outer_wall(shape, z):
         return False
     if z < shape.ditch_depth and shape.ditch_inner < r < shape.ditch_outer:
         return False
@@ -86,15 +73,37 @@ def in_germanium(shape: CrystalShape, x: float, y: float, z: float) -> bool:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _outer_wall(shape: CrystalShape, z: float) -> float:
+    """Radius of the crystal at a height; tapers and bullets are never on the same end."""
+    into_top = z - shape.length + shape.top_bullet
+    into_bottom = shape.bottom_bullet - z
+    wall = shape.radius
+    wall -= max(z - shape.outer_taper_start, 0.0) * shape.outer_taper_slope
+    wall -= max(shape.bottom_taper_end - z, 0.0) * shape.bottom_taper_slope
+    if into_top > 0.0:
+        wall -= _rounded_off(shape.top_bullet, into_top)
+    if into_bottom > 0.0:
+        wall -= _rounded_off(shape.bottom_bullet, into_bottom)
+    return wall
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rounded_off(bullet: float, depth: float) -> float:
+    """What a quarter circle of radius `bullet` takes off a wall `depth` after it begins."""
+    return bullet - math.sqrt(max(bullet * bullet - depth * depth, 0.0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_bore(shape: CrystalShape, r: float, z: float) -> bool:
     above = z - shape.bore_end
     if above <= 0.0:
         return False
-    wall = shape.bore_radius + max(z - shape.inner_taper_start, 0.0) * shape.taper_slope
-    if above < shape.bullet_radius:
+    wall = shape.bore_radius
+    wall += max(z - shape.inner_taper_start, 0.0) * shape.inner_taper_slope
+    if above < shape.bore_bullet:
         # the end of the bore is rounded off with this radius
-        missing = shape.bullet_radius - above
-        wall += math.sqrt(shape.bullet_radius**2 - missing**2) - shape.bullet_radius
+        end = shape.bore_radius - _rounded_off(shape.bore_bullet, shape.bore_bullet - above)
+        wall = min(wall, end)
     return r < wall
 
 
