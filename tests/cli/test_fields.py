@@ -28,6 +28,21 @@ def test_numbers_of_a_detector(command):
     assert 0 < low < 300 < 1000 < high
 
 
+def test_impurities_from_the_measured_depletion(command):
+    measured = ["--set", "measured_depletion_V=2200"]
+    outcome = command("fields", "ppc", *COARSE, *measured, "--impurity-from", "depletion")
+    assert outcome.code == 0
+    told = dict(line.split("  ", 1) for line in outcome.out.splitlines())
+    told = {name.strip(): value.strip() for name, value in told.items()}
+    assert told["measured depletion"] == "2200 V"
+    assert float(told["depletion voltage"].split()[0]) == pytest.approx(2200, abs=1)
+    # given by hand, the scale leads to the same fields
+    scale = ["--set", f"impurity_scale={told['impurity_scale']}"]
+    again = command("fields", "ppc", *COARSE, *measured, *scale)
+    assert again.out.splitlines()[1:3] == outcome.out.splitlines()[1:3]
+    assert again.out.splitlines()[4] == outcome.out.splitlines()[4]
+
+
 @pytest.mark.parametrize("name", ["icpc", "bege", "ppc"])
 def test_a_picture_of_each_detector(command, tmp_path: Path, name: str):
     out = tmp_path / "fields.png"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
+from cpunet.jobs.simulate import LIBRARY_FROM_HITS
 from cpunet.pulses.reading import open_pulses
 
 PPC = ["--detector", "ppc", "--set", "grid_mm=0.5"]
@@ -72,6 +75,46 @@ def test_diffusion_widens_the_edge(command, hits: Path, tmp_path: Path):
     assert steepest[0] < steepest[1]
 
 
+def test_the_diffusion_constant_is_kept_and_widens_the_edge(
+    command, hits: Path, tmp_path: Path
+):
+    out = tmp_path / "sim.lh5"
+    steepest = {}
+    for constant in ("temperature", "0.12", "siggen"):
+        words = ["--hits", hits, "--dt", "1", "--diffusion-constant", constant]
+        assert command("simulate", *PPC, *words, "--out", out, "--force").code == 0
+        with h5py.File(out) as file:
+            made = json.loads(file["geds/sim"].attrs["simulation"])
+        kept = made["settings"]["diffusion_constant"]
+        assert kept == (float(constant) if constant == "0.12" else constant)
+        steepest[constant] = np.diff(next(open_pulses(out).blocks()).waveforms).max()
+    # kT/e is 0.073 V mm/cm at 85 K; siggen counts up the cloud's duration
+    assert steepest["siggen"] < steepest["0.12"] < steepest["temperature"]
+
+
+def test_help_names_the_number_of_hits_that_decides(command):
+    shown = " ".join(command("simulate", "--help").out.replace("│", " ").split())
+    assert f"exact below {LIBRARY_FROM_HITS:,} hits" in shown
+
+
+def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data, tmp_path):
+    metadata, out = reference_data / "legend-metadata", tmp_path / "sim.lh5"
+    crystal = metadata / "crystals" / "V99000.yaml"
+    words = ["--detector", metadata / "diodes" / "P99000A.yaml", "--set", "grid_mm=0.5"]
+    words += ["--hits", hits, "--temperature", "85", "--out", out]
+    assert "give the crystal's file with --crystal" in command("simulate", *words).err
+    words += ["--crystal", crystal, "--impurity-from", "depletion", "--set", "bias_V=3300"]
+    outcome = command("simulate", *words)
+    assert outcome.code == 0
+    assert "so that it depletes at the measured 3000 V" in outcome.err
+    with h5py.File(out) as file:
+        made = json.loads(file["geds/sim"].attrs["simulation"])
+    assert made["impurity_from"] == "depletion"
+    assert made["detector"]["measured_depletion_V"] == 3000
+    # simulated with the maker's impurities, P99000A would deplete at some 2260 V
+    assert 1.2 < made["detector"]["impurity_scale"] < 1.5
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -88,6 +131,9 @@ def test_diffusion_widens_the_edge(command, hits: Path, tmp_path: Path):
         (["--events", "5", "--resolution=-1,0"], "give numbers from 0 up"),
         (["--events", "5", "--set", "bias_V=900"], "does not deplete it"),
         (["--events", "5", "--temperature", "300"], "temperature_K"),
+        (["--events", "5", "--diffusion-constant", "hot"], "diffusion_constant: give a number"),
+        (["--events", "5", "--impurity-from", "depletion"], "no measured_depletion_V"),
+        (["--events", "5", "--crystal", "x.yaml"], "leave out --crystal"),
         (["--hits", "nowhere.lh5"], "nowhere.lh5: cannot be read"),
         (["--hits", "x", "--origin", "1,2"], "--origin 1,2: expected 3 numbers"),
     ],

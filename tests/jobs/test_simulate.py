@@ -185,6 +185,64 @@ def test_hits_all_outside_say_where_they_are(ppc, source):
         away.open(ppc)
 
 
+class Told(Monitor):
+    """Keeps the lines that a job tells."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+def test_hits_outside_are_told(ppc, source, tmp_path: Path):
+    told = Told()
+    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS, monitor=told)
+    # one of five, at z = 300 mm
+    assert told.notes == [
+        f"warning: {source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
+        "mm); they span x 0 to 12, y 0 to 3, z 20 to 300 mm; their energy is lost; check "
+        "--origin, --flip-z and --hits-detector"
+    ]
+
+
+@pytest.mark.parametrize(("outside", "said"), [(1, ""), (2, "2 of 1002 (0.2%) hits")])
+def test_a_stray_hit_draws_no_warning(ppc, tmp_path: Path, outside: int, said: str):
+    places = [[10.0, 0, 20 + 0.01 * i] for i in range(1000)] + [[0.0, 0, 47]] * outside
+    hits = Hits.of(places, np.ones(len(places)), range(len(places) + 1))
+    warning = HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc).warning
+    assert said in warning
+    assert bool(said) == bool(warning)
+
+
+def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
+    places = [[10, 0, 20], *([10, 0, -20 - i] for i in range(10))]
+    hits = Hits.of(places, np.ones(11), range(12))
+    with pytest.raises(CpunetError, match=r"10 of 11 \(90.9%\) hits lie outside ppc .* move"):
+        HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc)
+
+
+def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path):
+    out, told = tmp_path / "sim.lh5", Told()
+    known = ppc.model_copy(update={"measured_depletion_V": 2100.0})
+    simulate_file(known, source, out, SETTINGS, impurity_from="depletion", monitor=told)
+    made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])
+    scale = made["detector"]["impurity_scale"]
+    assert (made["impurity_from"], made["depletion_V"]) == (
+        "depletion",
+        pytest.approx(2100, abs=1),
+    )
+    assert scale > 1.05
+    assert any(f"impurities times {scale:.4g}" in note for note in told.notes)
+    # what is kept is the detector that was simulated
+    again = tmp_path / "again.lh5"
+    simulate_file(Detector.model_validate(made["detector"]), source, again, SETTINGS)
+    first, second = (next(open_pulses(path).blocks()) for path in (out, again))
+    assert np.array_equal(first.waveforms, second.waveforms)
+    plain = json.loads(h5py.File(again)["geds/sim"].attrs["simulation"])
+    assert plain["impurity_from"] == "file"
+
+
 def test_no_event_with_a_signal(ppc, tmp_path: Path):
     dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
     with pytest.raises(CpunetError, match="none of 1 events gives a signal"):
@@ -227,9 +285,26 @@ def test_settings_of_a_file_and_on_top(tmp_path: Path):
     assert (settings.dt_ns, settings.length_ns, settings.diffusion) == (8, 1600, True)
 
 
+def test_settings_in_json_indented_by_tabs(tmp_path: Path):
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps({"dt_ns": 8, "diffusion_constant": "siggen"}, indent="\t"))
+    settings = load_settings(path)
+    assert (settings.dt_ns, settings.diffusion_constant) == (8, "siggen")
+
+
+def test_the_diffusion_is_that_of_the_field_unless_told():
+    assert load_settings().diffusion_constant == 0.12
+    assert load_settings(values={"diffusion_constant": "0.09"}).diffusion_constant == 0.09
+    kept = SimulationSettings(diffusion_constant="temperature").model_dump(mode="json")
+    assert SimulationSettings.model_validate(kept).diffusion_constant == "temperature"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("diffusion_constant: hot", "diffusion_constant: give a number above 0"),
+        ("diffusion_constant: 0", "diffusion_constant: give a number above 0"),
+        ("diffusion_constant: [1]", "diffusion_constant: give a number above 0"),
         ("dt: 8", "dt: no such setting; there are step_ns"),
         ("dt_ns: 1.5", "dt_ns must be a multiple"),
         ("- 3", "holds no settings"),
