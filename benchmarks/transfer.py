@@ -59,15 +59,13 @@ def main() -> None:
         sides = [InputFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
         train_run(sides[0], sides[1], known, load_recipe("fast"), device="cpu")
         few = few_of(data, arguments.pulses, folder)
-        # no more simulated pulses than the measured ones can tell
-        less = [f"training.max_pulses={2 * arguments.pulses}", "training.noise_sets=1"]
-        for title, start, measured, overrides in (
-            ("fresh, all pulses", None, data, []),
-            (f"fresh, {arguments.pulses} pulses", None, few, less),
-            (f"from the other, {arguments.pulses} pulses", known, few, less),
+        for title, start, measured in (
+            ("fresh, all pulses", None, data),
+            (f"fresh, {arguments.pulses} pulses", None, few),
+            (f"from the other, {arguments.pulses} pulses", known, few),
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
-            recipe = load_recipe("fast", overrides)
+            recipe = load_recipe("fast")
             info = train_run(sim, measured, run, recipe, init=start, device="cpu")
             scored = evaluate(
                 run,

@@ -188,7 +188,7 @@ def test_wrong_settings_are_named(override, part):
         ("training.start_factors=[]", "training.start_factors: "),
         ("training.segments=[0.5, 1]", "training.segments.0: "),
         ("training.baseline=[230]", "training.baseline"),
-        ("training.max_pulses=99", "training.max_pulses: "),
+        ("training.search_pulses=99", "training.search_pulses: "),
         ("generator.poles_ns=[]", "generator.poles_ns: "),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
         ("generator.ringing_mhz=0", "generator.ringing_mhz: "),

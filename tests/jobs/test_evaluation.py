@@ -29,7 +29,6 @@ RECIPE = load_recipe(
         "training.squares=2",
         "training.start_factors=[1]",
         "training.ringing_mhz=[]",
-        "training.noise_sets=1",
     ],
 )
 KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}

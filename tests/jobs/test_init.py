@@ -23,7 +23,6 @@ FAST = load_recipe(
         "training.squares=2",
         "training.start_factors=[1]",
         "training.ringing_mhz=[]",
-        "training.noise_sets=1",
         "generator.slow_ns=[]",
         "generator.fast_decays_us=[]",
     ],

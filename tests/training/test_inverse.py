@@ -18,6 +18,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.training import inverse as inverse_module
 from cpunet.training.inverse import fit_inverse
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50, 50]", "generator.decay_us=60"])
@@ -215,8 +216,9 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     )
 
 
-def test_many_pulses_are_thinned_out_by_the_seed():
-    recipe = load_recipe("fast", ["training.max_pulses=250", "generator.poles_ns=[50, 50]"])
+def test_many_pulses_are_thinned_out_by_the_seed(monkeypatch):
+    monkeypatch.setattr(inverse_module, "MOST", 250)
+    recipe = load_recipe("fast", ["generator.poles_ns=[50, 50]"])
     sim, generator = charge(400, seed=1), readout(NOISE_KEV)
     energy = np.full(len(sim), FEP_KEV)
     first, same, other = (

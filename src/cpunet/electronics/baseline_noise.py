@@ -163,13 +163,7 @@ class BaselineNoise:
         CpunetError
             If an energy is not a positive number.
         """
-        usable = np.isfinite(energy_kev) & (energy_kev > 0)
-        if not usable.all():
-            row = int(np.argmin(usable))
-            raise CpunetError(
-                f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
-                "1/energy, so give the energies"
-            )
+        require_energies(energy_kev)
         n = len(energy_kev)
         # Twice as long as needed, so that end and beginning know nothing of each other.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
@@ -205,6 +199,17 @@ class BaselineNoise:
         if len(wanted) == len(known):
             return densities
         return np.asarray([np.interp(wanted, known, one) for one in densities], float)
+
+
+def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
+    """Raise a `CpunetError` unless all energies are positive numbers."""
+    usable = np.isfinite(energy_kev) & (energy_kev > 0)
+    if not usable.all():
+        row = int(np.argmin(usable))
+        raise CpunetError(
+            f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
+            "1/energy, so give the energies"
+        )
 
 
 def _add_lines(

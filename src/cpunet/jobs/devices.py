@@ -45,7 +45,7 @@ def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
             raise
         where = "GPU" if isinstance(error, torch.cuda.OutOfMemoryError) else "computer"
         if isinstance(recipe.training, MatchingConfig):
-            remedy = f"--set training.max_pulses={max(100, recipe.training.max_pulses // 2)}"
+            remedy = "fewer energies (--peak) or files"
         else:
             half = recipe.training.batch_size // 2 // processes * processes
             remedy = f"--set training.batch_size={max(2, processes, half)}"

@@ -112,9 +112,8 @@ def match(
     if known is not None:
         recipe = _with_config(recipe, known.config)
     response, fit = fit_response(
-        sides.sim.waveforms,
-        sides.data.waveforms,
-        sides.sim.energy_kev,
+        sides.sim,
+        sides.data,
         noise,
         recipe,
         seed=seed,

@@ -78,8 +78,8 @@ class ElectronicsResponse(nn.Module):
         Tensor
             Shape (batch, ROOM_BEFORE + samples + ROOM_AFTER).
         """
-        length = ROOM_BEFORE + windows.shape[1] + ROOM_AFTER
-        padded = fast_length(math.ceil(_LEAST_FACTOR * length))
+        length = record_length(windows.shape[1])
+        padded = padded_length(length)
         current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
         current = nn.functional.pad(current, (ROOM_BEFORE, 0))
         spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
@@ -167,6 +167,16 @@ def _spline(frequency: Tensor) -> Tensor:
     """
     spline: Tensor = torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
     return spline
+
+
+def record_length(samples: int) -> int:
+    """Samples of the record that a window of so many becomes."""
+    return ROOM_BEFORE + samples + ROOM_AFTER
+
+
+def padded_length(length: int) -> int:
+    """Samples of the transform of a record of so many."""
+    return fast_length(math.ceil(_LEAST_FACTOR * length))
 
 
 def fast_length(least: int) -> int:

@@ -75,11 +75,12 @@ class MatchingConfig(Config):
     ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
     ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
     ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
-    ``max_pulses`` bounds the sets, ``steps`` the iterations of a fit.  A fit that ends in the
-    wrong valley is begun again with the response's poles times the next of
-    ``start_factors``; the best of all is kept.  If it is still poor, a ringing is looked for at
-    ``ringing_mhz``.  The last steps average over up to ``noise_sets`` draws of the noise, if
-    there are so few pulses that ``max_pulses`` allows it.
+    Valleys are searched with ``search_pulses`` of each side, in fits of at most ``steps``
+    iterations.  A fit that ends in the wrong valley is begun again with the response's poles
+    times the next of ``start_factors``; the best of all is kept.  If it is still poor, a
+    ringing is looked for at ``ringing_mhz``.  In the end all pulses are compared, optimally
+    weighted, with ``noise_sets`` draws of the noise each and the components in
+    ``conditional_bins`` of the current amplitude.
     """
 
     method: Literal["matching"]
@@ -94,7 +95,8 @@ class MatchingConfig(Config):
     amplitude_width: Positive
     clip: Positive
     ridge: Fraction
-    max_pulses: Annotated[int, Field(ge=100)]
+    search_pulses: Annotated[int, Field(ge=200)]
+    conditional_bins: Annotated[int, Field(ge=2)]
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
     ringing_mhz: tuple[Positive, ...]

@@ -26,9 +26,10 @@ class SimulationSettings(Config):
     diffusion_constant
         D/(v/E), diffusivity over mobility, in V mm/cm.  Siggen's 0.12 was set to the
         diffusion measured (of electrons: Jacoboni et al., PRB 24 (1981) 1014) at the
-        fields of a detector, where carriers are hotter than the crystal.  ``"temperature"``: kT/e at the crystal's temperature
-        (0.078 at 90 K), the limit of weak fields; ``"siggen"``: 0.12 with siggen's
-        roundings, of the number and of the cloud's duration to whole steps.
+        fields of a detector, where carriers are hotter than the crystal.  ``"temperature"``:
+        kT/e at the crystal's temperature (0.078 at 90 K), the limit of weak fields;
+        ``"siggen"``: 0.12 with siggen's roundings, of the number and of the cloud's duration
+        to whole steps.
     cloud_fwhm_mm
         Width of the charge cloud when it is set free.
     self_repulsion

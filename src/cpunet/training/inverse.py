@@ -31,6 +31,7 @@ Values = npt.NDArray[np.float64]
 # RMS, in pulse heights, of white noise beside that of the baselines: rounding to float32,
 # and what the response does not describe.
 FLOOR = 1e-5
+MOST = 4096  # pulses that are translated for it
 RECORD_SAMPLES = 8192  # of the transform from which the noise's correlations follow
 
 
@@ -55,7 +56,7 @@ def fit_inverse(
     recipe
         With a response to be matched.
     seed
-        Of the choice of pulses, if there are more than the recipe's `max_pulses`.
+        Of the choice of pulses, if there are more than `MOST`.
 
     Returns
     -------
@@ -70,7 +71,7 @@ def fit_inverse(
     _, training = recipe.matching
     _check(sim, energy_kev)
     rng = np.random.default_rng(seed)
-    rows = np.sort(rng.choice(len(sim), min(len(sim), training.max_pulses), replace=False))
+    rows = np.sort(rng.choice(len(sim), min(len(sim), MOST), replace=False))
     windows, delay, used = _translated(generator, sim[rows], recipe)
     inverse = LinearInverse(Sizes.of(recipe.preparation.length, training))
     inverse.half_height.fill_(0.5 * float(windows.amax(dim=1).median()))

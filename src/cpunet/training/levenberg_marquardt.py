@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.moments import Values
+from cpunet.training.response_problem import Parameters
 
 Listener = Callable[[int, float], None]
 
@@ -22,37 +22,43 @@ CONVERGED = 0.2
 DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How well a response describes the data.
+class Problem(Protocol):
+    """Residuals whose squares are to be as small as possible in all."""
+
+    clip: float | None
+
+    @property
+    def parameters(self) -> Parameters: ...
+
+    @property
+    def moments(self) -> int: ...
+
+    def residuals(self, vector: Values) -> Values: ...
+
+    def jacobian(self, vector: Values, residuals: Values) -> Values: ...
+
+
+class Minimum(NamedTuple):
+    """Where a fit has ended.
 
     Parameters
     ----------
-    chi_square, moments
-        Of the comparison, and the number of moments compared; before errors of the
-        simulation were allowed for, if they were.
+    cost
+        Sum of the squared residuals.
     steps
-        Steps taken.
-    errors
-        Standard deviations of the parameters, by name, as the curvature where the fit ended
-        gives them.
-    pulls
-        Deviation of each moment in its standard deviations, by name.
-    data_left_out
-        Measured pulses that the moments leave out: a second pulse, or no baseline.
+        Taken.
+    covariance
+        Of the parameters.
     """
 
-    chi_square: float
-    moments: int
+    cost: float
     steps: int
-    errors: dict[str, float]
-    pulls: dict[str, float]
-    data_left_out: int
+    covariance: Values
 
 
 def levenberg_marquardt(
-    problem: ResponseProblem, steps: int, listener: Listener | None, *, coarse: bool = True
-) -> Fit:
+    problem: Problem, steps: int, listener: Listener | None, *, coarse: bool = True
+) -> Minimum:
     """Minimise a problem from where its response is, and leave the response there.
 
     Parameters
@@ -71,7 +77,8 @@ def levenberg_marquardt(
     CpunetError
         If chi-square is not finite in the end.
     """
-    vector, taken = problem.vector(), 0
+    parameters = problem.parameters
+    vector, taken = parameters.vector(), 0
     rounds = [(clip, ROUNDS_EACH) for clip in FIRST_CLIPS if coarse]
     for clip, most in [*rounds, (None, steps - ROUNDS_EACH * len(rounds))]:
         problem.clip = clip
@@ -81,9 +88,9 @@ def levenberg_marquardt(
             jacobian = problem.jacobian(vector, residuals)
             curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
             for _ in range(TRIES):
-                scaled = curvature + damping * torch.diag(curvature.diagonal())
-                move = -torch.linalg.solve(scaled, gradient)
-                tried = vector + move.clamp(-problem.widths, problem.widths)
+                scaled = curvature + damping * np.diag(curvature.diagonal())
+                move = -np.linalg.solve(scaled, gradient)
+                tried = vector + np.clip(move, -parameters.widths, parameters.widths)
                 found = problem.residuals(tried)
                 if float(found @ found) < cost:
                     break
@@ -96,7 +103,7 @@ def levenberg_marquardt(
             taken += 1
             if listener is not None:
                 listener(taken, cost)
-            if fall < CONVERGED * max(1.0, cost / len(problem.wanted)):
+            if fall < CONVERGED * max(1.0, cost / problem.moments):
                 break
     if not math.isfinite(cost):
         raise CpunetError(
@@ -105,23 +112,6 @@ def levenberg_marquardt(
         )
     # the last curvature may be that before the last step, which can be a long one
     jacobian = problem.jacobian(vector, residuals)
-    covariance = torch.linalg.inv(jacobian.T @ jacobian)
-    problem.set(vector)
-    pulls = problem.pulls(vector)
-    return Fit(
-        chi_square=cost,
-        moments=len(pulls),
-        steps=taken,
-        errors=_by_name(problem.labels, covariance.diagonal().sqrt()),
-        pulls=dict(zip(problem.moments.names, pulls.tolist(), strict=True)),
-        data_left_out=problem.moments.left_out,
-    )
-
-
-def _by_name(labels: list[str], values: Tensor) -> dict[str, float]:
-    counted: dict[str, int] = {}
-    named = {}
-    for label, value in zip(labels, values.tolist(), strict=True):
-        counted[label] = counted.get(label, 0) + 1
-        named[f"{label}.{counted[label]}"] = value
-    return named
+    parameters.set(vector)
+    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
+    return Minimum(cost, taken, covariance)

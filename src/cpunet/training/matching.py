@@ -3,8 +3,8 @@
 The parameters of a response are those for which the moments of the translated simulation,
 noise and all, agree best with those of the data: a chi-square fit in about ten
 parameters by the Levenberg–Marquardt method, with derivatives by finite differences on
-fixed random numbers.  Its value says whether the response describes the data, its
-curvature how well each parameter is known.
+fixed random numbers.  Some of the pulses are enough to find the valley; then all of them,
+optimally weighted, say where in it the response is.
 """
 
 from __future__ import annotations
@@ -12,28 +12,29 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.errors import CpunetError
-from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE, ElectronicsResponse
-from cpunet.pulses.container import FloatArray
+from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.levenberg_marquardt import Fit, Listener, levenberg_marquardt
-from cpunet.training.moments import FEWEST, Moments
-from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands
+from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
+from cpunet.training.misfit import amplitude_shift
+from cpunet.training.moments import Moments, Values
+from cpunet.training.optimal_weights import refine
+from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
+from cpunet.training.translated import Noise, Translated
 
-# Half maxima come at most this many samples after the aligned one: what the response delays.
-DELAY = 100
-# Chi-square per moment at which a fit has found its valley; the data's own outliers and the
-# ridge keep it from 1.
+# Chi-square per moment, with as many pulses as valleys are searched with, at which a fit has
+# found its own.  The data's own outliers and the ridge keep it from 1.
 GOOD_FIT = 1.6
 # A wrong valley gives three per moment; this is another detector.
 HOPELESS_FIT = 20.0
@@ -43,12 +44,66 @@ RINGS, PROMISES = 0.7, 0.9
 # Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
 # deviations from which on that is not as it is simulated.
 ONSET, OFF = -15, 4.0
+# Pulses of each side with which a poor fit is looked at.
+CHECKED = 4096
+# Of a band at the least, where a set is thinned out.
+FEWEST_OF_BAND = 400
+# Rounds of optimal weights: those of the second are of where the first has led.
+ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a response describes the data.
+
+    Parameters
+    ----------
+    chi_square, moments
+        Of the comparison, and the number of moments compared; before errors of the
+        simulation were allowed for, if they were.
+    steps
+        Steps taken.
+    errors
+        Standard deviations of the parameters, by name, as their curvature gives them.
+    pulls
+        Deviation of each moment in its standard deviations, by name.
+    data_left_out
+        Measured pulses that the moments leave out: a second pulse, or no baseline.
+    pairs
+        Number of pulses that the errors go with: the harmonic sum of both sides.
+    amplitude_shift, amplitude_shift_error
+        Relative change of the translated current amplitudes that would bring them closest to
+        the data's, see `cpunet.training.misfit`.
+    """
+
+    chi_square: float
+    moments: int
+    steps: int
+    errors: dict[str, float]
+    pulls: dict[str, float]
+    data_left_out: int
+    pairs: float
+    amplitude_shift: float
+    amplitude_shift_error: float
+
+    @property
+    def poor(self) -> bool:
+        """Whether the response does not describe the data.
+
+        With many pulses chi-square tells any response from the true one, so that what counts
+        then is the misfit in units of what single pulses differ by.
+        """
+        return self.excess > GOOD_FIT - 1
+
+    @property
+    def excess(self) -> float:
+        """Chi-square per moment above 1; of more than some thousand pulses, that of so many."""
+        return (self.chi_square / self.moments - 1) * min(1.0, 0.5 * CHECKED / self.pairs)
 
 
 def fit_response(
-    sim: FloatArray,
-    data: FloatArray,
-    energy_kev: np.ndarray[tuple[int], np.dtype[np.float64]],
+    sim: Pulses,
+    data: Pulses,
     noise: BaselineNoise,
     recipe: Recipe,
     *,
@@ -61,15 +116,14 @@ def fit_response(
     Parameters
     ----------
     sim, data
-        Prepared windows, shapes (n, samples) and (n', samples).
-    energy_kev
-        Of the simulated pulses: the noise goes as its inverse.
+        Prepared pulses with their energies: noise goes as their inverse, and pulses are
+        compared in bands of energy, see `cpunet.training.energy_bands`.
     noise
         Of the data's baselines.
     recipe
         With a response to be matched.
     seed
-        Of the choice of pulses, if there are many, and of the noise.
+        Of the noise, and of the pulses with which valleys are searched.
     known
         The response of a similar readout, of the recipe's configuration, to start from.  Only
         if that leads nowhere the recipe's own starts are tried.
@@ -83,59 +137,146 @@ def fit_response(
     """
     config, training = recipe.matching
     rng = np.random.default_rng(seed)
-    if len(sim) < FEWEST:
-        raise CpunetError(
-            f"{len(sim)} simulated pulses; {FEWEST} or more are needed: select more energies "
-            "(--peak) or simulate more"
-        )
-    sim_rows, data_rows = (
-        np.sort(rng.choice(len(side), min(len(side), training.max_pulses), replace=False))
-        for side in (sim, data)
-    )
-    moments = Moments.of_data(data[data_rows], training, recipe.preparation)
-    sets = max(1, min(training.noise_sets, training.max_pulses // len(sim_rows)))
-    length = ROOM_BEFORE + sim.shape[1] + ROOM_AFTER
-    drawn = torch.from_numpy(
-        np.stack([noise.draw(energy_kev[sim_rows], length, rng) for _ in range(-(-sets // 2))])
-    )
+    require_energies(sim.energy_kev)
+    sets = _Sets(sim, data, noise, recipe, rng)
+    some = sets.bands(training.search_pulses)
+    first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some)
     if listener is not None:
         listener = _counted(listener)
-    first = ResponseProblem(
-        ElectronicsResponse(config, noise.dt_ns),
-        moments,
-        torch.from_numpy(sim[sim_rows]),
-        drawn[0],
-        last=ROOM_BEFORE + recipe.preparation.samples_before + DELAY,
-    )
     near = None if known is None else _from_known(first, known, training, listener)
-    problem, fit = near or _best_start(first, config, training, listener)
-    if _poor(fit):
-        problem, fit = _ringing_if_better(problem, fit, config, training, listener)
-    if sets > 1:
-        # each draw once more with the other sign: what noise adds to a mean cancels
-        problem.with_noise(torch.cat([drawn, -drawn])[:sets])
-        again = levenberg_marquardt(problem, training.steps, listener, coarse=False)
-        fit = replace(again, steps=fit.steps + again.steps)
-    if _poor(fit) and _onset_is_off(fit, training):
-        problem.allow_for_model_error()
-        again = levenberg_marquardt(problem, training.steps, listener, coarse=False)
-        # its own chi-square says nothing: what does not fit was allowed for
-        fit = replace(again, chi_square=fit.chi_square, steps=fit.steps + again.steps)
-    return problem.response, fit
+    problem, found = near or _best_start(first, config, training, listener)
+    everything = sets.bands()
+    if not _poor(problem, found):
+        fit = _refined(problem, found, everything, training, listener)
+        if not fit.poor:
+            return problem.response, fit
+    problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
+    if _poor(problem, found):
+        problem, found = _ringing_if_better(problem, found, config, training, listener)
+    if _poor(problem, found) and _onset_is_off(problem, training):
+        return problem.response, _with_wrong_physics(problem, found, training, listener)
+    return problem.response, _refined(problem, found, everything, training, listener)
 
 
-def _poor(fit: Fit) -> bool:
-    return fit.chi_square >= GOOD_FIT * fit.moments
+class _Sets:
+    """Both sides in bands of energy, and parts of them that are enough for a question."""
+
+    def __init__(
+        self,
+        sim: Pulses,
+        data: Pulses,
+        noise: BaselineNoise,
+        recipe: Recipe,
+        rng: np.random.Generator,
+    ) -> None:
+        self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
+        parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
+        # in an order of which any beginning is a fair part
+        self.parted = [
+            (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
+            for band in parted
+        ]
+
+    def bands(self, most: int | None = None) -> list[Band]:
+        """All pulses, or as many of each side as `most`, in shares as they are."""
+        n_sim, n_data = (
+            sum(len(order) for order in orders)
+            for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
+        )
+        some = []
+        for band, sim_order, data_order in self.parted:
+            chosen = []
+            for order, n in ((sim_order, n_sim), (data_order, n_data)):
+                share = 1.0 if most is None else min(1.0, most / n)
+                kept = max(math.ceil(share * len(order)), min(FEWEST_OF_BAND, len(order)))
+                chosen.append(np.sort(order[:kept]))
+            some.append(self._band(band, *chosen))
+        return some
+
+    def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
+        _, training = self.recipe.matching
+        measured = self.data.waveforms[band.data[data]]
+        moments = Moments.of_data(measured, training, self.recipe.preparation)
+        rows = band.sim[sim]
+        pulses, energy_kev = self.sim.waveforms[rows], self.sim.energy_kev[rows]
+        length, draws = record_length(pulses.shape[1]), training.noise_sets
+        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng)
+        return Band(band.name, Translated(pulses, drawn, moments, band.weights[sim]))
 
 
-def _onset_is_off(fit: Fit, training: MatchingConfig) -> bool:
+def _refined(
+    problem: ResponseProblem,
+    found: Minimum,
+    bands: Sequence[Band],
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> Fit:
+    """Let all pulses say where in its valley the response is."""
+    steps, covariance = found.steps, found.covariance
+    for _ in range(ROUNDS):
+        covariance, taken = refine(problem, bands, training.conditional_bins, listener)
+        steps += taken
+    return _fit(ResponseProblem(problem.response, bands), covariance, steps)
+
+
+def _checked(
+    problem: ResponseProblem,
+    bands: Sequence[Band],
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Fit on, with more pulses."""
+    more = problem.of(problem.response, bands)
+    return more, levenberg_marquardt(more, training.steps, listener, coarse=False)
+
+
+def _with_wrong_physics(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> Fit:
+    """Fit with errors for what the simulation has wrong; its own chi-square says nothing."""
+    told = _fit(problem, found.covariance, found.steps)
+    problem.allow_for_model_error()
+    again = levenberg_marquardt(problem, training.steps, listener, coarse=False)
+    fit = _fit(problem, again.covariance, found.steps + again.steps)
+    return replace(fit, chi_square=told.chi_square)
+
+
+def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
+    """What is told of a response that has been found."""
+    parameters = problem.parameters
+    vector = parameters.vector()
+    pulls, deviations = problem.pulls(vector), problem.deviations(vector)
+    shift, shift_error = amplitude_shift(problem.response, problem.bands)
+    return Fit(
+        chi_square=float(deviations @ deviations),
+        moments=problem.moments,
+        pairs=problem.pairs,
+        steps=steps,
+        errors=parameters.by_name(np.sqrt(covariance.diagonal())),
+        pulls=dict(zip(problem.names, pulls.tolist(), strict=True)),
+        data_left_out=problem.left_out,
+        amplitude_shift=shift,
+        amplitude_shift_error=shift_error,
+    )
+
+
+def _poor(problem: ResponseProblem, found: Minimum) -> bool:
+    return found.cost >= GOOD_FIT * problem.moments
+
+
+def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
     """Whether pulses begin otherwise than simulated: no readout does that, physics do.
 
     If only what follows is off, the data have what no readout chain has, such as remains of
     earlier pulses in their tails, and the edge is still to be trusted.
     """
-    onset = [(a, b) for a, b in pairwise(training.segments) if b <= ONSET]
-    return any(abs(fit.pulls[f"samples {a} to {b}"]) > OFF for a, b in onset)
+    onset = {f"samples {a} to {b}" for a, b in pairwise(training.segments) if b <= ONSET}
+    pulls = problem.pulls(problem.parameters.vector())
+    named = zip(problem.names, pulls, strict=True)
+    return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
 
 
 def _from_known(
@@ -143,16 +284,16 @@ def _from_known(
     known: ElectronicsResponse,
     training: MatchingConfig,
     listener: Listener | None,
-) -> tuple[ResponseProblem, Fit] | None:
+) -> tuple[ResponseProblem, Minimum] | None:
     """Fit from a response that is known, first as if the data were near; None if it is poor."""
     start = copy.deepcopy(known)
-    _set_decay(start, float(first.moments.slope))
+    _set_decay(start, first.slope)
     problem, steps = first.of(start), 0
     for coarse in (False, True):
-        fit = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
-        steps += fit.steps
-        if not _poor(fit):
-            return problem, replace(fit, steps=steps)
+        found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
+        steps += found.steps
+        if not _poor(problem, found):
+            return problem, found._replace(steps=steps)
     return None
 
 
@@ -161,16 +302,16 @@ def _best_start(
     config: ResponseConfig,
     training: MatchingConfig,
     listener: Listener | None,
-) -> tuple[ResponseProblem, Fit]:
+) -> tuple[ResponseProblem, Minimum]:
     """Fit from start after start, until one is good or all are done."""
-    best: tuple[ResponseProblem, Fit] | None = None
-    dt_ns, slope = float(first.response.dt_ns), float(first.moments.slope)
+    best: tuple[ResponseProblem, Minimum] | None = None
+    dt_ns = float(first.response.dt_ns)
     for factor in training.start_factors:
-        problem = first.of(_start(config, dt_ns, factor, slope))
-        fit = levenberg_marquardt(problem, training.steps, listener)
-        if best is None or fit.chi_square < best[1].chi_square:
-            best = problem, fit
-        if not GOOD_FIT <= fit.chi_square / fit.moments <= HOPELESS_FIT:
+        problem = first.of(_start(config, dt_ns, factor, first.slope))
+        found = levenberg_marquardt(problem, training.steps, listener)
+        if best is None or found.cost < best[1].cost:
+            best = problem, found
+        if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
             break  # no other valley is to be looked for
     assert best is not None  # the recipe has one start at least
     return best
@@ -178,28 +319,28 @@ def _best_start(
 
 def _ringing_if_better(
     problem: ResponseProblem,
-    fit: Fit,
+    found: Minimum,
     config: ResponseConfig,
     training: MatchingConfig,
     listener: Listener | None,
-) -> tuple[ResponseProblem, Fit]:
+) -> tuple[ResponseProblem, Minimum]:
     """Let the response ring, if that promises to explain much of what it leaves."""
     if config.ringing_mhz is not None:
-        return problem, fit
+        return problem, found
     response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
-    if response is None or promised > PROMISES * fit.chi_square:
-        return problem, fit
-    best, steps = (problem, fit), fit.steps
+    if response is None or promised > PROMISES * found.cost:
+        return problem, found
+    best, steps = (problem, found), found.steps
     # from where the fit without ringing ended, first as if that were near, then as if far
     for coarse in (False, True):
         rings = problem.of(copy.deepcopy(response))
-        found = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
-        steps += found.steps
-        if found.chi_square < RINGS * best[1].chi_square:
-            best = rings, found
-        if not _poor(best[1]):
+        again = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
+        steps += again.steps
+        if again.cost < RINGS * best[1].cost:
+            best = rings, again
+        if not _poor(*best):
             break
-    return best[0], replace(best[1], steps=steps)
+    return best[0], best[1]._replace(steps=steps)
 
 
 def _counted(listener: Listener) -> Listener:

@@ -15,15 +15,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training._record_kernels import Window, project, read_records
+
+Values = npt.NDArray[np.float64]
 
 SIGMA_PER_MAD = 1.4826
 FEWEST = 200  # pulses for a covariance of about a hundred moments
@@ -32,43 +33,73 @@ EDGE = 60  # samples to either side of the half maximum hold the steepest point
 # electronics do; so many standard deviations off may the moments be where it is wrong.
 EARLY, WRONG, LATE = 30, 20.0, 2.0
 LEAST_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
+QUIET = 0.05  # of the height: above it before the pulse, there is another one
 # Of translated pulses, beyond which the cut on the data's tails is no longer followed: the
 # response is still far off.
 MOST_CUT = 0.2
+# Measured pulses from which the functions are drawn up, and those read at a time.
+DRAWN, BLOCK = 8192, 512
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What is read of each pulse, before functions are made of it.
+
+    Parameters
+    ----------
+    linear
+        Stretches, components and tail slope in robust standard deviations of the data from
+        their medians, shape (pulses, quantities).
+    log_amplitude
+        Logarithm of the current amplitude, shape (pulses,).
+    weights
+        Of the pulses, shape (pulses,).
+    """
+
+    linear: Values
+    log_amplitude: Values
+    weights: Values
+
+    def __len__(self) -> int:
+        return len(self.linear)
+
+    def __getitem__(self, rows: npt.NDArray[np.bool_] | slice) -> Readings:
+        return Readings(self.linear[rows], self.log_amplitude[rows], self.weights[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
     """The functions whose means are compared, drawn up from the measured set.
 
-    Use `of_data`; `of_records` then gives the functions of any set.
+    Use `of_data`; `read` and `functions` then give those of any set.
 
     Parameters
     ----------
+    data
+        Readings of the measured pulses that count.
     values
-        Functions of the measured pulses, shape (pulses, moments), float64.
+        Functions of these, shape (pulses, moments).
     names
         Of the moments.
     left_out
         Measured pulses that are no single pulses with a flat baseline, and do not count.
     slope_range
-        Lowest and highest tail slope of the data.  Quality cuts bound it, and what is beyond
-        is left out on the other side too: behind a fast decay the tails of late pulses are
-        steeper, so that such a cut takes more of these.
+        Lowest and highest tail slope of the data, as read.  Quality cuts bound it, and what is
+        beyond is left out on the other side too: behind a fast decay the tails of late pulses
+        are steeper, so that such a cut takes more of these.
     """
 
     config: MatchingConfig
     preparation: PreparationConfig
     level: float
-    kernel: Tensor
-    segments: Tensor
-    components: Tensor
-    mean: Tensor
-    centres: Tensor
-    spreads: Tensor
-    amplitude_centres: Tensor
-    amplitude_widths: Tensor
-    values: Tensor
+    mean: FloatArray
+    components: FloatArray
+    centres: Values
+    spreads: Values
+    amplitude_centres: Values
+    amplitude_widths: Values
+    data: Readings
+    values: Values
     names: tuple[str, ...]
     left_out: int
     slope_range: tuple[float, float]
@@ -84,139 +115,219 @@ class Moments:
         CpunetError
             If there are too few pulses.
         """
-        data = torch.from_numpy(np.ascontiguousarray(windows))
-        whole = torch.isfinite(data).all(dim=1)
-        level = 0.5 * float(data[whole].mean(dim=0).max())
-        aligned, records = at_half_maximum(
-            data, level, preparation.samples_before + 1, config, preparation.tail_level
-        )
-        kernel = torch.from_numpy(current_amplitude_kernel())
-        amplitude = _amplitude(aligned, kernel, config.before)
-        quiet = aligned[:, : max(1, config.before // 4)].mean(dim=1).abs()
-        usable = whole & torch.isfinite(aligned).all(dim=1) & (quiet < 0.05)
-        usable &= amplitude > LEAST_SHARE * amplitude[usable].median()
+        whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
+        some = whole[np.linspace(0, len(whole) - 1, min(len(whole), DRAWN)).astype(int)]
+        level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0
+        window = _window(config, preparation, level, preparation.samples_before + 1)
+        aligned, slopes, log_amplitude = _read_windows(windows[some], window, preparation)
+        usable = _usable(aligned, log_amplitude, config)
         if usable.sum() < FEWEST:
             raise CpunetError(
                 f"{int(usable.sum())} measured pulses can be used; {FEWEST} or more are "
                 "needed: select more energies (--peak) or give more files"
             )
-        aligned, records, amplitude = aligned[usable], records[usable], amplitude[usable].log()
-        mean = aligned.mean(dim=0)
-        _, sizes, axes = torch.linalg.svd(aligned - mean, full_matrices=False)
-        components = axes[: config.components].T / (
-            sizes[: config.components] / len(aligned) ** 0.5
-        )
-        edges = torch.quantile(
-            amplitude, torch.linspace(0.02, 0.995, config.amplitude_bins + 1)
-        )
-        segments = _segments(config, aligned.shape[1])
-        linear = torch.cat(
-            [
-                aligned @ segments,
-                (aligned - mean) @ components,
-                _tail_slopes(records, preparation)[:, None],
-            ],
-            dim=1,
-        )
-        centres = linear.median(dim=0).values
-        spreads = SIGMA_PER_MAD * (linear - centres).abs().median(dim=0).values
+        least = float(np.log(LEAST_SHARE) + np.median(log_amplitude[usable]))
+        aligned, slopes, log_amplitude = aligned[usable], slopes[usable], log_amplitude[usable]
+        mean, components = _principal_components(aligned, config.components)
+        linear = _linear(aligned, slopes, mean, components, config)
+        centres = np.median(linear, axis=0)
+        spreads = SIGMA_PER_MAD * np.median(np.abs(linear - centres), axis=0)
+        edges = np.quantile(log_amplitude, np.linspace(0.02, 0.995, config.amplitude_bins + 1))
         drawn_up = cls(
             config=config,
             preparation=preparation,
             level=level,
-            kernel=kernel,
-            segments=segments,
-            components=components,
             mean=mean,
+            components=components,
             centres=centres,
-            spreads=spreads.clamp_min(1e-9),
+            spreads=np.maximum(spreads, 1e-9),
             amplitude_centres=0.5 * (edges[1:] + edges[:-1]),
-            amplitude_widths=(edges[1:] - edges[:-1]).clamp_min(config.amplitude_width),
-            values=torch.empty(0),
+            amplitude_widths=np.maximum(np.diff(edges), config.amplitude_width),
+            data=Readings(np.empty((0, len(centres))), np.empty(0), np.empty(0)),
+            values=np.empty((0, 0)),
             names=_names(config),
-            left_out=int((~usable).sum()),
-            slope_range=(float(linear[:, -1].min()), float(linear[:, -1].max())),
+            left_out=0,
+            slope_range=(-np.inf, np.inf),
         )
-        values = drawn_up._of_aligned(aligned, linear[:, -1])
-        return cls(**{**vars(drawn_up), "values": values})
+        data = drawn_up._of_windows(windows, whole, window, least)
+        slopes = data.linear[:, -1] * drawn_up.spreads[-1] + drawn_up.centres[-1]
+        rounding = 1e-4 * drawn_up.spreads[-1]
+        complete = vars(drawn_up) | {
+            "data": data,
+            "values": drawn_up.functions(data),
+            "left_out": len(windows) - len(data),
+            "slope_range": (slopes.min() - rounding, slopes.max() + rounding),
+        }
+        return cls(**complete)
 
-    def of_records(self, records: Tensor, last: int, clip: float | None = None) -> Tensor:
-        """Functions of each pulse.
+    def read(
+        self,
+        records: FloatArray,
+        last: int,
+        *,
+        cut: bool = True,
+        weights: Values | None = None,
+    ) -> Readings:
+        """Read records with noise.
 
         Parameters
         ----------
         records
-            Shape (pulses, samples), of about the height of prepared ones, with noise.
+            Shape (pulses, samples), of about the height of prepared ones; they are changed.
         last
             Sample after all half maxima.
-        clip
-            In place of the recipe's: wider far from the data, where all would be clipped.
+        cut
+            Whether to leave out pulses whose tails are beyond the range of the data's, unless
+            these are very many.
+        weights
+            Of the pulses; 1 by default.
 
         Returns
         -------
-        Tensor
-            Float64, shape (pulses, moments); NaN for a pulse that does not count.
+        Readings
+            Of the pulses that count.
         """
-        tail_level = self.preparation.tail_level
-        aligned, records = at_half_maximum(records, self.level, last, self.config, tail_level)
-        slopes = self._slopes_of(records, last)
-        values = self._of_aligned(aligned, slopes, clip)
-        cut = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
-        if clip is None and cut.float().mean() < MOST_CUT:
-            values[cut] = torch.nan
-        return values
+        window = _window(self.config, self.preparation, self.level, last)
+        aligned, slopes, log_amplitude = _aligned(records, window)
+        linear = _linear(aligned, slopes, self.mean, self.components, self.config)
+        linear = (linear - self.centres) / self.spreads
+        beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
+        counts = np.isfinite(linear).all(axis=1) & np.isfinite(log_amplitude)
+        if cut and beyond.mean() < MOST_CUT:
+            counts &= ~beyond
+        readings = Readings(
+            linear, log_amplitude, np.ones(len(linear)) if weights is None else weights
+        )
+        return readings if counts.all() else readings[counts]
+
+    def functions(self, readings: Readings, clip: float | None = None) -> Values:
+        """Functions of each pulse, shape (pulses, moments).
+
+        Parameters
+        ----------
+        readings
+            Of pulses.
+        clip
+            In place of the recipe's: wider far from the data, where all would be clipped.
+        """
+        limit = clip or self.config.clip
+        linear = np.clip(readings.linear, -limit, limit)
+        first = len(self.config.segments) - 1
+        squared = [linear[:, first : first + self.config.squares], linear[:, -1:]]
+        density = self.density(readings.log_amplitude)
+        return np.concatenate([linear, np.concatenate(squared, axis=1) ** 2, density], axis=1)
+
+    def density(self, log_amplitude: Values) -> Values:
+        """Bins of the logarithm of the current amplitude, shape (pulses, bins)."""
+        distance = log_amplitude[:, np.newaxis] - self.amplitude_centres
+        return np.asarray(np.exp(-0.5 * (distance / self.amplitude_widths) ** 2))
 
     @property
-    def model_errors(self) -> Tensor:
+    def model_errors(self) -> Values:
         """Errors of the moments, in their standard deviations, if the physics are wrong."""
-        edges = self.config.segments
-        early = [stop <= EARLY for stop in edges[1:]]
-        errors = [
-            *(WRONG if e else LATE for e in early),
-            *[WRONG] * self.config.components,
-            0.0,
-        ]
+        errors = [WRONG if stop <= EARLY else LATE for stop in self.config.segments[1:]]
+        errors += [WRONG] * self.config.components + [0.0]
         errors += [WRONG] * self.config.squares
         errors += [0.0] * (len(self.names) - len(errors))
-        return torch.tensor(errors, dtype=torch.float64)
+        return np.array(errors)
 
     @property
-    def slope(self) -> Tensor:
+    def slope(self) -> float:
         """Median slope per sample of the logarithm of the data's tails."""
-        return self.centres[-1]
+        return float(self.centres[-1])
 
-    def _slopes_of(self, records: Tensor, first: int) -> Tensor:
-        """Tail slopes where the preparation would align each record."""
-        before = self.preparation.samples_before
-        top = records[:, first - before : first + self.preparation.samples_after]
-        highest, at = top.max(dim=1)
-        index = torch.arange(top.shape[1], device=top.device)
-        threshold = self.preparation.align_fraction * highest
-        below = (top < threshold[:, None]) & (index < at[:, None])
-        align = (below * (index + 1)).amax(dim=1) + first - before
-        stop = self.preparation.samples_after
-        start = stop - self.preparation.decay_fit_samples
-        window = align[:, None] + torch.arange(start, stop, device=top.device)
-        tail = records.gather(1, window.clamp(max=records.shape[1] - 1))
-        return tail.clamp_min(1e-3).log() @ _lever(tail.shape[1])
+    def _of_windows(
+        self, windows: FloatArray, whole: npt.NDArray[np.intp], window: Window, least: float
+    ) -> Readings:
+        """Readings of the prepared measured pulses that count."""
+        linear, log_amplitude = [], []
+        for first in range(0, len(whole), BLOCK):
+            block = windows[whole[first : first + BLOCK]]
+            aligned, slopes, logs = _read_windows(block, window, self.preparation)
+            usable = _usable(aligned, logs, self.config) & (logs > least)
+            of_block = _linear(aligned, slopes, self.mean, self.components, self.config)
+            linear.append(((of_block - self.centres) / self.spreads)[usable])
+            log_amplitude.append(logs[usable])
+        logs = np.concatenate(log_amplitude)
+        return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
 
-    def _of_aligned(self, aligned: Tensor, slopes: Tensor, clip: float | None = None) -> Tensor:
-        config, limit = self.config, clip or self.config.clip
-        linear = torch.cat(
-            [
-                aligned @ self.segments,
-                (aligned - self.mean) @ self.components,
-                slopes[:, None],
-            ],
-            dim=1,
-        )
-        linear = ((linear - self.centres) / self.spreads).clamp(-limit, limit)
-        first = self.segments.shape[1]
-        squared = torch.cat([linear[:, first : first + config.squares], linear[:, -1:]], dim=1)
-        amplitude = _amplitude(aligned, self.kernel, config.before).clamp_min(1e-4).log()
-        distance = (amplitude[:, None] - self.amplitude_centres) / self.amplitude_widths
-        density = torch.exp(-0.5 * distance**2)
-        return torch.cat([linear, squared**2, density], dim=1).double()
+
+def _window(
+    config: MatchingConfig, preparation: PreparationConfig, level: float, last: int
+) -> Window:
+    return Window(
+        level=level,
+        last=last,
+        before=config.before,
+        after=config.after,
+        base_first=config.baseline[0],
+        base_stop=config.baseline[1],
+        level_samples=config.level_samples,
+        tail_level=preparation.tail_level,
+        align_before=preparation.samples_before,
+        align_after=preparation.samples_after,
+        align_fraction=preparation.align_fraction,
+        fit_samples=preparation.decay_fit_samples,
+        edge=EDGE,
+    )
+
+
+def _aligned(records: FloatArray, window: Window) -> tuple[FloatArray, Values, Values]:
+    """Aligned pulses, tail slopes and logarithms of the current amplitude of records."""
+    n = len(records)
+    aligned = np.empty((n, window.before + window.after), np.float32)
+    slopes, amplitudes = np.empty(n), np.empty(n)
+    read_records(records, window, current_amplitude_kernel(), aligned, slopes, amplitudes)
+    return aligned, slopes, np.log(np.maximum(amplitudes, 1e-4))
+
+
+def _read_windows(
+    windows: FloatArray, window: Window, preparation: PreparationConfig
+) -> tuple[FloatArray, Values, Values]:
+    """As `_aligned`, of prepared windows: their tails lie where the preparation put them."""
+    records = np.array(windows, np.float32)  # is changed
+    aligned, _, log_amplitude = _aligned(records, window)
+    tails = records[:, -preparation.decay_fit_samples :]
+    lever = np.arange(tails.shape[1]) - 0.5 * (tails.shape[1] - 1)
+    slopes = np.log(np.maximum(tails, np.float32(1e-3))) @ (lever / (lever @ lever))
+    return aligned, slopes, log_amplitude
+
+
+def _usable(
+    aligned: FloatArray, log_amplitude: Values, config: MatchingConfig
+) -> npt.NDArray[np.bool_]:
+    quiet = np.abs(aligned[:, : max(1, config.before // 4)].mean(axis=1)) < QUIET
+    usable = np.isfinite(aligned).all(axis=1) & quiet
+    if usable.any():
+        usable &= log_amplitude > np.log(LEAST_SHARE) + np.median(log_amplitude[usable])
+    return np.asarray(usable)
+
+
+def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Mean, and the first components in units of their standard deviation, (samples, n)."""
+    mean = aligned.mean(axis=0)
+    covariance = np.cov(aligned.T.astype(float), bias=True)
+    variances, axes = np.linalg.eigh(covariance)
+    variances, axes = variances[::-1][:n], axes[:, ::-1][:, :n]
+    scaled = axes / np.sqrt(np.maximum(variances, np.finfo(float).tiny))
+    return mean, np.ascontiguousarray(scaled, np.float32)
+
+
+def _linear(
+    aligned: FloatArray,
+    slopes: Values,
+    mean: FloatArray,
+    components: FloatArray,
+    config: MatchingConfig,
+) -> Values:
+    """Stretches, components and tail slope, shape (pulses, quantities)."""
+    segments = _segments(config, aligned.shape[1])
+    matrix = np.concatenate([segments, components], axis=1)
+    out = np.empty((len(aligned), matrix.shape[1]), np.float32)
+    project(aligned, matrix, out)
+    linear = np.concatenate([out, slopes[:, np.newaxis]], axis=1, dtype=float)
+    linear[:, segments.shape[1] : -1] -= mean.astype(float) @ components
+    return linear
 
 
 def _names(config: MatchingConfig) -> tuple[str, ...]:
@@ -231,33 +342,10 @@ def _names(config: MatchingConfig) -> tuple[str, ...]:
     )
 
 
-def _segments(config: MatchingConfig, length: int) -> Tensor:
+def _segments(config: MatchingConfig, length: int) -> FloatArray:
     """Means over stretches as a matrix, shape (samples, stretches)."""
     edges = config.segments
-    matrix = torch.zeros(length, len(edges) - 1)
+    matrix = np.zeros((length, len(edges) - 1), np.float32)
     for column, (first, stop) in enumerate(pairwise(edges)):
         matrix[config.before + first : config.before + stop, column] = 1 / (stop - first)
     return matrix
-
-
-def _amplitude(aligned: Tensor, kernel: Tensor, before: int) -> Tensor:
-    """Current amplitude about the half maximum, as `pulses.parameters` defines it."""
-    current = torch.diff(aligned, dim=1)
-    near = current[:, before - EDGE : before + EDGE]
-    half = kernel.shape[1] // 2
-    steepest = near.argmax(dim=1) + before - EDGE
-    index = steepest[:, None] + torch.arange(-half - EDGE // 3, half + EDGE // 3 + 1)
-    around = current.gather(1, index.clamp(0, current.shape[1] - 1))
-    phases = nn.functional.conv1d(around[:, None], kernel[:, None])  # (pulses, phases, samples)
-    return phases.flatten(1).amax(dim=1)
-
-
-def _tail_slopes(records: Tensor, preparation: PreparationConfig) -> Tensor:
-    """Slopes per sample of the logarithm of the last samples of prepared windows."""
-    tail = records[:, -preparation.decay_fit_samples :]
-    return tail.clamp_min(1e-3).log() @ _lever(tail.shape[1])
-
-
-def _lever(samples: int) -> Tensor:
-    lever = torch.arange(samples) - 0.5 * (samples - 1)
-    return (lever / (lever @ lever)).float()

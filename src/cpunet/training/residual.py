@@ -28,9 +28,8 @@ from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.network_settings import ResidualConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.matching import DELAY
-from cpunet.training.moments import EDGE, Moments
-from cpunet.training.response_problem import BLOCK
+from cpunet.training.moments import BLOCK, EDGE, Moments
+from cpunet.training.translated import DELAY
 
 Listener = Callable[[int, float], None]
 
@@ -79,6 +78,11 @@ class Features:
     def __init__(self, data: FloatArray, recipe: Recipe) -> None:
         self.training, self.preparation = recipe.matching.training, recipe.preparation
         self.moments = Moments.of_data(data, self.training, recipe.preparation)
+        self.middle, self.components = map(
+            torch.from_numpy, (self.moments.mean, self.moments.components)
+        )
+        centres, widths = self.moments.amplitude_centres, self.moments.amplitude_widths
+        self.bins = torch.from_numpy(np.stack([centres, widths])).float()
         self.kernel = torch.from_numpy(current_amplitude_kernel())
         aligned = self._aligned(torch.from_numpy(data), self.preparation.samples_before + 1)
         aligned = aligned[torch.isfinite(aligned).all(dim=1)]
@@ -108,13 +112,12 @@ class Features:
         return at_half_maximum(records, self.moments.level, last, self.training, level)[0]
 
     def _of(self, aligned: Tensor) -> tuple[Tensor, Tensor]:
-        moments = self.moments
-        shape = (aligned - moments.mean) @ moments.components
+        shape = (aligned - self.middle) @ self.components
         slope = (self._slopes(aligned) - self.mean) @ self.axes
         logs = self._amplitudes(aligned).clamp_min(1e-4).log()
         amplitude = ((logs - self.scale[0]) / self.scale[1])[:, None]
         features = torch.cat([shape, slope, amplitude], dim=1).clamp(-OUTLIER, OUTLIER)
-        bins = (logs[:, None] - moments.amplitude_centres) / moments.amplitude_widths
+        bins = (logs[:, None] - self.bins[0]) / self.bins[1]
         return features, torch.exp(-0.5 * bins**2)
 
     def _slopes(self, aligned: Tensor) -> Tensor:

@@ -2,19 +2,95 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
+import numpy as np
+import scipy.linalg
 import torch
-from torch import Tensor
 
-from cpunet.networks.response import ROOM_AFTER, ElectronicsResponse
-from cpunet.training.moments import Moments
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.training.moments import Moments, Readings, Values
+from cpunet.training.translated import Translated
 
 # Widths of the priors about the start: wide for times (in their logarithm), and for weights
 # such that a chain may be half slow, and that a decay is mostly the main one.
 TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.3
 TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # of the finite differences
-BLOCK = 512  # pulses at a time, to bound memory
+
+
+class Parameters:
+    """The parameters of a response as one vector, with their priors.
+
+    Parameters
+    ----------
+    response
+        Its parameters are the vector, and where they are now the priors' centre.
+    """
+
+    def __init__(self, response: ElectronicsResponse) -> None:
+        self.response = response
+        named = [(n, p) for n, p in response.named_parameters() if p.numel()]
+        self._parts = [part for _, part in named]
+        self.labels = [n for n, p in named for _ in range(p.numel())]
+        self.centre = self.vector()
+        widths = {
+            "decay_weights": DECAY_WIDTH,
+            "ringing": RINGING_WIDTH,
+            "slow_weights": WEIGHT_WIDTH,
+        }
+        self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
+        times = [label.startswith("log") for label in self.labels]
+        self.steps = np.where(times, TIME_STEP, WEIGHT_STEP)
+
+    def vector(self) -> Values:
+        """Parameters as one vector."""
+        return torch.cat([p.detach().flatten() for p in self._parts]).numpy().copy()
+
+    def set(self, vector: Values) -> None:
+        """Put a vector into the response."""
+        first = 0
+        for part in self._parts:
+            stop = first + part.numel()
+            part.data.copy_(torch.from_numpy(vector[first:stop]).view_as(part))
+            first = stop
+
+    def by_name(self, values: Values) -> dict[str, float]:
+        """Values of the parameters by name and number."""
+        counted: dict[str, int] = {}
+        named = {}
+        for label, value in zip(self.labels, values.tolist(), strict=True):
+            counted[label] = counted.get(label, 0) + 1
+            named[f"{label}.{counted[label]}"] = value
+        return named
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Pulses of some energies, on both sides: what is compared with each other.
+
+    Parameters
+    ----------
+    name
+        Energies, as the user knows them.
+    sim
+        Simulated pulses, and the moments of the measured ones.
+    """
+
+    name: str
+    sim: Translated
+
+    @property
+    def moments(self) -> Moments:
+        """Functions drawn up from the measured pulses."""
+        return self.sim.moments
+
+    @property
+    def pairs(self) -> float:
+        """Number of pulses that errors go with: the harmonic sum of both sides."""
+        weights = self.sim.weights
+        simulated = weights.sum() ** 2 / (weights @ weights)
+        return float(1 / (1 / len(self.moments.data) + 1 / simulated))
 
 
 class ResponseProblem:
@@ -23,52 +99,50 @@ class ResponseProblem:
     Parameters
     ----------
     response
-        Its parameters are the vector, and where they are now the priors' centre.
-    moments
-        What is compared, drawn up from the data.
-    sim
-        Prepared simulated pulses, shape (pulses, samples).
-    noise
-        To be added to their records, shape (pulses, record), or several such sets, shape
-        (sets, pulses, record): more of them make the comparison depend less on the noise
-        that was drawn.
-    last
-        Sample of the records after all half maxima.
+        To be fitted.
+    bands
+        What is compared: moments of one band follow those of another.
     """
 
-    def __init__(
-        self,
-        response: ElectronicsResponse,
-        moments: Moments,
-        sim: Tensor,
-        noise: Tensor,
-        last: int,
-    ) -> None:
-        self.response, self.moments = response, moments
-        self.sim, self.noise, self.last = sim, noise.view(-1, *noise.shape[-2:]), last
+    def __init__(self, response: ElectronicsResponse, bands: Sequence[Band]) -> None:
+        self.parameters, self.bands = Parameters(response), tuple(bands)
         self.clip: float | None = None
-        named = [(n, p) for n, p in response.named_parameters() if p.numel()]
-        self.parameters = [parameter for _, parameter in named]
-        self.labels = [n for n, p in named for _ in range(p.numel())]
-        self.centre = self.vector()
-        widths = {
-            "decay_weights": DECAY_WIDTH,
-            "ringing": RINGING_WIDTH,
-            "slow_weights": WEIGHT_WIDTH,
-        }
-        times = [label.startswith("log") for label in self.labels]
-        self.widths = torch.tensor(
-            [widths.get(n, TIME_WIDTH) for n in self.labels], dtype=torch.float64
+        self._comparisons = [_Comparison(band, None) for band in self.bands]
+
+    @property
+    def response(self) -> ElectronicsResponse:
+        """What is fitted."""
+        return self.parameters.response
+
+    @property
+    def moments(self) -> int:
+        """How many there are in all."""
+        return sum(len(band.moments.names) for band in self.bands)
+
+    @property
+    def slope(self) -> float:
+        """Of the logarithm of the data's tails, per sample."""
+        return float(np.mean([band.moments.slope for band in self.bands]))
+
+    @property
+    def pairs(self) -> float:
+        """Number of pulses that errors go with, of all bands."""
+        return sum(band.pairs for band in self.bands)
+
+    @property
+    def left_out(self) -> int:
+        """Measured pulses that do not count."""
+        return sum(band.moments.left_out for band in self.bands)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the moments; with their band, if there are several."""
+        several = len(self.bands) > 1
+        return tuple(
+            f"{band.name}: {name}" if several else name
+            for band in self.bands
+            for name in band.moments.names
         )
-        self.steps = torch.where(torch.tensor(times), TIME_STEP, WEIGHT_STEP).double()
-        values = moments.values
-        self.wanted = values.mean(dim=0)
-        covariance = torch.cov(values.T) * (1 / len(values) + 1 / len(sim))
-        self.sigma = covariance.diagonal().sqrt().clamp_min(1e-12)
-        correlation = covariance / self.sigma[:, None] / self.sigma
-        ridge = moments.config.ridge
-        self.correlation = (1 - ridge) * correlation + ridge * torch.eye(len(correlation))
-        self.whiten = torch.linalg.cholesky(torch.linalg.inv(self.correlation)).T
 
     def allow_for_model_error(self) -> None:
         """Let the moments that physics shape, and electronics do not, count for little.
@@ -77,71 +151,69 @@ class ResponseProblem:
         edge would then bend the response to its liking; current amplitude, top and tail
         decide instead, see `Moments.model_errors`.
         """
-        correlation = self.correlation + torch.diag(self.moments.model_errors**2)
-        self.whiten = torch.linalg.cholesky(torch.linalg.inv(correlation)).T
+        self._comparisons = [_Comparison(b, b.moments.model_errors) for b in self.bands]
 
-    def of(self, response: ElectronicsResponse) -> ResponseProblem:
-        """The same comparison for another response, with its priors about where it is."""
-        return ResponseProblem(response, self.moments, self.sim, self.noise, self.last)
+    def of(
+        self, response: ElectronicsResponse, bands: Sequence[Band] | None = None
+    ) -> ResponseProblem:
+        """The comparison for another response, or other pulses, with the priors about it."""
+        return ResponseProblem(response, bands or self.bands)
 
-    def with_noise(self, noise: Tensor) -> None:
-        """Put other noise in the place of what there is, see the class."""
-        self.noise = noise.view(-1, *noise.shape[-2:])
-
-    def vector(self) -> Tensor:
-        """Parameters as one vector."""
-        return torch.cat([p.detach().flatten().clone() for p in self.parameters])
-
-    def set(self, vector: Tensor) -> None:
-        """Put a vector into the response."""
-        first = 0
-        for parameter in self.parameters:
-            stop = first + parameter.numel()
-            parameter.data.copy_(vector[first:stop].view_as(parameter))
-            first = stop
-
-    @torch.no_grad()
-    def pulls(self, vector: Tensor) -> Tensor:
+    def pulls(self, vector: Values) -> Values:
         """Deviations of the moments in standard deviations, correlated as they are."""
-        self.set(vector)
-        level = self.moments.preparation.tail_level
-        total, n = torch.zeros_like(self.wanted), 0
-        for first in range(0, len(self.sim), BLOCK):
-            rows = slice(first, first + BLOCK)
-            records = self.response(self.sim[rows])
-            plateau = records[:, -ROOM_AFTER : -ROOM_AFTER + 100].mean(dim=1, keepdim=True)
-            records = records * (level / plateau)
-            for noise in self.noise[:, rows]:
-                values = self.moments.of_records(records + noise, self.last, self.clip)
-                usable = torch.isfinite(values).all(dim=1)
-                total, n = total + values[usable].sum(dim=0), n + int(usable.sum())
-        pulls: Tensor = (total / max(n, 1) - self.wanted) / self.sigma
-        return pulls
+        self.parameters.set(vector)
+        found = [c.pulls(self.response, self.clip) for c in self._comparisons]
+        return np.concatenate(found)
 
-    def deviations(self, vector: Tensor) -> Tensor:
+    def deviations(self, vector: Values) -> Values:
         """Deviations of the moments, uncorrelated."""
-        deviations: Tensor = self.whiten @ self.pulls(vector)
-        return deviations
+        self.parameters.set(vector)
+        found = [c.whiten @ c.pulls(self.response, self.clip) for c in self._comparisons]
+        return np.concatenate(found)
 
-    def residuals(self, vector: Tensor) -> Tensor:
+    def residuals(self, vector: Values) -> Values:
         """Uncorrelated deviations, and those of the priors."""
-        prior = (vector - self.centre) / self.widths
-        return torch.cat([self.deviations(vector), prior])
+        prior = (vector - self.parameters.centre) / self.parameters.widths
+        return np.concatenate([self.deviations(vector), prior])
 
-    def jacobian(self, vector: Tensor, residuals: Tensor) -> Tensor:
+    def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters)."""
-        moments = len(self.wanted)
-        derivatives = self.derivatives(vector, residuals[:moments], range(len(vector)))
-        return torch.cat([derivatives, torch.diag(1 / self.widths)])
+        derivatives = self.derivatives(vector, residuals[: self.moments], range(len(vector)))
+        return np.concatenate([derivatives, np.diag(1 / self.parameters.widths)])
 
     def derivatives(
-        self, vector: Tensor, deviations: Tensor, parameters: Iterable[int]
-    ) -> Tensor:
+        self, vector: Values, deviations: Values, parameters: Iterable[int]
+    ) -> Values:
         """Derivatives of the deviations by finite differences, one column a parameter."""
         columns = []
         for i in parameters:
-            moved = vector.clone()
-            moved[i] += self.steps[i]
-            columns.append((self.deviations(moved) - deviations) / self.steps[i])
-        self.set(vector)
-        return torch.stack(columns, dim=1)
+            moved = vector.copy()
+            moved[i] += self.parameters.steps[i]
+            columns.append((self.deviations(moved) - deviations) / self.parameters.steps[i])
+        self.parameters.set(vector)
+        return np.stack(columns, axis=1)
+
+
+class _Comparison:
+    """One band: what its moments are to be, and how well they are known."""
+
+    def __init__(self, band: Band, model_errors: Values | None) -> None:
+        self.sim, self.moments = band.sim, band.moments
+        values = self.moments.values
+        self.wanted = values.mean(axis=0)
+        covariance = np.cov(values.T) / band.pairs
+        self.sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
+        correlation = covariance / self.sigma[:, np.newaxis] / self.sigma
+        ridge = self.moments.config.ridge
+        correlation = (1 - ridge) * correlation + ridge * np.eye(len(correlation))
+        if model_errors is not None:
+            correlation = correlation + np.diag(model_errors**2)
+        self.whiten = scipy.linalg.cholesky(np.linalg.inv(correlation))
+
+    def pulls(self, response: ElectronicsResponse, clip: float | None) -> Values:
+        def of(readings: Readings) -> tuple[Values, ...]:
+            return (readings.weights @ self.moments.functions(readings, clip),)
+
+        # far from the data many tails are beyond theirs, and none is to be left out
+        (total,), n = self.sim.sums(response, of, cut=clip is None)
+        return np.asarray((total / max(n, 1e-9) - self.wanted) / self.sigma)

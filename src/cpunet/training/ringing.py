@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
+import numpy as np
 
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
@@ -39,7 +39,7 @@ def most_promising_ringing(
     promised
         Chi-square to be expected of it, to first order.
     """
-    vector = problem.vector()
+    vector = problem.parameters.vector()
     problem.clip = None
     deviations = problem.deviations(vector)
     known = problem.derivatives(vector, deviations, range(len(vector)))
@@ -47,11 +47,11 @@ def most_promising_ringing(
     for frequency in frequencies_mhz:
         response = _ringing_copy(problem.response, config, frequency)
         tried = problem.of(response)
-        weights = [i for i, label in enumerate(tried.labels) if label == "ringing"]
-        slopes = tried.derivatives(tried.vector(), deviations, weights)
-        columns = torch.cat([known, slopes], dim=1)
-        move = torch.linalg.lstsq(columns, deviations[:, None]).solution
-        left = deviations - (columns @ move)[:, 0]
+        weights = [i for i, label in enumerate(tried.parameters.labels) if label == "ringing"]
+        slopes = tried.derivatives(tried.parameters.vector(), deviations, weights)
+        columns = np.concatenate([known, slopes], axis=1)
+        move = np.linalg.lstsq(columns, deviations)[0]
+        left = deviations - columns @ move
         response.ringing.data.zero_()  # the derivatives moved it
         if float(left @ left) < best[1]:
             best = response, float(left @ left)

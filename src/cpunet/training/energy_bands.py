@@ -1,0 +1,127 @@
+"""Bands of energy in which simulated and measured pulses are compared.
+
+Lines and continua hold different mixtures of single and multiple sites, and noise goes as
+1/energy.  So pulses of one line are compared with those of that line, and a continuum in bands
+that are narrow enough for its mixture to be the same.  Within a band of a continuum the two
+sides may have other spectra; simulated pulses then get weights that make them alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.peaks import label_peaks
+from cpunet.recipes.schema import PeakConfig
+
+Values = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
+
+WIDEST = 1.3  # ratio of a band's ends
+LEAST = 200  # pulses of each side without which a band is not compared
+SLICES = 8  # of a band, in which spectra are made alike
+HEAVIEST = 5.0  # weight of a simulated pulse
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBand:
+    """Pulses of both sides that are compared with each other.
+
+    Parameters
+    ----------
+    name
+        A line, or a range in keV.
+    sim, data
+        Rows of the two sides.
+    weights
+        Of the simulated pulses, with a mean of 1.
+    """
+
+    name: str
+    sim: Rows
+    data: Rows
+    weights: Values
+
+
+def energy_bands(
+    sim_kev: Values, data_kev: Values, peaks: Mapping[str, PeakConfig]
+) -> list[EnergyBand]:
+    """Part two sets of pulses by energy.
+
+    Parameters
+    ----------
+    sim_kev, data_kev
+        Energies of the two sides; all are pulses to be compared.
+    peaks
+        The lines known.
+
+    Returns
+    -------
+    list of EnergyBand
+        Lines first.  Pulses of energies with too few of one side are in none.
+
+    Raises
+    ------
+    CpunetError
+        If no band has enough pulses of both sides.
+
+    Examples
+    --------
+    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
+    >>> sim = np.r_[np.full(500, 2614.5), np.linspace(1000, 1200, 900)]
+    >>> data = np.r_[np.full(400, 2614.0), np.linspace(1000, 1200, 800)]
+    >>> [(b.name, len(b.sim), len(b.data)) for b in energy_bands(sim, data, lines)]
+    [('FEP', 500, 400), ('1000-1200 keV', 900, 800)]
+    """
+    labels = [label_peaks(side, peaks) for side in (sim_kev, data_kev)]
+    bands = []
+    for name in peaks:
+        sim, data = (np.flatnonzero(of == name) for of in labels)
+        if min(len(sim), len(data)) >= LEAST:
+            bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
+    inside = {band.name for band in bands}
+    between = [np.flatnonzero(~np.isin(of, [*inside])) for of in labels]
+    bands += _continuum(sim_kev, data_kev, *between)
+    if not bands:
+        raise CpunetError(
+            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {LEAST} of each at "
+            "the same energies are needed: select more energies (--peak), simulate more, or "
+            "give more files"
+        )
+    return bands
+
+
+def _continuum(sim_kev: Values, data_kev: Values, sim: Rows, data: Rows) -> list[EnergyBand]:
+    """Bands of what is on no line, from the highest energy down."""
+    bands, energies = [], (sim_kev, data_kev)
+    rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
+    while min(map(len, rows)):
+        top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
+        rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
+        counts = [
+            int((e[r] >= top / WIDEST).sum()) for r, e in zip(rows, energies, strict=True)
+        ]
+        left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
+        if min(counts) >= LEAST and min(left) < LEAST and max(left) < 2 * LEAST:
+            counts = [len(r) for r in rows]  # a small rest goes along
+        parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
+        if min(counts) >= LEAST:
+            low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
+            weights = _weights(sim_kev[parts[0]], data_kev[parts[1]])
+            bands.append(EnergyBand(f"{low:.0f}-{top:.0f} keV", parts[0], parts[1], weights))
+        rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
+    return bands
+
+
+def _weights(sim_kev: Values, data_kev: Values) -> Values:
+    """Weights of simulated pulses that give them the data's spectrum."""
+    edges = np.quantile(data_kev, np.linspace(0, 1, SLICES + 1)[1:-1])
+    of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
+    counts = [np.bincount(of, minlength=SLICES) for of in (of_sim, of_data)]
+    ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
+    weights = np.minimum(ratio, HEAVIEST)[of_sim]
+    return np.asarray(weights / weights.mean())

@@ -1,0 +1,58 @@
+"""What a misfit does to what users cut on.
+
+With many pulses any chain is told from the true one: chi-square grows with their number.
+What counts is what the difference does.  So it is also given as the shift of the current
+amplitude (A of A/E) that would make the translated distribution that of the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.training.moments import Readings, Values
+from cpunet.training.response_problem import Band
+
+STEP = 0.002  # of the logarithm of the amplitude, for the derivative
+
+
+def amplitude_shift(
+    response: ElectronicsResponse, bands: Sequence[Band]
+) -> tuple[float, float]:
+    """Relative shift that the translated current amplitudes need, and its error.
+
+    The least-squares shift of the densities of its logarithm, with their covariance from the
+    data's events.
+
+    Parameters
+    ----------
+    response
+        That translates.
+    bands
+        What is compared.
+    """
+    weight = weighted = 0.0
+    for band in bands:
+        bins = band.moments.config.amplitude_bins
+        density, slope = _density(band, response)
+        values = band.moments.values[:, -bins:]
+        inverse = np.linalg.inv(np.cov(values.T) / band.pairs + 1e-12 * np.eye(bins))
+        weight += float(slope @ inverse @ slope)
+        weighted += float(slope @ inverse @ (values.mean(axis=0) - density))
+    return weighted / weight, weight**-0.5
+
+
+def _density(band: Band, response: ElectronicsResponse) -> tuple[Values, Values]:
+    """Mean densities of translated amplitudes, and their derivatives with a shift."""
+    moments = band.moments
+
+    def of(readings: Readings) -> tuple[Values, ...]:
+        logs = readings.log_amplitude
+        return tuple(
+            readings.weights @ moments.density(logs + shift) for shift in (0.0, STEP, -STEP)
+        )
+
+    (here, up, down), n = band.sim.sums(response, of)
+    return here / n, (up - down) / (2 * STEP * n)

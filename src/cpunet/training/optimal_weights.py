@@ -1,0 +1,195 @@
+r"""The most that unpaired pulses tell of a response: many functions, optimally weighted.
+
+The chi-square of a fit compares some eighty means, each function of all pulses alike.  But what
+a bandwidth does to the edge shows best in single-site pulses, whose current amplitude is the
+highest, and hardly in the others.  So each principal component is taken in bins of the current
+amplitude too: some five hundred functions :math:`\varphi`, too many to compare one by one.
+What of them depends on the parameters is as many linear combinations as there are parameters,
+
+.. math:: t(x) = J^T C^{-1} \varphi(x), \qquad J = \partial\langle\varphi\rangle/\partial\theta,
+
+with the covariance C of the functions: the efficient weights of the generalised method of
+moments (Hansen, Econometrica 50 (1982) 1029), and Fisher's linear discriminant between one
+response and the next.  J and C come from translated simulation, at a response that a fit has
+found; the parameters are those at which the means of t agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.moments import BLOCK, Moments, Readings, Values
+from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+
+# Bins of the current amplitude are no narrower than twice its noise.
+LEAST_BIN = 0.006
+RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
+FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
+# A direction counts if pulses tell it this many times better than its prior; the longest step,
+# in widths of the priors; and the fall of the sum of squares with which it ends.
+LEAST_TOLD, LONGEST, CONVERGED, PASSES = 10.0, 0.3, 0.1, 6
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionalFunctions:
+    """The functions of `Moments`, and its components in bins of the current amplitude."""
+
+    moments: Moments
+    centres: Values
+    widths: Values
+
+    @classmethod
+    def of(cls, moments: Moments, bins: int) -> ConditionalFunctions:
+        """Equally populated bins of the data's amplitudes, narrow where these are dense."""
+        amplitudes = np.quantile(moments.data.log_amplitude, np.linspace(0.03, 0.995, bins))
+        centres = [amplitudes[-1]]
+        for amplitude in amplitudes[-2::-1]:
+            if centres[-1] - amplitude >= LEAST_BIN:
+                centres.append(amplitude)
+        found = np.array(centres[::-1])
+        widths = np.diff(found, prepend=2 * found[0] - found[min(1, len(found) - 1)])
+        return cls(moments, found, np.maximum(widths, LEAST_BIN))
+
+    def __call__(self, readings: Readings) -> Values:
+        """Functions of each pulse, shape (pulses, functions)."""
+        values = self.moments.functions(readings)
+        first = len(self.moments.config.segments) - 1
+        components = values[:, first : first + self.moments.config.components]
+        distance = (readings.log_amplitude[:, np.newaxis] - self.centres) / self.widths
+        bins = np.exp(-0.5 * distance**2)
+        both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
+        return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
+
+
+def refine(
+    near: ResponseProblem, bands: Sequence[Band], bins: int, listener: Listener | None
+) -> tuple[Values, int]:
+    """Move a response to where the optimally weighted means of both sides agree.
+
+    Weights and derivatives are those of where the response is, to which the end is near.  What
+    the pulses hardly tell, such as by how much two equal poles differ, stays as it is.
+
+    Parameters
+    ----------
+    near
+        A comparison whose fit has ended; its response is moved.
+    bands
+        All pulses.
+    bins
+        Of the current amplitude.
+    listener
+        Told step and the sum of squared deviations.
+
+    Returns
+    -------
+    tuple
+        Covariance of the parameters, and the number of steps.
+    """
+    parameters = near.parameters
+    weighted = [_Weighted(band, parameters, bins) for band in bands]
+    slopes = np.concatenate([w.slopes for w in weighted])
+    inverse_widths = 1 / parameters.widths
+    _, sizes, directions = np.linalg.svd(slopes / inverse_widths, full_matrices=False)
+    told = directions[sizes > LEAST_TOLD].T / inverse_widths[:, np.newaxis]
+    columns = np.concatenate([slopes, np.diag(inverse_widths)]) @ told
+
+    def residuals(vector: Values) -> Values:
+        parameters.set(vector)
+        found = [w.deviations(parameters.response) for w in weighted]
+        return np.concatenate([*found, (vector - parameters.centre) * inverse_widths])
+
+    vector = parameters.vector()
+    left, taken = residuals(vector), 0
+    for _ in range(PASSES):
+        move = told @ np.linalg.lstsq(columns, -left)[0]
+        tried = vector + np.clip(move, -LONGEST / inverse_widths, LONGEST / inverse_widths)
+        found = residuals(tried)
+        if found @ found >= left @ left:
+            break
+        taken += 1
+        fall = left @ left - found @ found
+        vector, left = tried, found
+        if listener is not None:
+            listener(taken, float(left @ left))
+        if fall < CONVERGED:
+            break
+    parameters.set(vector)
+    information = slopes.T @ slopes + np.diag(inverse_widths**2)
+    return np.linalg.inv(information), taken
+
+
+class _Weighted:
+    """Optimally weighted functions of one band."""
+
+    def __init__(self, band: Band, parameters: Parameters, bins: int) -> None:
+        self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
+        slopes = _slopes(band, self.functions, parameters)
+        covariance = _covariance(band, self.functions, parameters.response)
+        sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
+        correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
+        correlation += RIDGE * np.eye(len(sigma))
+        self.weights = np.linalg.solve(correlation, slopes / sigma[:, np.newaxis])
+        self.weights /= sigma[:, np.newaxis]
+        data = band.moments.data
+        of_data = np.concatenate(
+            [self.functions(data[rows]) @ self.weights for rows in _blocks(len(data))]
+        )
+        self.wanted = of_data.mean(axis=0)
+        spread = np.cov(of_data.T).reshape(len(self.wanted), -1) / band.pairs
+        self.whiten = scipy.linalg.cholesky(np.linalg.inv(spread))
+        self.slopes = self.whiten @ self.weights.T @ slopes
+
+    def deviations(self, response: ElectronicsResponse) -> Values:
+        def of(readings: Readings) -> tuple[Values, ...]:
+            return (readings.weights @ self.functions(readings),)
+
+        (total,), n = self.band.sim.sums(response, of)
+        return np.asarray(self.whiten @ (total / n @ self.weights - self.wanted))
+
+
+def _blocks(n: int) -> list[slice]:
+    return [slice(first, first + BLOCK) for first in range(0, n, BLOCK)]
+
+
+def _slopes(band: Band, functions: ConditionalFunctions, parameters: Parameters) -> Values:
+    """Derivatives of the functions' means with the parameters, (functions, parameters)."""
+
+    def mean() -> Values:
+        (total,), n = sim.sums(
+            parameters.response, lambda r: (r.weights @ functions(r),), draws=1
+        )
+        return np.asarray(total / n)
+
+    sim, vector, columns = band.sim.first(FOR_WEIGHTS), parameters.vector(), []
+    for i, step in enumerate(parameters.steps):
+        means = []
+        for sign in (1, -1):
+            moved = vector.copy()
+            moved[i] += sign * step
+            parameters.set(moved)
+            means.append(mean())
+        columns.append((means[0] - means[1]) / (2 * step))
+    parameters.set(vector)
+    return np.stack(columns, axis=1)
+
+
+def _covariance(
+    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
+) -> Values:
+    """Covariance of the functions over the pulses of both sides."""
+
+    def of(readings: Readings) -> tuple[Values, ...]:
+        values = functions(readings)
+        return readings.weights @ values, (readings.weights * values.T) @ values
+
+    (total, squares), n = band.sim.first(FOR_WEIGHTS).sums(response, of, draws=1)
+    mean = total / n
+    simulated = squares / n - np.outer(mean, mean)
+    measured = functions(band.moments.data[slice(0, FOR_WEIGHTS)])
+    return np.asarray(0.5 * (simulated + np.cov(measured.T)))

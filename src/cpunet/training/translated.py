@@ -1,0 +1,219 @@
+"""Simulated pulses behind a response and noise, read block by block on all cores.
+
+A comparison asks the same question at many responses: of what mean are these functions?
+The noise is therefore drawn once, so that two responses are compared with the same noise,
+and what is kept of a pulse is its part of a sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.networks.response import (
+    ROOM_AFTER,
+    ROOM_BEFORE,
+    ElectronicsResponse,
+    padded_length,
+    record_length,
+)
+from cpunet.pulses.container import FloatArray
+from cpunet.training.moments import BLOCK, Moments, Readings, Values
+
+# Half maxima come at most this many samples after the aligned one: what the response delays.
+DELAY = 100
+PLATEAU = 100  # samples after the window whose mean tells the height of a record
+# Traces of noise that are kept, each twice as long as a record.  More pulses than these share
+# them, at other places and with other signs.
+NOISE_TRACES = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise for a set of pulses, the same whenever it is asked for.
+
+    Parameters
+    ----------
+    traces
+        For an energy of 1 keV, shape (traces, samples).
+    trace, start, factor
+        Of each draw and pulse: which trace, from which sample on, and its sign over the energy;
+        each of shape (draws, pulses).
+    """
+
+    traces: FloatArray
+    trace: npt.NDArray[np.intp]
+    start: npt.NDArray[np.intp]
+    factor: FloatArray
+
+    @classmethod
+    def draw(
+        cls,
+        noise: BaselineNoise,
+        energy_kev: Values,
+        length: int,
+        draws: int,
+        rng: np.random.Generator,
+    ) -> Noise:
+        """Draw noise for records of `length` samples.
+
+        Every second draw is the one before it with the other sign: what noise adds to a mean
+        cancels.
+
+        Raises
+        ------
+        CpunetError
+            If an energy is not a positive number.
+        """
+        n, pairs = len(energy_kev), -(-draws // 2)
+        require_energies(energy_kev)
+        kept = min(NOISE_TRACES, n * pairs)
+        traces = noise.draw(np.ones(kept), 2 * length, rng)
+        # each trace before any is used again
+        trace = np.concatenate([rng.permutation(kept) for _ in range(-(-n * pairs // kept))])
+        sign = rng.choice((-1.0, 1.0), (pairs, n))
+        return cls(
+            traces,
+            np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)[:draws],
+            np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)[:draws],
+            np.asarray(
+                np.stack([sign, -sign], axis=1).reshape(2 * pairs, n)[:draws] / energy_kev,
+                np.float32,
+            ),
+        )
+
+    def add(self, records: FloatArray, draw: int, first: int) -> FloatArray:
+        """Records of the pulses from `first` on, with the noise of a draw."""
+        noisy = np.empty_like(records)
+        length = records.shape[1]
+        for i, record in enumerate(records):
+            row = first + i
+            start = self.start[draw, row]
+            drawn = self.traces[self.trace[draw, row], start : start + length]
+            np.multiply(drawn, self.factor[draw, row], out=noisy[i])
+            noisy[i] += record
+        return noisy
+
+
+@dataclass(frozen=True, eq=False)
+class Translated:
+    """A set of simulated pulses, the noise they get, and the functions they are compared by.
+
+    Parameters
+    ----------
+    sim
+        Prepared simulated pulses, shape (pulses, samples).
+    noise
+        Of their records.
+    moments
+        Drawn up from the data that they are compared with.
+    weights
+        Of the pulses, shape (pulses,).
+    """
+
+    sim: FloatArray
+    noise: Noise
+    moments: Moments
+    weights: Values
+
+    def __len__(self) -> int:
+        return len(self.sim)
+
+    @property
+    def length(self) -> int:
+        """Samples of a record."""
+        return record_length(self.sim.shape[1])
+
+    def first(self, n: int) -> Translated:
+        """The first `n` pulses, with their noise."""
+        noise = Noise(
+            self.noise.traces,
+            self.noise.trace[:, :n],
+            self.noise.start[:, :n],
+            self.noise.factor[:, :n],
+        )
+        return Translated(self.sim[:n], noise, self.moments, self.weights[:n])
+
+    def sums(
+        self,
+        response: ElectronicsResponse,
+        of: Callable[[Readings], tuple[Values, ...]],
+        *,
+        cut: bool = True,
+        draws: int | None = None,
+    ) -> tuple[tuple[Values, ...], float]:
+        """Sums over all pulses and draws of noise, and the weight of those that count.
+
+        Parameters
+        ----------
+        response
+            What the pulses pass through.
+        of
+            Weighted sums over the pulses of one block; called in several threads.
+        cut
+            See `Moments.read`.
+        draws
+            Only so many of the draws.
+
+        Returns
+        -------
+        tuple
+            The sums, and the weight of the pulses in them.
+        """
+        transfer = self._transfer(response)
+        threads = torch.get_num_threads()
+
+        def one(first: int) -> list[tuple[tuple[Values, ...], float]]:
+            return [
+                (of(readings), float(readings.weights.sum()))
+                for readings in self._block(transfer, first, cut=cut, draws=draws)
+            ]
+
+        starts = range(0, len(self), BLOCK)
+        if threads == 1 or len(starts) == 1:
+            parts = [part for first in starts for part in one(first)]
+        else:
+            with ThreadPoolExecutor(min(threads, len(starts))) as pool:
+                parts = [part for found in pool.map(one, starts) for part in found]
+        # in the order of the pulses, whichever thread was first
+        sums = zip(*(found for found, _ in parts), strict=True)
+        totals = tuple(np.sum(np.stack(one), axis=0) for one in sums)
+        return totals, sum(n for _, n in parts)
+
+    def _transfer(self, response: ElectronicsResponse) -> npt.NDArray[np.complex64]:
+        with torch.no_grad():
+            transfer = response.transfer(padded_length(self.length))
+        return np.asarray(transfer.numpy(), np.complex64)
+
+    def _block(
+        self,
+        transfer: npt.NDArray[np.complex64],
+        first: int,
+        *,
+        cut: bool,
+        draws: int | None,
+    ) -> Iterator[Readings]:
+        """Readings of one block of pulses, draw by draw."""
+        preparation = self.moments.preparation
+        sim = self.sim[first : first + BLOCK]
+        padded = padded_length(self.length)
+        current = np.zeros((len(sim), self.length), np.float32)
+        current[:, ROOM_BEFORE] = sim[:, 0]
+        np.subtract(sim[:, 1:], sim[:, :-1], out=current[:, ROOM_BEFORE + 1 : -ROOM_AFTER])
+        spectrum = scipy.fft.rfft(current, padded)
+        spectrum *= transfer
+        records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
+        plateau = records[:, -ROOM_AFTER : PLATEAU - ROOM_AFTER].mean(axis=1, keepdims=True)
+        records *= preparation.tail_level / plateau
+        last = ROOM_BEFORE + preparation.samples_before + DELAY
+        for draw in range(len(self.noise.factor))[:draws]:
+            noisy = self.noise.add(records, draw, first)
+            weights = self.weights[first : first + BLOCK]
+            yield self.moments.read(noisy, last, cut=cut, weights=weights)
