@@ -11,17 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside as aside_with_marker
-from cpunet.files import refuse_existing, require_replaceable, written_aside
+from cpunet.files import folder_written_aside as aside_of_kind
+from cpunet.files import written_aside
+from cpunet.outputs import MARKER, FolderKind
+
+KIND = FolderKind("thing", "cpunet make", known_by="old", own="old|new")
 
 
 def folder_written_aside(target, *, force=False):
-    return aside_with_marker(target, marker="old", force=force)
+    return aside_of_kind(target, KIND, force=force)
 
 
 def listing(folder: Path) -> list[str]:
-    """Every name in a folder, hidden ones too."""
-    return sorted(path.name for path in folder.iterdir())
+    """Every name in a folder, hidden ones too, but for the marker that all folders have."""
+    return sorted(path.name for path in folder.iterdir() if path.name != MARKER)
 
 
 def test_a_file_appears_at_the_end(tmp_path):
@@ -150,40 +153,6 @@ def test_a_file_in_the_place_of_a_folder_is_no_traceback(tmp_path):
         with folder_written_aside(target, force=True):
             pass
     assert listing(tmp_path) == ["run"]
-
-
-def test_refuse_existing(tmp_path):
-    refuse_existing(tmp_path / "none")
-    refuse_existing(tmp_path, force=True)
-    with pytest.raises(CpunetError, match="--force"):
-        refuse_existing(tmp_path)
-
-
-def test_force_replaces_nothing_but_folders_of_its_kind(tmp_path):
-    target = tmp_path / "home"
-    target.mkdir()
-    (target / "thesis.tex").touch()
-    with pytest.raises(CpunetError, match=r"is no folder with a run\.json"):  # noqa: SIM117
-        with aside_with_marker(target, marker="run.json", force=True):
-            pytest.fail("entered")
-    assert listing(target) == ["thesis.tex"]
-    (target / "thesis.tex").unlink()
-    with folder_written_aside(target, force=True) as aside:  # an empty one is fair game
-        (aside / "run.json").touch()
-    assert listing(target) == ["run.json"]
-    assert listing(tmp_path) == ["home"]
-
-
-def test_require_replaceable(tmp_path):
-    target = tmp_path / "run"
-    require_replaceable(target, marker="run.json")
-    target.mkdir()
-    require_replaceable(target, marker="run.json")
-    (target / "thesis.tex").touch()
-    with pytest.raises(CpunetError, match=r"is no folder with a run\.json"):
-        require_replaceable(target, marker="run.json")
-    (target / "run.json").touch()
-    require_replaceable(target, marker="run.json")
 
 
 NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)

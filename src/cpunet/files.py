@@ -11,6 +11,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cpunet.errors import CpunetError
+from cpunet.outputs import (
+    FolderKind,
+    Given,
+    Note,
+    keep_others,
+    mark,
+    refuse_existing,
+    require_replaceable,
+    told_kept,
+)
 
 
 @contextmanager
@@ -53,19 +63,28 @@ def remove_partial(target: Path) -> None:
 
 
 @contextmanager
-def folder_written_aside(target: Path, *, marker: str, force: bool = False) -> Iterator[Path]:
+def folder_written_aside(
+    target: Path,
+    kind: FolderKind,
+    *inputs: Given,
+    force: bool = False,
+    note: Note = lambda _message: None,
+) -> Iterator[Path]:
     """Give a temporary folder beside `target`; move it there if all went well.
 
     Parameters
     ----------
     target
         The folder to make.
-    marker
-        A file that all folders of this kind hold.  With `force`, only an empty
-        folder or one with that file is replaced, so that a slip of the keyboard
-        cannot delete anything else.
+    kind
+        What it is.  With `force`, only an empty folder or one of the same kind is replaced,
+        and in it only what the program wrote.
+    inputs
+        Files and folders that are read: `target` may neither be nor hold nor lie in one.
     force
         Replace an existing folder.
+    note
+        Told of what is kept of an old folder.
 
     Raises
     ------
@@ -73,17 +92,21 @@ def folder_written_aside(target: Path, *, marker: str, force: bool = False) -> I
         If `target` exists and may not be replaced, or its parent cannot be written to.
     """
     target = Path(target)
-    refuse_existing(target, force=force)
-    require_replaceable(target, marker=marker)
+    refuse_existing(target, *inputs, force=force)
+    require_replaceable(target, kind)
+    place = target.resolve() if target.is_symlink() else target
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror})") from error
     try:
         yield aside
         aside.chmod(0o777 & ~_umask())
-        _take_the_place(aside, target)
+        mark(aside, kind)
+        kept = keep_others(place, aside, kind) if place.exists() else []
+        _take_the_place(aside, place)
+        told_kept(target, kept, note)
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
@@ -103,27 +126,6 @@ def _take_the_place(aside: Path, target: Path) -> None:
         old.replace(target)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def refuse_existing(target: Path, *, force: bool = False) -> None:
-    """Raise a `CpunetError` if `target` is there already and `force` is off."""
-    if target.exists() and not force:
-        raise CpunetError(f"{target}: exists already; choose another name or give --force")
-
-
-def require_replaceable(target: Path, *, marker: str) -> None:
-    """Raise a `CpunetError` if `target` is there, but no folder that may be replaced.
-
-    An empty folder may be, and one that holds the file `marker`.
-    """
-    if not target.exists():
-        return
-    made = target.is_dir() and ((target / marker).is_file() or not any(target.iterdir()))
-    if not made:
-        raise CpunetError(
-            f"{target}: is no folder with a {marker}, so --force does not replace it; "
-            "choose another name"
-        )
 
 
 def _umask() -> int:

@@ -29,8 +29,17 @@ from cpunet.analysis.report_tables import (
     survival_html,
     verdicts_html,
 )
+from cpunet.outputs import FolderKind
 
 METRICS = "metrics.json"
+REPORT = FolderKind(
+    name="report",
+    command="cpunet validate",
+    known_by=METRICS,
+    own=r"metrics\.json|report\.html|figures\.npz",
+    older=r"(spectrum|losses|.*_(forward_cycle|backward_cycle|mean_pulse|single_pulse|superpulses"
+    r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
+)
 DPI = 150
 WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
 MANY = 4  # figures, from which on they are folded away

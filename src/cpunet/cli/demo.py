@@ -11,6 +11,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
 from cpunet.cli.scores import score_table
 from cpunet.cli.stand import DetectorFile, Events, Kind, KindOption, wanted_events
+from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
 Preset = Annotated[
@@ -45,9 +46,12 @@ def demo(
     """
     from cpunet.electronics.presets import read_electronics
     from cpunet.jobs.demo import demonstrate
+    from cpunet.jobs.demo_parts import PARTS
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
 
+    for part in PARTS:
+        refuse_inputs(out_folder / part, preset, detector, recipe)
     names, numbers = wanted_events(events)
     metrics = demonstrate(
         read_electronics(preset),

@@ -13,6 +13,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import err, monitor, out
 from cpunet.cli.scores import PARAMETERS
 from cpunet.cli.train import Peak, RecipeName, Set
+from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the run folders to make.")]
 Seeds = Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")]
@@ -61,6 +62,7 @@ def ensemble(
     from cpunet.jobs.inputs import InputFile
     from cpunet.recipes import load_recipe
 
+    refuse_inputs(out_folder, recipe)
     try:
         told = train_ensemble(
             InputFile(sim, sim_table, sim_energy, dt_ns=dt),

@@ -9,6 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.outputs import refuse_inputs
 
 Runs = Annotated[
     list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
@@ -59,6 +60,7 @@ def explore(
     from cpunet.jobs.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
+    refuse_inputs(out_file, detector, settings_file)
     measured = None
     if data is not None:
         measured = InputFile(data, data_table, data_energy, kev_per_adc, dt)

@@ -9,6 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.outputs import refuse_inputs
 
 DetectorFile = Annotated[
     str,
@@ -41,6 +42,8 @@ def fields(
     from cpunet.jobs.fields import describe_fields
     from cpunet.simulation.geometry_readers import read_detector
 
+    if out_file is not None:
+        refuse_inputs(out_file, detector)
     told = describe_fields(
         read_detector(detector, set_values or (), crystal),
         out_file,

@@ -58,6 +58,7 @@ def weights(
         dt_ns=dt,
         peak=peak,
         force=force,
+        monitor=monitor(),
     )
     out.print(f"{out_folder}: a run of {', '.join(info['imported'])}", soft_wrap=True)
 

@@ -11,6 +11,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 
 library = typer.Typer(
     help="Make pulse-shape libraries, and put them behind the learned electronics.",
@@ -68,6 +69,7 @@ def make(
     from cpunet.jobs.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
+    refuse_inputs(out_file, detector, settings)
     degrees = parse_numbers(angles, angles.count(",") + 1, "--angles")
     if any(angle != int(angle) for angle in degrees):
         raise CpunetError(f"--angles {angles}: give whole degrees")

@@ -13,8 +13,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out
+from cpunet.cli.messages import monitor, out
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 
 Runs = Annotated[
     list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
@@ -66,12 +67,14 @@ def response(
 
     if stand is not None and electronics is not None:
         raise CpunetError("--stand and --electronics both name the truth; give one of them")
+    if out_folder is not None:
+        refuse_inputs(out_folder, stand, electronics)
     truth = None
     if stand is not None:
         truth = stand_electronics(stand)
     elif electronics is not None:
         truth = read_electronics(electronics)
-    told = describe_responses(runs, truth=truth, out=out_folder, force=force)
+    told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
     table = response_table(told)
     # whole, also where it is wider than a terminal or a log's 80 columns
     width = out.measure(table, options=out.options.update(max_width=_WIDEST)).maximum

@@ -11,6 +11,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
 from cpunet.cli.values import parse_events, parse_numbers, parse_resolution
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
     from cpunet.jobs.hit_sources import HitSource
@@ -214,6 +215,7 @@ def simulate(
             "give either --hits FILE or --events N (for the gamma Monte Carlo); pulse-shape "
             "libraries are made by cpunet library make"
         )
+    refuse_inputs(out_file, detector, settings_file)
     peaks = load_recipe("small").peaks
     source: HitSource
     if hits is not None:

@@ -11,6 +11,7 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
     from cpunet.jobs.stand import StandSummary
@@ -63,6 +64,7 @@ def stand(
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
 
+    refuse_inputs(out_folder, preset, detector)
     names, numbers = wanted_events(events)
     summary = make_stand(
         read_electronics(preset),

@@ -14,6 +14,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import fail, monitor, out
 from cpunet.errors import CpunetError
 from cpunet.jobs.monitor import Monitor
+from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:  # torch takes seconds to import
     from cpunet.training.team import Launch
@@ -83,6 +84,7 @@ def train(
     from cpunet.training.loop import StoppedError
     from cpunet.training.team import ToldElsewhereError, launch
 
+    refuse_inputs(out_folder, recipe)
     keep_freed_memory()
     if threads is not None:
         torch.set_num_threads(threads)

@@ -13,6 +13,7 @@ from cpunet.cli import options
 from cpunet.cli.ensemble import Jobs, Resume, Threads
 from cpunet.cli.messages import err, monitor, out
 from cpunet.cli.train import Peak, RecipeName, Set
+from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the search to make.")]
 Trials = Annotated[int, typer.Option(min=1, help="Trials in all, those already done included.")]
@@ -49,6 +50,7 @@ def tune(
     from cpunet.jobs.tune import BEST, tune_recipe
     from cpunet.recipes import load_recipe
 
+    refuse_inputs(out_folder, recipe)
     try:
         told = tune_recipe(
             InputFile(sim, sim_table, sim_energy, dt_ns=dt),

@@ -11,7 +11,8 @@ from cpunet.analysis.report import METRICS
 from cpunet.analysis.side_by_side import SideBySide, side_by_side
 from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
+from cpunet.outputs import refuse_existing
 
 REPORT = "report"  # folder of a demonstration that holds the metrics
 
@@ -50,7 +51,7 @@ def compare_reports(
     if out is not None:
         if out.is_dir():
             raise CpunetError(f"{out}: is a folder; give the name of a page, as compare.html")
-        refuse_existing(out, force=force)
+        refuse_existing(out, *reports, force=force)
     files = [_metrics_file(report) for report in reports]
     runs = dict(zip(_names(reports), map(read_metrics, files), strict=True))
     table = side_by_side(runs, method)

@@ -7,8 +7,7 @@ from typing import Any
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing
-from cpunet.jobs.demo_parts import PARTS, remove_parts, require_same_parts
+from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
 from cpunet.jobs.hit_sources import energy_windows
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
@@ -16,6 +15,7 @@ from cpunet.jobs.stand import write_stand
 from cpunet.jobs.stand_plan import Kind, StandPlan
 from cpunet.jobs.train import train_run
 from cpunet.jobs.validate import validate_run
+from cpunet.outputs import refuse_existing
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.simulation.geometry import Detector
@@ -70,18 +70,20 @@ def demonstrate(
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is no folder; give another --out")
     stand, run, report = (out / part for part in PARTS)
-    refuse_existing(report, force=force)
+    if is_there(out, "report"):
+        refuse_existing(report, force=force)
     windows = tuple(energy_windows(",".join(events), recipe.peaks, _HALF_WINDOW_KEV))
     plan = StandPlan.of(
         electronics, detector, windows, tuple(events.values()), kind=kind, seed=seed
     )
     if force:
-        remove_parts(out)
+        remove_parts(out, monitor.note)
     require_same_parts(out, plan, recipe, _PEAK)
-    if not stand.exists():
-        write_stand(plan, stand, monitor=monitor)
+    # a folder of a part that is not there holds files of others only, which are kept
+    if not is_there(out, "stand"):
+        write_stand(plan, stand, force=stand.exists(), monitor=monitor)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
-    if not run.exists():
+    if not is_there(out, "run"):
         train_run(
             sim,
             data,
@@ -92,7 +94,7 @@ def demonstrate(
             device=device,
             # what was begun and not ended goes on, but for --force
             resume=isinstance(recipe.training, TrainingConfig) and not force,
-            force=force,
+            force=force or run.exists(),
             monitor=monitor,
         )
     return validate_run(
@@ -101,6 +103,7 @@ def demonstrate(
         data,
         report,
         truth=stand / "truth.npz",
+        force=report.exists(),
         seed=seed,
         device=device,
         monitor=monitor,

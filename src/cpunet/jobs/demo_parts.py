@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from cpunet.analysis.report import METRICS
+from cpunet.analysis.report import METRICS, REPORT
 from cpunet.errors import CpunetError
-from cpunet.files import require_replaceable
-from cpunet.jobs.stand import MARKER
+from cpunet.jobs.stand import MARKER, STAND
 from cpunet.jobs.stand_plan import StandPlan
+from cpunet.outputs import Note, made_here, remove_own, require_replaceable, told_kept
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import INFO, read_info, read_recipe
+from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
 
 # in the order they are made; and the file that each has when it is whole
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
 _WAY_OUT = "give --force to make all parts anew, or another --out"
 _NONE = "none"
+_KINDS = {"stand": STAND, "run": RUN, "report": REPORT}
 
 
 def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) -> None:
@@ -41,13 +41,13 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
         or if the run's stand is gone.
     """
     stand, run, _ = (out / part for part in PARTS)
-    if stand.exists():
+    if is_there(out, "stand"):
         wanted = plan.provenance()
         made = _read_stand(stand)
         _require_same(stand, {key: made.get(key) for key in wanted}, wanted)
-    elif run.exists():
+    elif is_there(out, "run"):
         raise CpunetError(f"{run}: its stand is gone; {_WAY_OUT}")
-    if run.exists():
+    if is_there(out, "run"):
         info = read_info(run)
         _require_same(
             run,
@@ -56,21 +56,31 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
         )
 
 
-def remove_parts(out: Path) -> None:
+def is_there(out: Path, part: str) -> bool:
+    """Whether a part is there, other than a folder of files that the program did not write."""
+    folder, kind = out / part, _KINDS[part]
+    emptied = made_here(folder, kind) and not (folder / kind.known_by).exists()
+    return folder.exists() and not emptied
+
+
+def remove_parts(out: Path, note: Note) -> None:
     """Remove all parts, or none if anything else is in the place of one.
+
+    What the program did not write there is kept, and told.
 
     Raises
     ------
     CpunetError
         If a part's place holds something else, or a part cannot be removed.
     """
-    for part, marker in PARTS.items():
-        require_replaceable(out / part, marker=marker)
+    for part, kind in _KINDS.items():
+        require_replaceable(out / part, kind)
     # the stand last: interrupted, no run is left without its stand
-    for folder in (out / part for part in reversed(PARTS)):
+    for part in reversed(PARTS):
+        folder = out / part
         try:
             if folder.exists():
-                shutil.rmtree(folder)
+                told_kept(folder, remove_own(folder, _KINDS[part]), note)
         except OSError as error:
             reason = error.strerror or error
             raise CpunetError(f"{folder}: cannot be removed ({reason})") from error

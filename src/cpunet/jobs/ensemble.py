@@ -24,6 +24,7 @@ from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.checkpoints import require_same
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
+    ENSEMBLE_KIND,
     member_folder,
     read_json,
     require_usable,
@@ -96,10 +97,14 @@ def train_ensemble(
     if seeds < 1:
         raise CpunetError(f"--seeds {seeds}: give 1 or more")
     device = resolve_device(device)
-    require_usable(out, ENSEMBLE, resume=resume, force=force)
+    require_usable(
+        out, ENSEMBLE_KIND, *sim.files, *data.files, truth, resume=resume, force=force
+    )
     begun_with = {"recipe": recipe.model_dump(mode="json"), "peak": peak}
     begun_with |= fingerprints(sim, data, recipe, peak, monitor)
-    with working_folder(out, ENSEMBLE, resume=resume, force=force) as folder:
+    with working_folder(
+        out, ENSEMBLE_KIND, resume=resume, force=force, note=monitor.note
+    ) as folder:
         ensemble = _Ensemble(folder, begun_with)
         member = _Member(sim, data, folder, recipe, peak, validate, truth, device)
         left = [seed for seed in range(seeds) if not member.is_done(seed)]

@@ -14,11 +14,12 @@ from cpunet.analysis.explorer import Exploration, explorer_page
 from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import InputFile, load_measured
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.places import Places, place_pulses, settings_at
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Rejection
@@ -82,7 +83,7 @@ def explore_runs(
         If the page exists, runs, settings or data do not go together, the detector is not
         depleted, or no place has a pulse.
     """
-    refuse_existing(out, force=force)
+    refuse_existing(out, *runs, *([] if data is None else data.files), force=force)
     if not FEWEST <= points <= MOST:
         raise CpunetError(f"--points {points}: give from {FEWEST} to {MOST} places")
     translators = _load(runs, resolve_device(device))

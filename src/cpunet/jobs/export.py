@@ -12,9 +12,10 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.monitor import Monitor
 from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.outputs import refuse_existing
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import NetworkBackend, ResponseBackend
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
@@ -79,7 +80,7 @@ def export_run(
     """
     card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
     for path in (out, card, noise_file):
-        refuse_existing(path, force=force)
+        refuse_existing(path, run, report, force=force)
     kind: type[Translator] = IREN if inverse else REN
     translator = kind.load(run)
     info = read_info(run)

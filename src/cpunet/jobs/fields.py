@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.simulate import ImpurityFrom, solved
+from cpunet.outputs import refuse_existing
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import LI_CONTACT, Detector, FloatArray
 from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE

@@ -7,11 +7,12 @@ from pathlib import Path
 from cpunet.analysis.figures import loss_curves
 from cpunet.analysis.report import DPI
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.evaluation import evaluate
 from cpunet.jobs.figures import Maker, figure_makers
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
+from cpunet.outputs import refuse_existing
 from cpunet.training.run_folder import read_losses
 
 QUIET = Monitor()

@@ -16,10 +16,11 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.monitor import Monitor
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import INFO, versions, write_run
+from cpunet.training.run_folder import RUN, versions, write_run
 from cpunet.translation.published import read_discriminator, read_generator
 from cpunet.translation.restricted_unpickler import TruncatedError, load_all
 
@@ -40,6 +41,7 @@ def import_weights(
     dt_ns: float = 16.0,
     peak: str = "FEP",
     force: bool = False,
+    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Make a run folder of published state dicts, which `REN.load` and `IREN.load` take.
 
@@ -57,6 +59,8 @@ def import_weights(
         What they were trained on.
     force
         Replace an existing run folder.
+    monitor
+        Told of what is kept of it.
 
     Returns
     -------
@@ -75,6 +79,7 @@ def import_weights(
         "discriminator_data": discriminator_data,
         "discriminator_sim": discriminator_sim,
     }
+    refuse_existing(out, *given.values(), force=force)
     files = {part: path for part, path in given.items() if path is not None}
     if ren is None and iren is None:
         raise CpunetError("no generator given; name fep_REN.pt, fep_IREN.pt or both")
@@ -115,7 +120,7 @@ def import_weights(
         "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions(),
     }
-    with folder_written_aside(out, marker=INFO, force=force) as folder:
+    with folder_written_aside(out, RUN, force=force, note=monitor.note) as folder:
         write_run(folder, nn.ModuleDict(networks), recipe, info)
     return info
 
@@ -161,6 +166,7 @@ def import_pulses(
     CpunetError
         If the pickle asks for more than arrays and plain containers, or holds no pulse.
     """
+    refuse_existing(out, source, force=force)
     counts: Counter[str] = Counter()
     ended: list[str] = []
     length = 0

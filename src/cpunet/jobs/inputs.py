@@ -35,6 +35,11 @@ class InputFile:
     kev_per_adc: float | None = None
     dt_ns: float | None = None
 
+    @property
+    def files(self) -> tuple[Path | str | None, ...]:
+        """What is read, for `cpunet.outputs.refuse_inputs`."""
+        return self.path, self.energy
+
     def open(self) -> PulseSource:
         """Open the file."""
         return open_pulses(

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.outputs import refuse_existing
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import SimulationSettings

@@ -23,14 +23,23 @@ from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.noise import noise_power
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside, refuse_existing
+from cpunet.files import folder_written_aside
+from cpunet.jobs.monitor import Monitor
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 
+QUIET = Monitor()
 MARKER = "response.json"
+RESPONSE = FolderKind(
+    name="response",
+    command="cpunet response",
+    known_by=MARKER,
+    own=r"response\.json|response\.png",
+)
 
 _DPI = 150
 _LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
@@ -60,6 +69,7 @@ def describe_responses(
     truth: Electronics | None = None,
     out: Path | None = None,
     force: bool = False,
+    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Say in terms of physics which readout chains trainings have learned.
 
@@ -73,6 +83,8 @@ def describe_responses(
         Folder to make, with ``response.json`` and ``response.png``; None for none.
     force
         Replace an existing folder.
+    monitor
+        Told of what is kept of it.
 
     Returns
     -------
@@ -90,7 +102,7 @@ def describe_responses(
         If a run holds no response, or runs or truth do not fit each other.
     """
     if out is not None:
-        refuse_existing(out, force=force)
+        refuse_existing(out, *runs, force=force)
     learned = [_read_run(Path(run)) for run in runs]
     if not learned:
         raise CpunetError("no run was given; give the folder of one")
@@ -111,7 +123,9 @@ def describe_responses(
     if out is not None:
         window = first.preparation.samples_after * first.dt_ns
         figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
-        with folder_written_aside(out, marker=MARKER, force=force) as folder:
+        with folder_written_aside(
+            out, RESPONSE, *runs, force=force, note=monitor.note
+        ) as folder:
             text = json.dumps(told, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
             figure.savefig(folder / "response.png", dpi=_DPI)

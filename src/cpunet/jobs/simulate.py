@@ -13,9 +13,10 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.hit_sources import HitSource, Window
+from cpunet.jobs.hit_sources import HitFile, HitSource, Window
 from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.jobs.simulation_summary import Clock, Summary
+from cpunet.outputs import refuse_inputs
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import EventPulses, simulate_events
@@ -110,6 +111,7 @@ def simulate_file(
     """
     clock = Clock()
     made_by = f"cpunet simulate {cpunet.__version__}"
+    refuse_inputs(out, source.path if isinstance(source, HitFile) else None)
     writer = PulseWriter(out, attrs={"made_by": made_by}, force=force)
     _check(cluster_mm, resolution)
     opened = source.open(detector)

@@ -21,6 +21,7 @@ from cpunet.jobs.growing_archive import GrowingArchive
 from cpunet.jobs.hit_sources import Window
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.stand_plan import LABELS, OTHER, Kind, Labels, StandPlan
+from cpunet.outputs import FolderKind
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.geometry import Detector
@@ -28,6 +29,12 @@ from cpunet.simulation.library_lookup import Library
 
 QUIET = Monitor()
 MARKER = "stand.json"
+STAND = FolderKind(
+    name="stand",
+    command="cpunet stand",
+    known_by=MARKER,
+    own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
+)
 # Events of a side from which on building a library of pulses (20 s on two cores) takes less
 # time than drifting their hits, some 20 each.
 _LIBRARY_FROM_EVENTS = 20_000
@@ -112,7 +119,7 @@ def write_stand(
     """Make a planned stand; the rest is as for `make_stand`."""
     many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
     summary = StandSummary()
-    with folder_written_aside(out, marker=MARKER, force=force) as folder:
+    with folder_written_aside(out, STAND, force=force, note=monitor.note) as folder:
         library = plan.sim.library(monitor) if many else None
         _write_sim(folder, plan, library, summary, monitor)
         if many and plan.shift is not None:

@@ -10,8 +10,9 @@ from urllib.parse import quote
 from cpunet.analysis.report import METRICS
 from cpunet.analysis.summary_page import Entry, summary_page
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.compare import read_metrics
+from cpunet.outputs import refuse_existing
 
 REPORT = "report"  # name of a folder that says nothing about what is in it
 PAGE = "report.html"
@@ -47,7 +48,7 @@ def summarise_reports(
     """
     if out.is_dir():
         raise CpunetError(f"{out}: is a folder; give the name of a page, as index.html")
-    refuse_existing(out, force=force)
+    refuse_existing(out, *reports, force=force)
     entries = []
     known: dict[tuple[str, str], Path] = {}
     for report in reports:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -34,7 +34,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.loop import Keeping, Listener, Record, train
 from cpunet.training.run_folder import (
-    INFO,
+    RUN,
     append_losses,
     fill_networks,
     read_info,
@@ -117,7 +117,8 @@ def train_run(
     with team_for(recipe, device) as (team, device):
         selection = parse_selection(peak, recipe.peaks)
         told = monitor if team.leads else QUIET
-        with _workplace(out, recipe, team, resume=resume, force=force) as folder:
+        read = (*sim.files, *data.files, init)
+        with _workplace(out, read, recipe, team, told, resume=resume, force=force) as folder:
             sim_set = load_simulated(sim, recipe, selection, told)
             data_set = load_measured(data, recipe, selection, told)
             require_same_sampling(sim_set, data_set)
@@ -138,18 +139,25 @@ def train_run(
 
 
 def _workplace(
-    out: Path, recipe: Recipe, team: Team, *, resume: bool, force: bool
+    out: Path,
+    read: Sequence[Path | str | None],
+    recipe: Recipe,
+    team: Team,
+    monitor: Monitor,
+    *,
+    resume: bool,
+    force: bool,
 ) -> AbstractContextManager[Path]:
     if not team.leads:  # another process writes there
         return nullcontext(out)
     if not isinstance(recipe.training, MatchingConfig):
-        return unfinished_folder(out, resume=resume, force=force)
+        return unfinished_folder(out, *read, resume=resume, force=force, note=monitor.note)
     if resume:
         raise CpunetError(
             f"recipe {recipe.name}: takes a minute and keeps no checkpoints; give the recipe "
             "that the training was begun with, or leave out --resume"
         )
-    return folder_written_aside(out, marker=INFO, force=force)
+    return folder_written_aside(out, RUN, *read, force=force, note=monitor.note)
 
 
 def _require_sampling(init: Path, data: InputSet) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing
 from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.memory import give_back_large_arrays
@@ -33,6 +32,7 @@ from cpunet.jobs.translation_record import (
     stamp,
 )
 from cpunet.jobs.translation_writers import Writer, other_columns, writer_of
+from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
@@ -99,8 +99,7 @@ class FileTranslation:
             Name that the noise depends on besides the seed, so that files differ; None for
             noise as from Python.
         """
-        if out.exists() and source.path.exists() and out.samefile(source.path):
-            raise CpunetError(f"{out}: is the input; choose another --out")
+        refuse_inputs(out, self.run, *source.files)
         with only_writer(out):
             before = source_print(source)
             options = asdict(self.options) | {"noise_key": noise_key}

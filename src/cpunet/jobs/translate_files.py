@@ -13,12 +13,12 @@ from typing import Any
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing
 from cpunet.jobs.file_workers import Relay, in_processes
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.jobs.translate import FileTranslation
 from cpunet.jobs.translate_options import TranslateOptions
+from cpunet.outputs import refuse_existing, refuse_inputs
 
 QUIET = Monitor()
 DEFAULTS = TranslateOptions()
@@ -84,6 +84,9 @@ def translate_files(
         `resume` and `force`) or would have the same names; in the end, if files failed.
     """
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
+    read = [run, *(given for source in sources for given in source.files)]
+    for task in tasks:
+        refuse_inputs(task.out, *read)
     _require_apart(tasks, out, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
     for note in FileTranslation(run, options, device).notes:

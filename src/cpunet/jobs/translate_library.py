@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
 from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.columns import TIME_UNITS
@@ -107,7 +108,7 @@ def translate_library(
     CpunetError
         If the file holds no library of charge templates, or the run cannot translate it.
     """
-    refuse_existing(out, force=force)
+    refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))
     tally = _Tally()
     with _opened(source) as given, written_aside(out) as aside:

@@ -38,6 +38,7 @@ from cpunet.jobs.tuning_study import (
     this_worker,
 )
 from cpunet.jobs.workers import Link, Outcome, cores, default_jobs, work_off
+from cpunet.outputs import FolderKind
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import require_same
@@ -55,6 +56,12 @@ if TYPE_CHECKING:
 QUIET = Monitor()
 TRIALS = 30
 TUNE, BEST, TABLE = "tune.json", "best.yaml", "trials.csv"
+TUNE_KIND = FolderKind(
+    name="search",
+    command="cpunet tune",
+    known_by=TUNE,
+    own=r"tune\.json|best\.yaml|trials\.csv|journal\.log.*",
+)
 STARTS = 8  # drawn at random before the Gaussian processes have something to go by
 
 
@@ -113,10 +120,12 @@ def tune_recipe(
     if trials < 1:
         raise CpunetError(f"--trials {trials}: give 1 or more")
     device, space = resolve_device(device), search_space(recipe)
-    require_usable(out, TUNE, resume=resume, force=force)
+    require_usable(out, TUNE_KIND, *sim.files, *data.files, resume=resume, force=force)
     begun_with = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
     begun_with |= fingerprints(sim, data, recipe, peak, monitor)
-    with working_folder(out, TUNE, resume=resume, force=force, alone=False) as folder:
+    with working_folder(
+        out, TUNE_KIND, resume=resume, force=force, alone=False, note=monitor.note
+    ) as folder:
         known = read_json(folder / TUNE)
         if known is not None:
             require_same(known["begun_with"], begun_with)

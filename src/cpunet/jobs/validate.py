@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cpunet.analysis.report import METRICS, write_report
+from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.evaluation import evaluate
 from cpunet.jobs.figures import figure_makers
@@ -62,7 +62,8 @@ def validate_run(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    with folder_written_aside(out, marker=METRICS, force=force) as folder:
+    read = (run, *sim.files, *data.files, truth)
+    with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
         found = evaluate(
             run,
             sim,

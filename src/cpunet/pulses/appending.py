@@ -16,7 +16,8 @@ import numpy.typing as npt
 from lgdo import LGDO, Array
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table, write_errors
 from cpunet.pulses.reading.hdf5 import text_attribute
@@ -74,7 +75,7 @@ class ColumnAppender:
         self._new: list[str] = []
         if not name or "/" in name:
             raise CpunetError(f"{name!r} is no name of a column; give one as waveform_ren")
-        refuse_existing(self.path, force=force)
+        refuse_existing(self.path, source, force=force)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from lgdo import LGDO, Array, Table
 
 from cpunet.errors import CpunetError
-from cpunet.files import refuse_existing, written_aside
+from cpunet.files import written_aside
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table
 

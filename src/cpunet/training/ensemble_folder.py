@@ -13,7 +13,7 @@ from __future__ import annotations
 import fcntl
 import json
 import math
-import shutil
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -22,11 +22,30 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import require_replaceable, written_aside
-from cpunet.training.run_folder import INFO
+from cpunet.files import written_aside
+from cpunet.outputs import (
+    MARKER,
+    FolderKind,
+    Given,
+    Note,
+    mark,
+    refuse_inputs,
+    remove_own,
+    require_replaceable,
+    told_kept,
+)
+from cpunet.training.run_folder import INFO, RUN
+from cpunet.training.unfinished import UNFINISHED
 
 ENSEMBLE = "ensemble.json"
 _LOCK = ".lock"
+_MEMBER = rf"({RUN.own}|{UNFINISHED.own}|{re.escape(MARKER)})"
+ENSEMBLE_KIND = FolderKind(
+    name="ensemble",
+    command="cpunet ensemble",
+    known_by=ENSEMBLE,
+    own=rf"ensemble\.json|seeds\.png|\.lock|\.seed_\d.*|seed_\d+(\.unfinished)?(/{_MEMBER})?",
+)
 
 
 def member_folder(ensemble: Path, seed: int) -> Path:
@@ -51,21 +70,30 @@ def finished_members(ensemble: Path) -> list[Path]:
     return sorted(runs, key=lambda run: (len(run.name), run.name))
 
 
-def require_usable(out: Path, marker: str, *, resume: bool, force: bool) -> None:
+def require_usable(
+    out: Path, kind: FolderKind, *inputs: Given, resume: bool, force: bool
+) -> None:
     """Raise a `CpunetError` if `out` is there and may be neither gone on with nor replaced."""
     out = Path(out)
+    refuse_inputs(out, *inputs)
     if out.exists() and not (resume or force):
         raise CpunetError(
             f"{out}: exists already; go on with --resume, or choose another name or --force"
         )
-    left = [path.name for path in out.iterdir()] if out.is_dir() else []
-    if left != [_LOCK]:  # of a process that was stopped before it had begun
-        require_replaceable(out, marker=marker)
+    left = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    if left != {_LOCK}:  # of a process that was stopped before it had begun
+        require_replaceable(out, kind)
 
 
 @contextmanager
 def working_folder(
-    out: Path, marker: str, *, resume: bool = False, force: bool = False, alone: bool = True
+    out: Path,
+    kind: FolderKind,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    alone: bool = True,
+    note: Note = lambda _message: None,
 ) -> Iterator[Path]:
     """Give a folder to work in that stays, whatever happens.
 
@@ -73,14 +101,16 @@ def working_folder(
     ----------
     out
         The folder.
-    marker
-        A file that all folders of this kind hold; others are never replaced.
+    kind
+        What it is; others are never replaced.
     resume
         Go on in an existing folder.
     force
-        Without `resume`, empty an existing folder.
+        Without `resume`, remove what the program wrote in an existing folder.
     alone
         Keep other processes out.
+    note
+        Told of what is kept of an old folder.
 
     Raises
     ------
@@ -88,12 +118,14 @@ def working_folder(
         As by `require_usable`; if it cannot be written to, or another process works there.
     """
     out = Path(out)
-    require_usable(out, marker, resume=resume, force=force)
+    require_usable(out, kind, resume=resume, force=force)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with _locked(out) if alone else nullcontext():
             if not resume:
-                _empty(out)
+                told_kept(out, remove_own(out, kind, leave=(_LOCK,)), note)
+                out.mkdir(exist_ok=True)
+            mark(out, kind, listed=False)
             yield out
     except OSError as error:
         raise CpunetError(
@@ -142,14 +174,6 @@ def _locked(folder: Path) -> Iterator[None]:
         except OSError:
             pass  # a file system without locks
         yield
-
-
-def _empty(folder: Path) -> None:
-    for path in folder.iterdir():
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.name != _LOCK:
-            path.unlink()
 
 
 def _plain(value: Any) -> Any:

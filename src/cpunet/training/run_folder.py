@@ -27,11 +27,19 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
+from cpunet.outputs import FolderKind
 from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
+RUN = FolderKind(
+    name="run",
+    command="cpunet train",
+    known_by=INFO,
+    own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors|tensorboard(/events\.out\..*)?"
+    r"|metrics\.json|figures\.npz",  # of an ensemble's members, and of `cpunet figure`
+)
 
 
 def versions() -> dict[str, str]:

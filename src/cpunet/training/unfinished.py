@@ -15,7 +15,6 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,10 +23,20 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside, refuse_existing, require_replaceable
+from cpunet.files import folder_written_aside
+from cpunet.outputs import (
+    FolderKind,
+    Given,
+    copy_own,
+    mark,
+    refuse_existing,
+    refuse_inputs,
+    remove_own,
+    require_replaceable,
+    told_kept,
+)
 from cpunet.training.checkpoints import (
     CHECKPOINT,
-    PREVIOUS,
     Checkpoint,
     differences,
     has_checkpoint,
@@ -37,15 +46,24 @@ from cpunet.training.checkpoints import (
     write_checkpoint,
 )
 from cpunet.training.loop import Record, State
-from cpunet.training.run_folder import INFO, LOSSES
+from cpunet.training.run_folder import LOSSES, RUN
 
 MARKER = "unfinished.json"
-_NOT_KEPT = (MARKER, CHECKPOINT, PREVIOUS, ".*")
+UNFINISHED = FolderKind(
+    name="unfinished run",
+    command="cpunet train",
+    known_by=MARKER,
+    own=rf"{RUN.own}|unfinished\.json|checkpoint(\.previous)?\.safetensors|\.[^/]*\.partial.*",
+)
 
 
 @contextmanager
 def unfinished_folder(
-    out: Path, *, resume: bool = False, force: bool = False
+    out: Path,
+    *inputs: Given,
+    resume: bool = False,
+    force: bool = False,
+    note: Callable[[str], None] = lambda _message: None,
 ) -> Iterator[Path]:
     """Give ``OUT.unfinished`` to work in; what is there at the end becomes `out`.
 
@@ -55,11 +73,15 @@ def unfinished_folder(
     ----------
     out
         The run folder to be.
+    inputs
+        Files and folders that are read.
     resume
         Whether an unfinished training may be there; it is left for `UnfinishedRun` to go
         on with.
     force
         Replace an existing run folder, and begin anew where an unfinished one is.
+    note
+        Told of what is kept of either.
 
     Raises
     ------
@@ -69,13 +91,15 @@ def unfinished_folder(
         cannot be written to.
     """
     out = Path(out)
-    refuse_existing(out, force=force)
-    require_replaceable(out, marker=INFO)
+    refuse_existing(out, *inputs, force=force)
+    require_replaceable(out, RUN)
     folder = out.parent / f"{out.name}.unfinished"
-    require_replaceable(folder, marker=MARKER)
+    refuse_inputs(folder, *inputs)
+    require_replaceable(folder, UNFINISHED)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
+            mark(folder, UNFINISHED, listed=False)
             if has_checkpoint(folder) and not (resume or force):
                 raise CpunetError(
                     f"{folder}: an unfinished training; go on with --resume, or begin again "
@@ -84,11 +108,11 @@ def unfinished_folder(
             finished = False
             try:
                 yield folder
-                _put_in_place(folder, out, force=force)
+                _put_in_place(folder, out, force=force, note=note)
                 finished = True
             finally:
                 if finished or not has_checkpoint(folder):
-                    shutil.rmtree(folder, ignore_errors=True)
+                    told_kept(folder, remove_own(folder, UNFINISHED), note)
     except OSError as error:
         raise CpunetError(
             f"{folder}: cannot be written ({error.strerror or error}); what is stored is kept, "
@@ -96,12 +120,11 @@ def unfinished_folder(
         ) from error
 
 
-def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
+def _put_in_place(folder: Path, out: Path, *, force: bool, note: Callable[[str], None]) -> None:
     # a copy: until it is in its place, the folder is all that a resumed training needs
-    ignore = shutil.ignore_patterns(*_NOT_KEPT)
     try:
-        with folder_written_aside(out, marker=INFO, force=force) as whole:
-            shutil.copytree(folder, whole, ignore=ignore, dirs_exist_ok=True)
+        with folder_written_aside(out, RUN, force=force, note=note) as whole:
+            copy_own(folder, whole, RUN)
     except CpunetError as error:
         raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
 

@@ -1,0 +1,247 @@
+"""What an output may replace: never an input, and of a folder only what this program wrote.
+
+Every folder that is made holds `MARKER`, which names the program, the command and the files
+that it wrote.  With ``--force`` these are replaced; whatever else lies there is kept.
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from cpunet.errors import CpunetError
+
+MARKER = ".cpunet.json"
+PROGRAM = "cpunet"
+
+Note = Callable[[str], None]
+Given = Path | str | None
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """A kind of folder that this program makes.
+
+    Parameters
+    ----------
+    name
+        Of the kind; a folder is replaced only by one of the same.
+    command
+        That makes it.
+    known_by
+        A file of every such folder, by which those without a marker are recognised.
+    own
+        Regular expression of names, relative to the folder, that are always the program's.
+    older
+        The same of further names in folders without a list of their files.
+    """
+
+    name: str
+    command: str
+    known_by: str
+    own: str
+    older: str = "(?!)"  # none
+
+
+def refuse_inputs(out: Path, *inputs: Given) -> None:
+    """Raise a `CpunetError` if an output is, holds, or lies in something that is read.
+
+    Parameters
+    ----------
+    out
+        File or folder to be written; it need not be there.
+    inputs
+        Files and folders, as a user gives them: ``FILE:table`` and patterns are understood,
+        and what is no file's name (a preset, None) is passed over.
+    """
+    place = Path(out).resolve()
+    for source in (found for given in inputs for found in _named(given)):
+        real = source.resolve()
+        if _same(place, real):
+            raise CpunetError(f"{out}: is the input; choose another --out")
+        if any(_same(place, above) for above in real.parents):
+            raise CpunetError(f"{out}: holds the input {source}; choose another --out")
+        if any(_same(above, real) for above in place.parents):
+            raise CpunetError(f"{out}: lies in the input {source}; choose another --out")
+
+
+def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
+    """Raise a `CpunetError` if `target` is there and `force` is off, or as `refuse_inputs`."""
+    refuse_inputs(target, *inputs)
+    if target.exists() and not force:
+        raise CpunetError(f"{target}: exists already; choose another name or give --force")
+
+
+def require_replaceable(target: Path, kind: FolderKind) -> None:
+    """Raise a `CpunetError` if `target` is there, but no folder that may be replaced.
+
+    An empty folder may be, and one of the same kind that this program made.
+    """
+    if not target.exists():
+        return
+    if not (target.is_dir() and (made_here(target, kind) or not any(target.iterdir()))):
+        raise CpunetError(
+            f"{target}: is no folder with a {kind.known_by} that {kind.command} made, so "
+            "--force does not replace it; choose another name"
+        )
+
+
+def made_here(folder: Path, kind: FolderKind) -> bool:
+    """Whether a folder was made by this program, and is of a kind."""
+    if (folder / MARKER).is_file():
+        return _marker(folder).get("kind") == kind.name
+    return (folder / kind.known_by).is_file()
+
+
+def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
+    """Write into a folder who made it, and, if `listed`, that all files in it now are own."""
+    content: dict[str, object] = {
+        "program": PROGRAM,
+        "command": kind.command,
+        "kind": kind.name,
+    }
+    if listed:
+        content["files"] = sorted(_relative(path, folder) for path in _leaves(folder))
+    (folder / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def keep_others(old: Path, new: Path, kind: FolderKind) -> list[str]:
+    """Put what is not the program's own in one folder into the one that will replace it.
+
+    It is linked, or copied where that cannot be, so that nothing is lost at any moment.  What
+    has the name of a new file gets ``.kept`` at the end.
+
+    Returns
+    -------
+    list of str
+        Names of what is kept, relative to the folder.
+    """
+    kept = []
+    # first what keeps its name
+    for path in sorted(_others(old, kind), key=lambda p: (new / p.relative_to(old)).exists()):
+        place = new / path.relative_to(old)
+        while os.path.lexists(place):
+            place = place.with_name(f"{place.name}.kept")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            place.mkdir()
+        else:
+            try:
+                os.link(path, place, follow_symlinks=False)
+            except OSError:
+                shutil.copy2(path, place, follow_symlinks=False)
+        kept.append(_relative(place, new))
+    return kept
+
+
+def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
+    """Copy what has a name of the program's own from one folder into another."""
+    own = re.compile(kind.own)
+    for path in _leaves(folder):
+        if own.fullmatch(_relative(path, folder)) and path.is_file():
+            place = to / path.relative_to(folder)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, place)
+
+
+def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -> list[str]:
+    """Remove what the program wrote into a folder, and the folder if nothing else is in it.
+
+    Parameters
+    ----------
+    folder, kind
+        The folder, and what it is.
+    leave
+        Names of files that are the program's own, and in use.
+
+    Returns
+    -------
+    list of str
+        Names of what is kept, relative to the folder; then a marker is kept as well.
+    """
+    folder = folder.resolve()  # a link stays
+    others = list(_others(folder, kind))
+    staying = {above for path in others for above in (path, *path.parents)}
+    staying |= {folder / name for name in leave}
+    for path in list(_leaves(folder)):
+        if path not in staying:
+            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+            for above in path.parents:
+                if above == folder or above in staying or any(above.iterdir()):
+                    break
+                above.rmdir()
+    if others:
+        (folder / MARKER).unlink(missing_ok=True)
+        mark(folder, kind, listed=False)
+    elif not any(folder.iterdir()):
+        folder.rmdir()
+    return [_relative(path, folder) for path in others]
+
+
+def told_kept(folder: Path, kept: list[str], note: Note) -> None:
+    """Say what of a folder was kept, if anything was."""
+    if kept:
+        shown = ", ".join(kept[:5]) + (f" and {len(kept) - 5} more" if kept[5:] else "")
+        note(f"{folder}: kept what cpunet did not write: {shown}")
+
+
+def _named(given: Given) -> Iterator[Path]:
+    """Existing files and folders that a word on the command line stands for."""
+    if given is None or str(given) == "":
+        return
+    path = Path(given)
+    text = str(given)
+    if os.path.lexists(path):
+        yield path
+    elif (file := text.rpartition(":")[0]) and os.path.lexists(file):
+        yield Path(file)
+    elif glob.has_magic(text):
+        yield from map(Path, glob.glob(text, recursive=True))  # noqa: PTH207 (absolute ones too)
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two resolved paths are one thing, also under two names of it."""
+    try:
+        return one == other or one.samefile(other)
+    except OSError:
+        return False
+
+
+def _marker(folder: Path) -> dict[str, object]:
+    try:
+        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    ours = isinstance(content, dict) and content.get("program") == PROGRAM
+    return content if ours else {}
+
+
+def _leaves(folder: Path) -> Iterator[Path]:
+    """Files, links and empty folders below a folder."""
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and not path.is_symlink() and any(path.iterdir()):
+            yield from _leaves(path)
+        else:
+            yield path
+
+
+def _others(folder: Path, kind: FolderKind) -> Iterator[Path]:
+    """What in a folder is not the program's own."""
+    marker = _marker(folder)
+    files = marker.get("files")
+    listed = set(files) if isinstance(files, list) else set()
+    own = re.compile(kind.own if isinstance(files, list) else f"{kind.own}|{kind.older}")
+    for path in _leaves(folder):
+        name = _relative(path, folder)
+        if name != MARKER and name not in listed and not own.fullmatch(name):
+            yield path
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix()

@@ -1,0 +1,157 @@
+"""``--force`` replaces no input, whatever the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+
+from cpunet.cli.main import app
+
+GAMMAS = "--detector icpc --events FEP=1"
+TRAINING = "--sim D/sim.lh5 --data D/data.lh5"
+# Words of each command, and names for --out that are, hold or lie in one of its inputs.
+COMMANDS = {
+    "demo": [("--preset demo/run/my.yaml", "demo"), ("--recipe demo/stand/my.yaml", "demo")],
+    "simulate": [
+        ("--detector icpc --hits D/hits.lh5", "D/hits.lh5"),
+        ("--detector icpc --hits D/link.lh5", "D/hits.lh5"),
+        ("--detector D/my.yaml --events FEP=1", "D/my.yaml"),
+        (f"{GAMMAS} --settings D/my.yaml", "D/my.yaml"),
+    ],
+    "fields": [("D/my.yaml", "D/my.yaml")],
+    "stand": [("--preset D/my.yaml", "D"), ("--preset ornl --detector D/my.yaml", "D")],
+    "train": [
+        (TRAINING, "D"),
+        (TRAINING, "."),
+        (f"{TRAINING} --recipe small", "D"),  # works beside the folder
+        (f"{TRAINING} --recipe D/my.yaml", "D"),
+        ("--sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy", "D"),
+        ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN"),
+        ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN/new"),
+    ],
+    "ensemble": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
+    "tune": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
+    "translate": [
+        ("RUN D/sim.lh5", "D/sim.lh5"),
+        ("RUN D/link.lh5", "D/hits.lh5"),
+        ("RUN D/*.lh5", "D"),
+        ("RUN D/sim.lh5 D/hits.lh5", "D/"),
+        ("RUN sim.lh5", "RUN/weights.safetensors"),
+        ("RUN D/sim.lh5 --energy D/hits.lh5:energy", "D/hits.lh5"),
+    ],
+    "validate": [
+        (f"RUN {TRAINING}", "D"),
+        (f"RUN {TRAINING}", "RUN"),
+        (f"RUN {TRAINING}", "RUN/report"),
+        ("RUN --sim sim.lh5 --data data.lh5 --truth D/truth.npz", "D"),
+    ],
+    "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
+    "summary": [("REPORT", "REPORT/report.html")],
+    "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
+    "figure": [("RUN losses", "RUN")],
+    "explore": [
+        ("RUN --detector icpc --data D/data.lh5", "D/data.lh5"),
+        ("RUN --detector D/my.yaml", "D/my.yaml"),
+        ("RUN --detector icpc", "RUN/page.html"),
+    ],
+    "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
+    "library make": [("--detector D/my.yaml", "D/my.yaml")],
+    "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
+    "import weights": [("--ren D/fep_REN.pt", "D")],
+    "import pulses": [("D/my.pickle", "D/my.pickle")],
+}
+CASES = [
+    pytest.param(name, words, out, id=f"{name} {words} {out}")
+    for name, cases in COMMANDS.items()
+    for words, out in cases
+]
+
+
+def writing_commands() -> set[str]:
+    """Names of all commands that have ``--force``."""
+    found = set()
+
+    def walk(command, name: str) -> None:
+        for sub, inner in getattr(command, "commands", {}).items():
+            walk(inner, f"{name} {sub}".strip())
+        if any("--force" in option.opts for option in command.params):
+            found.add(name)
+
+    walk(typer.main.get_command(app), "")
+    return found
+
+
+def test_every_command_that_writes_is_here():
+    assert writing_commands() == set(COMMANDS)
+
+
+@pytest.fixture
+def home(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A user's folder: files to read, a run, a report, and a thesis everywhere."""
+    monkeypatch.chdir(tmp_path)
+    run.rename(tmp_path / "RUN")
+    names = "sim.lh5 data.lh5 hits.lh5 truth.npz my.yaml my.pickle fep_REN.pt thesis.tex"
+    for folder in ("D", "REPORT", "demo/run", "demo/stand"):
+        Path(folder).mkdir(parents=True)
+        for name in names.split():
+            Path(folder, name).write_text(f"the user's {name}")
+    # all that would make a folder one to be replaced
+    for name in ("run.json", "metrics.json", "stand.json", "tune.json", "ensemble.json"):
+        Path("D", name).write_text("{}")
+    for name in ("sim.lh5", "data.lh5"):
+        Path(name).touch()
+    Path("D/response.json").write_text("{}")
+    Path("REPORT/metrics.json").write_text(json.dumps({"peaks": {}}))
+    Path("REPORT/report.html").touch()
+    Path("D/link.lh5").symlink_to("hits.lh5")
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("name", "words", "out"), CASES)
+def test_no_input_is_replaced(command, home, name, words, out):
+    before = contents(home)
+    outcome = command(*name.split(), *words.split(), "--out", out, "--force")
+    assert outcome.code == 2
+    assert outcome.err.count("\n") == 1
+    assert "the input" in outcome.err
+    assert contents(home) == before
+
+
+def test_a_thesis_survives_a_training(command, stand, tiny, tmp_path):
+    words = ("train", *stand.inputs, "--out", tmp_path / "run", *tiny)
+    assert command(*words).code == 0
+    (tmp_path / "run" / "thesis.tex").write_text("mine")
+    outcome = command(*words, "--force")
+    assert outcome.code == 0
+    assert f"{tmp_path / 'run'}: kept what cpunet did not write: thesis.tex" in outcome.err
+    assert (tmp_path / "run" / "thesis.tex").read_text() == "mine"
+    assert (tmp_path / "run" / "run.json").exists()
+
+
+def test_a_thesis_survives_beside_seeds(tmp_path):
+    from cpunet.training.ensemble_folder import ENSEMBLE_KIND, working_folder
+
+    notes: list[str] = []
+    out = tmp_path / "ens"
+    with working_folder(out, ENSEMBLE_KIND) as folder:
+        (folder / "ensemble.json").write_text("{}")
+        for name in ("seed_000", "seed_001.unfinished"):
+            (folder / name).mkdir()
+            (folder / name / "weights.safetensors").touch()
+        (folder / "seed_001.unfinished" / "checkpoint.safetensors").touch()
+        (folder / "seed_000" / "thesis.tex").touch()
+        (folder / "seed_notes.txt").touch()
+    with working_folder(out, ENSEMBLE_KIND, force=True, note=notes.append):
+        pass
+    left = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
+    assert left == [".cpunet.json", ".lock", "seed_000/thesis.tex", "seed_notes.txt"]
+    assert notes == [
+        f"{out}: kept what cpunet did not write: seed_000/thesis.tex, seed_notes.txt"
+    ]
