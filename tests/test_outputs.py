@@ -185,9 +185,14 @@ def test_what_failed_changes_nothing(tmp_path):
     run = tmp_path / "run"
     make(run, run_json="old")
     (run / "mine").write_text("mine")
-    with pytest.raises(KeyError), folder_written_aside(run, RUN, force=True) as aside:
-        (aside / "run.json").write_text("new")
-        raise KeyError
+
+    def fail():
+        with folder_written_aside(run, RUN, force=True) as aside:
+            (aside / "run.json").write_text("new")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
     assert tree(tmp_path) == {"run/mine": "mine", "run/run.json": "old"}
 
 

@@ -7,10 +7,12 @@ The package is a row of rooms through which data flow one way:
 
 from __future__ import annotations
 
-from importlib.metadata import version
+import warnings
 from typing import TYPE_CHECKING, Any
 
-__version__ = version("cpunet")
+from cpunet.installation import other_package
+
+__version__ = "0.1.0"
 __all__ = ["IREN", "REN", "Pulses", "__version__", "open_pulses"]
 
 if TYPE_CHECKING:
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in __all__ and (clash := other_package()):
+        warnings.warn(clash, stacklevel=2)
     # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
     if name in ("REN", "IREN"):
         from cpunet.translation import translator

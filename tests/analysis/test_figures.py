@@ -112,7 +112,9 @@ def test_histograms_of_one_event_and_of_none_are_drawn():
 
 def test_mean_pulse_differences_are_in_percent_of_the_charge():
     data = pulses(40)
-    figure = figures.mean_pulses({"data": data, "ren": 1.01 * data}, 16.0, "DEP")
+    sets = {"data": data, "ren": 1.01 * data}
+    means = {method: figures.MeanPulse.of(windows) for method, windows in sets.items()}
+    figure = figures.mean_pulses(means, 16.0, "DEP")
     render(figure)
     difference = figure.axes[1].lines[0].get_ydata()
     assert difference[-1] == pytest.approx(1.0, rel=1e-3)
@@ -120,7 +122,8 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
 
 
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
-    render(figures.mean_pulses({"data": pulses(5), "raw": pulses(5, 700.0)}, 16.0, "DEP"))
+    means = [figures.MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
+    render(figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP"))
 
 
 def test_global_settings_neither_change_nor_matter():

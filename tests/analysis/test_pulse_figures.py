@@ -10,7 +10,12 @@ import pytest
 from scipy.special import ndtr
 
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.pulse_figures import nearest, single_pulse_figure, spectrum_figure
+from cpunet.analysis.pulse_figures import (
+    DataPulse,
+    nearest,
+    single_pulse_figure,
+    spectrum_figure,
+)
 from cpunet.analysis.seed_figure import seed_distributions, seed_figure
 from cpunet.errors import CpunetError
 
@@ -59,7 +64,8 @@ def test_a_pulse_of_which_little_is_in_the_record_is_not_compared():
 def test_single_pulses_lose_their_decay_below():
     data = edges([4.0, 8.0, 16.0])
     pulses = {"raw": edges([3.0], decay=False)[0], "ren": edges([8.0])[0]}
-    figure = single_pulse_figure(pulses, data, DT, ALIGN, "SEP")
+    beside = DataPulse.beside(pulses, data, DT, ALIGN)
+    figure = single_pulse_figure(pulses, beside, DT, ALIGN, "SEP")
     render(figure)
     assert len(figure.axes) == 6
     title = figure.legends[0].get_title().get_text()
@@ -78,9 +84,11 @@ def test_single_pulses_lose_their_decay_below():
 def test_single_pulses_need_an_edge():
     data = edges([4.0])
     with pytest.raises(CpunetError, match="no pulse to draw"):
-        single_pulse_figure({}, data, DT, ALIGN)
+        DataPulse.beside({}, data, DT, ALIGN)
+    pulses = {"ren": data[0], "raw": np.zeros(600, np.float32)}
+    beside = DataPulse.beside(pulses, data, DT, ALIGN)
     with pytest.raises(CpunetError, match="Simulation” never crosses"):
-        single_pulse_figure({"ren": data[0], "raw": np.zeros(600, np.float32)}, data, DT, ALIGN)
+        single_pulse_figure(pulses, beside, DT, ALIGN)
 
 
 def test_spectra_hold_all_events_and_name_the_peaks():

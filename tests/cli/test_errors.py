@@ -113,7 +113,7 @@ def test_simulated_pulses_that_cannot_be_used(
 
 
 def test_raw_data_are_no_input_of_the_inverse_if_too_short(translate_refused, stand):
-    line = translate_refused("--inverse")  # of the simulated pulses
+    line = translate_refused("--inverse", "--insist")  # of the simulated pulses
     assert line.startswith(f"error: {stand.sim}: none of ")
     assert "are these measured pulses?" in line
 
@@ -226,7 +226,8 @@ def test_a_failed_training_does_not_replace_a_run(command, run, stand, tiny):
 
 
 def test_folders_that_are_no_runs(validate_refused, translate_refused, refused, tmp_path):
-    for path in (tmp_path / "results", tmp_path / "none", tmp_path / "file"):
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "empty", tmp_path / "none", tmp_path / "file"):
         if path.name == "file":
             path.write_text("no run")
         for call in (validate_refused, translate_refused):

@@ -11,7 +11,8 @@ import pytest
 from cpunet.errors import CpunetError
 from cpunet.jobs.energy_ranges import validation_selection
 from cpunet.jobs.evaluation import Evaluation, evaluate
-from cpunet.jobs.figures import figure_makers
+from cpunet.jobs.figure_store import read_drawings, write_drawings
+from cpunet.jobs.figures import drawings, figure_names
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train import train_run
@@ -111,14 +112,40 @@ def test_what_is_compared(whole) -> None:
 
 
 def test_every_figure_can_be_drawn(whole) -> None:
-    makers = figure_makers(whole)
-    assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(makers)
-    for make in makers.values():
-        assert make().axes
+    made = drawings(whole)
+    assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(made)
+    assert set(made) <= set(figure_names(["FEP", "SEP", "DEP"]))
+    for drawing in made.values():
+        assert drawing.draw().axes
+
+
+def test_figures_are_the_same_when_they_were_stored(whole, tmp_path) -> None:
+    made = drawings(whole)
+    write_drawings(tmp_path / "figures.npz", made, {"seed": 1})
+    found, of = read_drawings(tmp_path / "figures.npz")
+    assert of == {"seed": 1}
+    assert list(found) == list(made)
+    for name, drawing in made.items():
+        ours, theirs = drawing.draw(), found[name].draw()
+        for axes, others in zip(ours.axes, theirs.axes, strict=True):
+            assert (axes.get_title(), axes.get_ylim()) == (
+                others.get_title(),
+                others.get_ylim(),
+            )
+            assert len(axes.lines) == len(others.lines)
+            for line, other in zip(axes.lines, others.lines, strict=True):
+                np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04"])
+def test_a_damaged_store_is_one_line(tmp_path, content) -> None:
+    (tmp_path / "figures.npz").write_bytes(content)
+    with pytest.raises(CpunetError, match=r"cannot be read .* score the run again"):
+        read_drawings(tmp_path / "figures.npz")
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("cpunet.jobs.validate.figure_makers", lambda found: {})  # drawn above
+    monkeypatch.setattr("cpunet.jobs.validate.drawings", lambda found: {})  # drawn above
     metrics = validate_run(
         run, files["sim"], files["no DEP"], tmp_path / "report", rivals=False, device="cpu"
     )

@@ -25,7 +25,7 @@ from cpunet.training.checkpoints import (
     write_checkpoint,
 )
 from cpunet.training.loop import Keeping, StoppedError, train
-from cpunet.training.run_folder import LOSSES
+from cpunet.training.run_folder import LOSSES, WEIGHTS
 from cpunet.training.unfinished import MARKER, LossLog, UnfinishedRun, unfinished_folder
 
 N = 5
@@ -235,7 +235,7 @@ def work(sets, recipe, out: Path, notes: list, *, resume=False, die=None, disk=N
         keeping = Keeping(save, start)
         model = train(*sets, recipe, seed=seed, listener=listen, keeping=keeping)
         run.finish()
-        (folder / "weights").write_bytes(b"".join(weights(model).values()))
+        (folder / WEIGHTS).write_bytes(b"".join(weights(model).values()))
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -19,7 +19,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.run_folder import write_run
 from cpunet.translation import translator
-from cpunet.translation.translator import IREN, REN
+from cpunet.translation.translator import IREN, REN, RejectionWarning
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
@@ -200,11 +200,20 @@ def test_pulses_without_energy_are_counted(ren, sim) -> None:
     assert without.codes.tolist() == np.where(np.arange(N) == 2, Rejection.NAN, 0).tolist()
 
 
-def test_a_pulse_without_energy_is_named(ren, sim) -> None:
+def test_a_pulse_without_energy_is_nan_and_counted(ren, sim) -> None:
     energies = np.full(N, KEV)
     energies[5] = np.nan
-    with pytest.raises(CpunetError, match=r"^pulse 5: energy unknown; "):
-        ren.translate(sim, energy_kev=energies)
+    with pytest.warns(RejectionWarning, match="rows of NaN: 1 energy unknown"):
+        done = ren.translate(sim, energy_kev=energies)
+    assert np.flatnonzero(np.isnan(done).any(axis=1)).tolist() == [5]
+
+
+def test_low_energies_have_large_noise(ren, sim) -> None:
+    """The lithium layer leaves a few keV of some events: most are translated all the same."""
+    low = np.where(np.arange(N) % 2, KEV, KEV / 50)
+    done = ren.translate(sim, energy_kev=low, seed=1)
+    rms = done[:, :200].std(axis=1)
+    assert rms[::2].mean() == pytest.approx(50 * rms[1::2].mean(), rel=0.3)
 
 
 def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:

@@ -7,7 +7,7 @@ can be made in worker processes and notebooks alike.  Saving is the caller's.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import hist
 import numpy as np
@@ -191,35 +191,41 @@ def parameter_histograms(
     return figure
 
 
+class MeanPulse(NamedTuple):
+    """The mean of `n` pulses, aligned at half maximum, `before` samples before it."""
+
+    n: int
+    mean: Values
+    before: int = 100
+
+    @classmethod
+    def of(cls, waveforms: FloatArray, before: int = 100, after: int = 150) -> Self:
+        """Average pulses of shape ``(n, length)``."""
+        return cls(len(waveforms), _mean_aligned(waveforms, before, after), before)
+
+
 @styled
-def mean_pulses(
-    sets: Mapping[str, FloatArray],
-    dt_ns: float,
-    peak: str,
-    samples_before: int = 100,
-    samples_after: int = 150,
-) -> Figure:
+def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figure:
     """Mean pulses aligned at half maximum, and their differences from the data's.
 
     Parameters
     ----------
     sets
-        Pulses of shape ``(n, length)`` by method, the measured ones under ``"data"``;
-        methods are drawn over each other in this order.
+        Mean pulses by method, the measured one under ``"data"``; methods are drawn over
+        each other in this order.
     dt_ns
         Sampling period in ns.
     peak
         Name of the gamma line, for the title.
-    samples_before, samples_after
-        Samples drawn before and after the crossing of half the maximum.
     """
     palette = colours(sets)
-    means = {m: _mean_aligned(w, samples_before, samples_after) for m, w in sets.items()}
-    time_ns = (np.arange(samples_before + samples_after) - samples_before) * dt_ns
+    means = {method: averaged.mean for method, averaged in sets.items()}
+    data = sets["data"]
+    time_ns = (np.arange(len(data.mean)) - data.before) * dt_ns
     figure = Figure(figsize=(5.6, 4.8))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for method, mean in means.items():
-        text = f"{label(method)}, n = {len(sets[method])}"
+        text = f"{label(method)}, n = {sets[method].n}"
         # a broad grey line, so that a method which agrees does not hide the data
         look = (
             {"color": "0.65", "linewidth": 4.0}

@@ -7,7 +7,7 @@ pulse is shown beside the measured one that is nearest to its translation.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -121,10 +121,59 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
     return int(found.index[0, 0]), float(found.rms[0, 0])
 
 
+class DataPulse(NamedTuple):
+    """The measured pulse that stands beside simulated ones.
+
+    Parameters
+    ----------
+    row
+        Its row among the measured pulses.
+    rms
+        RMS difference from the simulated pulse `target`, see `nearest`.
+    target
+        Method of that.
+    window
+        The pulse, shape ``(length,)``.
+    slope_per_ms
+        Slope of the tails of all measured pulses in 1/ms.
+    """
+
+    row: int
+    rms: float
+    target: str
+    window: FloatArray
+    slope_per_ms: float
+
+    @classmethod
+    def beside(
+        cls,
+        pulses: Mapping[str, FloatArray],
+        data: FloatArray,
+        dt_ns: float,
+        samples_before: int,
+    ) -> Self:
+        """Take, of windows of shape ``(n, length)``, the one nearest to a pulse.
+
+        That is the one of ``"ren"``, or else the ``"truth"`` or the first.  The other
+        parameters are those of `single_pulse_figure`.
+
+        Raises
+        ------
+        CpunetError
+            If there are no pulses, or it or all of the data have no edge or no tail.
+        """
+        if not pulses:
+            raise CpunetError("no pulse to draw; give one by method")
+        target = next((name for name in TARGETS if name in pulses), next(iter(pulses)))
+        row, rms = nearest(data, pulses[target])
+        slope = fitted_tail_slope(data, dt_ns, samples_before)
+        return cls(row, rms, target, data[row], slope)
+
+
 @styled
 def single_pulse_figure(
     pulses: Mapping[str, FloatArray],
-    data: FloatArray,
+    data: DataPulse,
     dt_ns: float,
     samples_before: int,
     title: str = "",
@@ -142,8 +191,7 @@ def single_pulse_figure(
         The pulse by method, each of shape ``(length,)``: ``"raw"``, ``"rc"``, ``"ren"``, ….
         Without noise, if it is to be told from the electronics.
     data
-        Measured windows of shape ``(n, length)``; the one nearest to the ``"ren"`` pulse, or
-        else the ``"truth"`` or the first, is drawn.
+        The measured pulse beside them.
     dt_ns
         Sampling period in ns.
     samples_before
@@ -154,14 +202,10 @@ def single_pulse_figure(
     Raises
     ------
     CpunetError
-        If there are no pulses, or one of them or all of the data have no edge or no tail.
+        If one of the pulses has no edge.
     """
-    if not pulses:
-        raise CpunetError("no pulse to draw; give one by method")
-    target = next((name for name in TARGETS if name in pulses), next(iter(pulses)))
-    row, rms = nearest(data, pulses[target])
-    shown = {"data": data[row]} | dict(pulses)
-    slope = fitted_tail_slope(data, dt_ns, samples_before)
+    shown = {"data": data.window} | dict(pulses)
+    slope = data.slope_per_ms
     windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
     figure = Figure(figsize=(9.5, 7.6))
     grid = figure.subplots(3, 2, sharey="row", sharex="col", height_ratios=(4, 4, 3))
@@ -186,8 +230,8 @@ def single_pulse_figure(
         *grid[0, 0].get_legend_handles_labels(),
         loc="outside upper left",
         ncols=len(shown),
-        title=f"{title + ': ' if title else ''}data pulse {row} is nearest to "
-        f"“{label(target)}”, RMS {rms:.4f}",
+        title=f"{title + ': ' if title else ''}data pulse {data.row} is nearest to "
+        f"“{label(data.target)}”, RMS {data.rms:.4f}",
         alignment="left",
     )
     return figure

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out
+from cpunet.cli.messages import out, print_table
 
 if TYPE_CHECKING:
     from cpunet.analysis.side_by_side import SideBySide
@@ -24,8 +23,6 @@ Out = Annotated[Path | None, typer.Option("--out", help="Page to write, such as 
 Method = Annotated[
     str, typer.Option(help="Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.")
 ]
-
-_WIDEST = 10_000  # columns
 
 
 def compare(
@@ -41,10 +38,7 @@ def compare(
     from cpunet.jobs.compare import compare_reports
 
     compared = compare_reports(reports, method=method, out=out_file, force=force)
-    table = comparison_table(compared)
-    # whole, also where it is wider than a terminal or a log's 80 columns
-    width = out.measure(table, options=out.options.update(max_width=_WIDEST)).maximum
-    Console(file=out.file, width=max(out.width, width)).print(table)
+    print_table(comparison_table(compared))
     for note in compared.notes:
         out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     if out_file is not None:
@@ -62,9 +56,9 @@ def comparison_table(compared: SideBySide) -> Table:
     title = f"Scores of {escape(compared.method)}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("peak", "score"):
-        table.add_column(column, no_wrap=True)
+        table.add_column(column)
     for name in compared.names:
-        table.add_column(escape(name), justify="right", no_wrap=True)
+        table.add_column(escape(name), justify="right")
     peak = None
     for row in compared.rows:
         cells = [

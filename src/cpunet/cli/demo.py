@@ -9,7 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
-from cpunet.cli.scores import score_table
+from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import DetectorFile, Events, Kind, KindOption, wanted_events
 from cpunet.outputs import refuse_inputs
 
@@ -18,7 +18,7 @@ Preset = Annotated[
     str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
 ]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="fast, small, paper, or a YAML file of your own.")
+    str, typer.Option("--recipe", help="fast, best, small, paper, or a YAML file of your own.")
 ]
 Set = Annotated[
     list[str] | None,
@@ -65,5 +65,5 @@ def demo(
         force=force,
         monitor=monitor(),
     )
-    out.print(score_table(metrics, leave_out=("FEP",)))
+    print_scores(metrics, leave_out=("FEP",))
     out.print(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)

@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import err, monitor, out
+from cpunet.cli.messages import err, monitor, out, print_table
 from cpunet.cli.scores import PARAMETERS
 from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
@@ -45,6 +45,7 @@ def ensemble(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     set_values: Set = None,
     jobs: Jobs = None,
     threads: Threads = None,
@@ -65,8 +66,8 @@ def ensemble(
     refuse_inputs(out_folder, recipe)
     try:
         told = train_ensemble(
-            InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-            InputFile(data, data_table, data_energy, kev_per_adc, dt),
+            InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
+            InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
             out_folder,
             load_recipe(recipe, set_values or ()),
             seeds=seeds,
@@ -84,7 +85,7 @@ def ensemble(
         err.print("finished seeds are kept; go on with --resume", markup=False)
         raise
     if told["table"]:
-        out.print(_table(told))
+        print_table(_table(told))
     for line in _summary(told):
         out.print(line, markup=False, highlight=False, soft_wrap=True)
     if told["table"]:
@@ -94,9 +95,9 @@ def ensemble(
 def _table(told: dict[str, Any]) -> Table:
     table = Table(title="IoU over seeds, %", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("peak", "score"):
-        table.add_column(column, no_wrap=True)
+        table.add_column(column)
     for column in ("median", "worst 5 %", "failures", "ceiling"):
-        table.add_column(column, justify="right", no_wrap=True)
+        table.add_column(column, justify="right")
     for row in told["table"]:
         digits = 1 if row["failures"] is not None else 4
         numbers = [_number(row[key], digits) for key in ("median", "worst")]

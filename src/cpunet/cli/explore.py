@@ -48,6 +48,7 @@ def explore(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
@@ -63,7 +64,7 @@ def explore(
     refuse_inputs(out_file, detector, settings_file)
     measured = None
     if data is not None:
-        measured = InputFile(data, data_table, data_energy, kev_per_adc, dt)
+        measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
     told = explore_runs(
         runs,
         read_detector(detector, set_values or (), crystal),

@@ -18,6 +18,12 @@ Names = Annotated[
         metavar="NAME…",
     ),
 ]
+Folder = Annotated[
+    Path,
+    typer.Argument(
+        help="Report folder, or run folder with --sim and --data.", metavar="REPORT"
+    ),
+]
 Sim = Annotated[Path | None, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path | None, typer.Option("--data", help="File of measured pulses.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the files.")]
@@ -25,7 +31,7 @@ Suffix = Annotated[str, typer.Option("--format", help="png, pdf or svg.")]
 
 
 def figure(
-    run: options.Run,
+    folder: Folder,
     names: Names,
     sim: Sim = None,
     data: Data = None,
@@ -40,21 +46,26 @@ def figure(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
     """Draw single figures of a validation, for a paper or a talk.
 
-    Example: cpunet figure run "single pulse" spectrum --sim sim.lh5 --data raw.lh5 --format pdf
+    Example: cpunet figure report "single pulse" spectrum --format pdf --out figures
+
+    Example: cpunet figure run "single pulse" --sim sim.lh5 --data raw.lh5 --out figures
     """
     from cpunet.jobs.figure_files import draw_figures
     from cpunet.jobs.inputs import InputFile
 
     files = draw_figures(
-        run,
+        folder,
         names,
-        None if sim is None else InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-        None if data is None else InputFile(data, data_table, data_energy, kev_per_adc, dt),
+        None if sim is None else InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
+        None
+        if data is None
+        else InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
         out_folder,
         suffix=f".{suffix.removeprefix('.')}",
         truth=truth,

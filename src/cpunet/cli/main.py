@@ -6,9 +6,11 @@ import os
 import signal
 import sys
 from types import FrameType
+from typing import Annotated
 
 import typer
 
+import cpunet
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.ensemble import ensemble
@@ -19,7 +21,7 @@ from cpunet.cli.figure import figure
 from cpunet.cli.import_weights import import_
 from cpunet.cli.info import info
 from cpunet.cli.library import library
-from cpunet.cli.messages import fail
+from cpunet.cli.messages import fail, out, warn
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
@@ -29,13 +31,34 @@ from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.errors import CpunetError
+from cpunet.installation import other_package
 
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"cpunet {cpunet.__version__}", highlight=False)
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool,
+    typer.Option(
+        "--version", callback=_tell_version, is_eager=True, help="Show the version and exit."
+    ),
+]
 app = typer.Typer(
     help="Make simulated germanium-detector pulses look measured.",
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
+
+
+@app.callback()
+def _options(version: Version = False) -> None:
+    pass
+
+
 for command in (
     demo,
     simulate,
@@ -64,6 +87,8 @@ def main() -> None:
     _share_the_machine()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _stop)
+    if clash := other_package():
+        warn(clash)
     try:
         app()
     except CpunetError as error:

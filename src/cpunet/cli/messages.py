@@ -15,6 +15,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
+from rich.text import Text
 
 from cpunet.jobs.monitor import Advance, Monitor
 
@@ -27,6 +29,27 @@ LOG_EVERY_S = 30.0  # between lines of progress in a log file
 def fail(message: str) -> None:
     """Print an error as one line."""
     err.print(f"[bold red]error:[/] {_plain(message)}", soft_wrap=True, highlight=False)
+
+
+def warn(message: str) -> None:
+    """Print a warning as one line."""
+    err.print(f"[bold]warning:[/] {_plain(message)}", soft_wrap=True, highlight=False)
+
+
+def print_table(table: Table) -> None:
+    """Print a table with every number whole, on a narrow screen or in a log, too.
+
+    Words and headings are broken where there is no room for them; if that is not enough, the
+    table is wider than the screen.
+    """
+    for column in table.columns:
+        cells = [Text.from_markup(str(cell)).plain for cell in column.cells]
+        if column.justify != "right":  # words
+            cells = [word for cell in cells for word in cell.split()]
+        column.min_width = max([1, *map(len, cells)])
+        column.no_wrap, column.overflow = False, "fold"
+    needed = 1 + sum(2 + (column.min_width or 0) for column in table.columns)  # with gaps
+    Console(file=out.file, width=max(out.width, needed)).print(table)
 
 
 def monitor() -> Monitor:

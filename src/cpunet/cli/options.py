@@ -45,6 +45,13 @@ Dt = Annotated[
     float | None,
     typer.Option("--dt-ns", "--dt", help="Sampling period in ns, if the files do not tell."),
 ]
+Insist = Annotated[
+    bool,
+    typer.Option(
+        "--insist",
+        help="Pulses are simulated or measured as given, whatever they look like.",
+    ),
+]
 Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]

@@ -8,12 +8,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, out, print_table
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -29,7 +28,6 @@ Truth = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for response.json and .png.")]
 
-_WIDEST = 10_000  # columns
 # What a name of `describe_responses` stands for, and its unit; shares are given in percent.
 ROWS = {
     r"pole_(\d)_ns": (r"bandwidth pole \1", "ns"),
@@ -75,10 +73,7 @@ def response(
     elif electronics is not None:
         truth = read_electronics(electronics)
     told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
-    table = response_table(told)
-    # whole, also where it is wider than a terminal or a log's 80 columns
-    width = out.measure(table, options=out.options.update(max_width=_WIDEST)).maximum
-    Console(file=out.file, width=max(out.width, width)).print(table)
+    print_table(response_table(told))
     if out_folder is not None:
         out.print(f"{out_folder / 'response.png'}", soft_wrap=True)
 
@@ -93,14 +88,14 @@ def response_table(told: dict[str, Any]) -> Table:
     """
     runs, truth = told["runs"], told.get("truth")
     table = Table(title="Readout response", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("", no_wrap=True)
+    table.add_column("")
     heads = [Path(run["path"]).name for run in runs]
     if "mean" in told:
         heads.append("mean ± spread")
     if truth is not None:
         heads += [truth["name"], "difference", "σ"]
     for head in heads:
-        table.add_column(escape(head), justify="right", no_wrap=True)
+        table.add_column(escape(head), justify="right")
     for name in _names(told):
         label, unit = _label(name)
         table.add_row(

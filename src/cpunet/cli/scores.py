@@ -8,6 +8,8 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from cpunet.cli.messages import out, print_table
+
 # Methods in the order of a report; those without noise are in metrics.json.
 METHODS = {
     "raw": "raw",
@@ -23,6 +25,15 @@ PARAMETERS = {
     "drift_time": "T_drift",
     "tail_slope": "tail slope",
 }
+
+
+def print_scores(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> None:
+    """Print the table of scores, and below it why peaks have none."""
+    print_table(score_table(metrics, leave_out))
+    for peak, scores in metrics["peaks"].items():
+        if "missing" in scores and peak not in leave_out:
+            line = f"{peak}: not scored, {scores['missing']}"
+            out.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def score_table(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> Table:
@@ -45,12 +56,10 @@ def score_table(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> Table
     shown = [m for m in METHODS if m in scored]
     table = Table(title="Overlap with data (IoU, %)", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("peak", "parameter"):
-        table.add_column(column, no_wrap=True)
+        table.add_column(column)
     for method in shown:
-        table.add_column(METHODS[method], justify="right", no_wrap=True)
+        table.add_column(METHODS[method], justify="right")
     for peak, scores in peaks.items():
-        if "missing" in scores:
-            table.add_row(peak, scores["missing"], *("" for _ in shown))
         for parameter, comparison in scores["parameters"].items():
             cells = [_number(comparison["iou"].get(m)) for m in shown]
             table.add_row(peak, PARAMETERS.get(parameter, parameter), *cells)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="fast, small, paper, or a YAML file of your own.")
+    str, typer.Option("--recipe", help="fast, best, small, paper, or a YAML file of your own.")
 ]
 Peak = Annotated[
     str, typer.Option(help="Energies to train on: FEP, SEP, DEP or a range in keV, as 300-.")
@@ -59,6 +59,7 @@ def train(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     set_values: Set = None,
     threads: Threads = None,
     device: options.Device = "auto",
@@ -99,8 +100,8 @@ def train(
     with _StopRequest(shown, launched) as stop:
         try:
             info = train_run(
-                InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-                InputFile(data, data_table, data_energy, kev_per_adc, dt),
+                InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
+                InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
                 out_folder,
                 chosen,
                 peak=peak,

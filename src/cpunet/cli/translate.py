@@ -100,6 +100,7 @@ def translate(
     energy: Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     output: Annotated[Output, typer.Option(help="Form of the output.")] = Output.NORMALISED,
     adc_per_kev: AdcPerKev = None,
     baseline: Baseline = None,
@@ -122,7 +123,7 @@ def translate(
     from cpunet.jobs.translate_options import TranslateOptions
 
     adc = _adc(output, adc_per_kev, baseline, length, n_pre)
-    files = [InputFile(f, table, energy, kev_per_adc, dt) for f in expanded(sources)]
+    files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
     place = Path(out_name)
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
         form = TranslateOptions(

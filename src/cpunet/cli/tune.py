@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.ensemble import Jobs, Resume, Threads
-from cpunet.cli.messages import err, monitor, out
+from cpunet.cli.messages import err, monitor, out, print_table
 from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
@@ -35,6 +35,7 @@ def tune(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     set_values: Set = None,
     jobs: Jobs = None,
     threads: Threads = None,
@@ -53,8 +54,8 @@ def tune(
     refuse_inputs(out_folder, recipe)
     try:
         told = tune_recipe(
-            InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-            InputFile(data, data_table, data_energy, kev_per_adc, dt),
+            InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
+            InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
             out_folder,
             load_recipe(recipe, set_values or ()),
             trials=trials,
@@ -70,7 +71,7 @@ def tune(
     except SystemExit:
         err.print("finished trials are kept; go on with --resume", markup=False)
         raise
-    out.print(_table(told))
+    print_table(_table(told))
     best, first = told["best"], told["first"]
     line = f"best: trial {best['number']} with {best['score']:.3f}"
     out.print(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))

@@ -9,7 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
-from cpunet.cli.scores import score_table
+from cpunet.cli.scores import print_scores
 
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 
@@ -28,6 +28,7 @@ def validate(
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    insist: options.Insist = False,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
@@ -40,8 +41,8 @@ def validate(
 
     metrics = validate_run(
         run,
-        InputFile(sim, sim_table, sim_energy, dt_ns=dt),
-        InputFile(data, data_table, data_energy, kev_per_adc, dt),
+        InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
+        InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
         out_folder,
         truth=truth,
         rivals=rivals,
@@ -50,5 +51,5 @@ def validate(
         force=force,
         monitor=monitor(),
     )
-    out.print(score_table(metrics))
+    print_scores(metrics)
     out.print(f"{out_folder / 'report.html'}", soft_wrap=True)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 
-from cpunet.analysis.figures import loss_curves
-from cpunet.analysis.report import DPI
+from cpunet.analysis.report import DPI, REPORT
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.evaluation import evaluate
-from cpunet.jobs.figures import Maker, figure_makers
+from cpunet.jobs.figure_store import STORE, made_of, read_drawings, write_drawings
+from cpunet.jobs.figures import LOSSES, Drawing, drawings, figure_names, of_losses
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
-from cpunet.outputs import refuse_existing
-from cpunet.training.run_folder import read_losses
+from cpunet.outputs import made_here, refuse_existing
+from cpunet.training.run_folder import read_info, read_losses, read_recipe
 
 QUIET = Monitor()
 FORMATS = (".png", ".pdf", ".svg")
-LOSSES = "losses"  # needs no pulses
 
 
 def draw_figures(
-    run: Path,
+    folder: Path,
     names: list[str],
     sim: InputFile | None,
     data: InputFile | None,
@@ -37,15 +38,19 @@ def draw_figures(
 ) -> list[Path]:
     """Draw figures by name into a folder.
 
+    They are drawn of what a validation stored in its report.  Of a run without a report, the
+    pulses are scored once and the results stored in its folder for the next time.
+
     Parameters
     ----------
-    run
-        Folder of the training run.
+    folder
+        Report folder of a validation, or folder of a training run.
     names
         As the report calls them, ``"SEP drift_time"`` or ``"SEP_drift_time"``, or a part of
         that: ``"single pulse"`` draws that of all peaks.
     sim, data
-        Simulated and measured pulses; not needed for the losses.
+        Simulated and measured pulses, for a run; not needed where results of a run are stored,
+        and for its losses.
     out
         Folder, made if need be.
     suffix
@@ -68,41 +73,124 @@ def draw_figures(
     """
     if suffix not in FORMATS:
         raise CpunetError(f"format {suffix!r} is not known; use {', '.join(FORMATS)}")
-    if names == [LOSSES]:
-        makers: dict[str, Maker] = {LOSSES: lambda: loss_curves(read_losses(run))}
-    elif sim is None or data is None:
-        raise CpunetError("simulated and measured pulses are needed; give --sim and --data")
-    else:
-        found = evaluate(
-            run,
-            sim,
-            data,
-            truth=truth,
-            rivals=rivals,
-            seed=seed,
-            device=device,
-            monitor=monitor,
-        )
-        makers = figure_makers(found)
-    chosen = _chosen(names, makers)
-    files = {name: out / f"{name.replace(' ', '_')}{suffix}" for name in chosen}
-    for file in files.values():
-        refuse_existing(file, force=force)
+    read = [folder, truth, *(file for side in (sim, data) if side for file in side.files)]
+
+    def files_of(known: Collection[str]) -> dict[str, Path]:
+        chosen = chosen_names(names, known)
+        files = {name: out / f"{name.replace(' ', '_')}{suffix}" for name in chosen}
+        for file in files.values():
+            refuse_existing(file, *read, force=force)
+        return files
+
+    found = _stored(folder, names, sim, data)
+    if found is None:
+        assert sim is not None  # or `_stored` had raised
+        assert data is not None
+        files_of(_possible(folder))  # before a minute goes into scores
+        given = _Given(folder, sim, data, truth, rivals, seed)
+        found = given.drawings(device, monitor)
+    files = files_of(found)
     for name, file in files.items():
         with written_aside(file) as aside:
-            makers[name]().savefig(aside, format=suffix[1:], dpi=DPI)
+            found[name].draw().savefig(aside, format=suffix[1:], dpi=DPI)
     return list(files.values())
 
 
-def _chosen(names: list[str], makers: dict[str, Maker]) -> list[str]:
-    """Figures with a name that is asked for, or has it as a part."""
+@dataclass(frozen=True)
+class _Given:
+    """A run, and what it is to be scored on."""
+
+    run: Path
+    sim: InputFile
+    data: InputFile
+    truth: Path | None
+    rivals: bool
+    seed: int
+
+    def drawings(self, device: str, monitor: Monitor) -> dict[str, Drawing]:
+        """Take figures stored in the run's folder, if of the same; else score, and store."""
+        how = self.truth, self.rivals, self.seed
+        made = made_of(self.run, self.sim, self.data, *how)
+        store = self.run / STORE
+        if store.is_file():
+            found, of = read_drawings(store)
+            if of == made:
+                return found
+        scored = evaluate(
+            self.run,
+            self.sim,
+            self.data,
+            truth=self.truth,
+            rivals=self.rivals,
+            seed=self.seed,
+            device=device,
+            monitor=monitor,
+        )
+        found = drawings(scored)
+        try:
+            with written_aside(store) as aside:
+                write_drawings(aside, found, made)
+        except CpunetError as error:
+            monitor.note(f"warning: {error}; the next figure takes as long")
+        return found
+
+
+def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
+    """Names of figures that are asked for, or have a name that is as a part.
+
+    Raises
+    ------
+    CpunetError
+        If one fits none; the message lists them.
+
+    Examples
+    --------
+    >>> chosen_names(["noise", "sep_mean_pulse"], ["SEP mean pulse", "SEP noise", "DEP noise"])
+    ['SEP noise', 'DEP noise', 'SEP mean pulse']
+    """
     found = []
+    plain = {name: name.replace("_", " ").casefold() for name in known}
     for wanted in names:
-        plain = wanted.replace("_", " ").casefold()
-        known = {name: name.replace("_", " ").casefold() for name in makers}
-        fits = [n for n, p in known.items() if p == plain]
-        fits = fits or [n for n, p in known.items() if plain in p]
+        asked = wanted.replace("_", " ").casefold()
+        fits = [n for n, p in plain.items() if p == asked]
+        fits = fits or [n for n, p in plain.items() if asked in p]
         if not fits:
-            raise CpunetError(f"no figure {wanted!r}; there are: {', '.join(makers)}")
+            raise CpunetError(f"no figure {wanted!r}; there are: {', '.join(known)}")
         found += fits
     return list(dict.fromkeys(found))
+
+
+def _stored(
+    folder: Path, names: list[str], sim: InputFile | None, data: InputFile | None
+) -> dict[str, Drawing] | None:
+    """Figures that need no scoring; None if pulses are given to be scored."""
+    if made_here(folder, REPORT):
+        if sim is not None or data is not None:
+            raise CpunetError(
+                f"{folder}: is a report, drawn of what it stores; leave out --sim and --data, "
+                "or give the run"
+            )
+        if not (folder / STORE).is_file():
+            raise CpunetError(
+                f"{folder}: stores no results to draw (an older report); validate again, or "
+                "give the run with --sim and --data"
+            )
+        return read_drawings(folder / STORE)[0]
+    if names == [LOSSES]:
+        return {LOSSES: of_losses(read_losses(folder))}
+    if sim is not None and data is not None:
+        return None
+    if (folder / STORE).is_file() and sim is None and data is None:
+        return read_drawings(folder / STORE)[0]
+    chosen_names(
+        names, figure_names([*read_recipe(folder).peaks, str(read_info(folder)["peak"])])
+    )
+    raise CpunetError(
+        "simulated and measured pulses are needed; give --sim and --data, or a report"
+    )
+
+
+def _possible(run: Path) -> list[str]:
+    """Names of the figures that a validation of a run may have."""
+    peaks = [*read_recipe(run).peaks, str(read_info(run)["peak"])]
+    return figure_names(dict.fromkeys(peaks))

@@ -14,10 +14,11 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.monitor import Monitor
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.peaks import EnergySelection, label_peaks
-from cpunet.pulses.preparation import Prepared
+from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
+from cpunet.pulses.side import require_side
 from cpunet.recipes.schema import Recipe
 
 Energies = npt.NDArray[np.float64]
@@ -27,13 +28,17 @@ LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured 
 
 @dataclass(frozen=True)
 class InputFile:
-    """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`."""
+    """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`.
+
+    With `insist` it is what it is given as, simulated or measured, whatever it looks like.
+    """
 
     path: Path
     table: str | None = None
     energy: str | None = None
     kev_per_adc: float | None = None
     dt_ns: float | None = None
+    insist: bool = False
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
@@ -110,6 +115,8 @@ def _load(
     measured: bool,
 ) -> InputSet:
     source = file.open()
+    side: Kind = "measured" if measured else "simulated"
+    require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
     seen: list[Energies] = []
 
     def select(energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -120,7 +127,7 @@ def _load(
         prepared = load_prepared(
             source,
             recipe.preparation,
-            "measured" if measured else "simulated",
+            side,
             select=select,
             peaks=lambda energies: label_peaks(energies, recipe.peaks),
             progress=advance,

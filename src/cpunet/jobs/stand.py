@@ -23,6 +23,7 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.stand_plan import LABELS, OTHER, Kind, Labels, StandPlan
 from cpunet.outputs import FolderKind
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.library_lookup import Library
@@ -141,7 +142,7 @@ def _write_sim(
     labels: list[Labels] = []
     electronics, side = plan.electronics, plan.sim
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
-    writer = PulseWriter(folder / "sim.lh5", attrs=_made_by())
+    writer = PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated"))
     with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
         with writer:
             for fine, label in side.blocks("Simulated events", library, monitor):
@@ -166,7 +167,7 @@ def _write_data(
     labels: list[Labels] = []
     flags: list[npt.NDArray[np.uint8]] = []
     writer = PulseWriter(
-        folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by()
+        folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
     )
     with writer:
         for fine, label in plan.data.blocks("Measured events", library, monitor):
@@ -220,5 +221,5 @@ def _by_line(labels: Labels) -> Counter[str]:
     return Counter({name: int((labels == i).sum()) for i, name in names.items()})
 
 
-def _made_by() -> dict[str, str | float]:
-    return {"made_by": f"cpunet stand {cpunet.__version__}"}
+def _made_by(side: str) -> dict[str, str | float]:
+    return {MADE_BY: f"cpunet stand {cpunet.__version__}", SIDE: side}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import cpunet
 from cpunet.errors import CpunetError
 from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.inputs import InputFile
@@ -36,6 +36,7 @@ from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
+from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
@@ -109,15 +110,16 @@ class FileTranslation:
             refuse_existing(out, force=force)
             pulses = source.open()
             self._require_sampling(source, pulses)
+            require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
             others = other_columns(pulses, self.options, monitor.note)
-            attrs = {"translated_by": f"cpunet {self.kind.part}", "run": str(self.run)}
+            attrs = {TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)}
             writer = writer_of(pulses, out, self.form, self.options, attrs, force=force)
             with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
                 counts = self._translate(pulses, noise_key, writer, others, advance)
                 self._require_some(source, counts)
                 require_unchanged(source, before)
                 told = counts.told(adc=self.options.adc is not None)
-                stamp(writer, made | {"counts": told, "cpunet": version("cpunet")})
+                stamp(writer, made | {"counts": told, "cpunet": cpunet.__version__})
             return told
 
     def _form(self) -> OutputForm:
@@ -135,6 +137,13 @@ class FileTranslation:
                 f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
                 f"{self.translator.dt_ns:g} ns; resample the pulses"
             )
+
+    def _remedy(self, pulses: PulseSource) -> str:
+        """What to do with pulses of the other side."""
+        found = recorded_side(pulses)
+        if found is not None and "translated" in found.why:
+            return f"translate the {self.kind.takes} ones that they were made of"
+        return "leave out --inverse" if self.options.inverse else "give --inverse"
 
     def _require_some(self, source: InputFile, counts: Counts) -> None:
         if counts.translated:

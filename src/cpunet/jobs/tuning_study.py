@@ -37,7 +37,7 @@ def require_optuna() -> Any:
         import optuna
     except ImportError as error:
         raise CpunetError(
-            "tuning needs optuna, which is not installed; pip install 'cpunet[tune]'"
+            "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

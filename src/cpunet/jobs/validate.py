@@ -9,7 +9,8 @@ from typing import Any
 from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.evaluation import evaluate
-from cpunet.jobs.figures import figure_makers
+from cpunet.jobs.figure_store import STORE, made_of, write_drawings
+from cpunet.jobs.figures import drawings
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.views import report_views
@@ -42,7 +43,8 @@ def validate_run(
     sim, data
         Simulated and measured pulses.
     out
-        Report folder: ``metrics.json``, figures, ``report.html``.
+        Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, of
+        which `cpunet.jobs.figure_files.draw_figures` draws them again.
     truth
         ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
     rivals
@@ -74,11 +76,13 @@ def validate_run(
             device=device,
             monitor=monitor,
         )
-        makers = figure_makers(found)
-        with monitor.stage("Drawing", len(makers)) as advance:
+        to_draw = drawings(found)
+        made = made_of(run, sim, data, truth, rivals, seed)
+        write_drawings(folder / STORE, to_draw, made)
+        with monitor.stage("Drawing", len(to_draw)) as advance:
             figures = {}
-            for name, make in makers.items():
-                figures[name] = make()
+            for name, drawing in to_draw.items():
+                figures[name] = drawing.draw()
                 advance(1)
             notes = _notes(found.info, truth)
             write_report(folder, found.metrics, figures, notes, report_views(found))

@@ -26,6 +26,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind
 from cpunet.recipes import recipe_from
@@ -44,8 +45,8 @@ RUN = FolderKind(
 
 def versions() -> dict[str, str]:
     """Versions of what shapes the result."""
-    packages = ("cpunet", "torch", "numpy", "numba")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+    packages = {name: version(name) for name in ("torch", "numpy", "numba")}
+    return {"python": platform.python_version(), "cpunet": cpunet.__version__} | packages
 
 
 def append_losses(folder: Path, records: Iterable[Record]) -> None:

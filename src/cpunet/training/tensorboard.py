@@ -23,7 +23,7 @@ class LossBoard:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
             raise CpunetError(
-                "TensorBoard is not installed; pip install 'cpunet[tensorboard]'"
+                "TensorBoard is not installed; pip install 'cpunet-hpge[tensorboard]'"
             ) from error
         self._writer = SummaryWriter(folder / "tensorboard")
 

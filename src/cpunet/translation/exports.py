@@ -269,5 +269,5 @@ def _needed(package: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise CpunetError(
-            f"the package {package} is needed for ONNX; pip install 'cpunet[onnx]'"
+            f"the package {package} is needed for ONNX; pip install 'cpunet-hpge[onnx]'"
         ) from error

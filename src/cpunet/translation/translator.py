@@ -7,6 +7,8 @@ left as it is), so raw simulated pulses of any length can be given.
 
 from __future__ import annotations
 
+import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,6 +42,10 @@ RESIDUAL = "residual"  # its weights lie beside those of the chain
 BATCH = 512  # pulses at a time: bounds the memory, hardly touches the speed
 
 
+class RejectionWarning(UserWarning):
+    """Some pulses could not be translated."""
+
+
 @dataclass(frozen=True, eq=False)
 class Translated:
     """Translated pulses, row by row those that were given.
@@ -59,6 +65,12 @@ class Translated:
     def valid(self) -> npt.NDArray[np.bool_]:
         """Which rows were translated."""
         return np.asarray(self.codes == Rejection.ACCEPTED)
+
+    def reasons(self) -> str:
+        """Say how many rows were not translated, by reason."""
+        counts = Counter(self.codes[~self.valid].tolist())
+        labels = ((n, Rejection(code).label.replace("_", " ")) for code, n in counts.items())
+        return ", ".join(f"{n} {label}" for n, label in labels)
 
 
 class Translator:
@@ -139,9 +151,13 @@ class Translator:
         Raises
         ------
         CpunetError
-            If energies are needed and not given, or a pulse cannot be prepared: names the
-            first and the reason.
-            `translate_pulses` gives rows of NaN instead.
+            If energies are needed and not given, or a single pulse cannot be translated.
+
+        Warns
+        -----
+        RejectionWarning
+            If pulses cannot be translated, with their number by reason: their rows are NaN.
+            `translate_pulses` has a code for each instead.
         """
         if isinstance(waveforms, torch.Tensor):
             array = waveforms.detach().cpu().numpy()
@@ -262,6 +278,8 @@ class Translator:
         noise: bool,
         seed: int | None,
     ) -> FloatArray:
+        if not waveforms.ndim:
+            raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         single = waveforms.ndim == 1
         if noise and self.needs_energies and energy_kev is None:
             raise CpunetError(
@@ -271,11 +289,14 @@ class Translator:
         if energy_kev is not None:
             pulses = replace(pulses, energy_kev=_one_each(energy_kev, len(pulses)))
         done = self.translate_pulses(pulses, noise=noise, generator=self.seeded(seed))
+        if single and not done.valid[0]:
+            raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
         if not done.valid.all():
-            first = int(np.flatnonzero(~done.valid)[0])
-            raise CpunetError(
-                f"pulse {first}: {Rejection(done.codes[first]).label.replace('_', ' ')}; "
-                "remove it, or use translate_pulses"
+            warnings.warn(
+                f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
+                f"translated and are rows of NaN: {done.reasons()}",
+                RejectionWarning,
+                stacklevel=3,
             )
         return done.pulses.waveforms[0] if single else done.pulses.waveforms
 

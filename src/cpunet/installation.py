@@ -1,0 +1,37 @@
+"""Whether another package lies over this one.
+
+The authors of CPU-Net publish their own code as ``cpunet``; this package's distribution is
+called ``cpunet-hpge`` and is imported as ``cpunet``, too.  Both write to the same folder, so
+only one of them can be installed in an environment.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
+
+
+@cache
+def other_package() -> str | None:
+    """Say in one line what to do if the other package is installed over this one.
+
+    Returns
+    -------
+    str or None
+        None if it is not installed, or lies elsewhere.
+    """
+    try:
+        other = distribution(OTHER)
+    except PackageNotFoundError:
+        return None
+    here = Path(__file__).resolve().parent
+    files = (Path(str(other.locate_file(file))) for file in other.files or ())
+    if not any(here == file.parent.resolve() for file in files if file.suffix == ".py"):
+        return None
+    return (
+        f"the package {OTHER} {other.version} is installed over {DISTRIBUTION}, of the same "
+        f"import name; pip uninstall {OTHER} {DISTRIBUTION}, then install the one you want"
+    )

@@ -1,0 +1,156 @@
+"""Which side pulses are of, simulated or measured: by what their file says, or their look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.preparation import Kind
+from cpunet.pulses.reading.hdf5 import opened, text_attribute
+from cpunet.pulses.reading.source import PulseSource
+
+SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"  # attributes of a table
+REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
+
+_LOOKED_AT = 256  # pulses
+_FEWEST_SAMPLES = 100  # of a trace; a shorter one has no ends to look at
+_FULL_HEIGHT = 10.0  # in ADC counts; whole numbers below may be a charge in its own units
+_TURNS = 3  # of a trace's beginning that noise makes, and a charge signal does not
+_SMALL = 1e-5  # of the height: what rounding makes of a flat line
+_LEAST_END = 0.98  # of the height: without electronics a pulse ends where it is highest
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """What pulses are.
+
+    Parameters
+    ----------
+    side
+        Simulated, or measured; translated ones are what they were made like.
+    why
+        How that is known, to follow "these".
+    certain
+        Whether the file says so; else it is a guess.
+    """
+
+    side: Kind
+    why: str
+    certain: bool
+
+
+def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool) -> None:
+    """Refuse pulses that are of the other side.
+
+    Parameters
+    ----------
+    source
+        A file of pulses.
+    wanted
+        What it was given as.
+    remedy
+        What to do if it is the other.
+    insist
+        Whether the user knows better than a guess.
+
+    Raises
+    ------
+    CpunetError
+        If the file says that its pulses are of the other side, or, unless `insist`, they
+        look so.
+    """
+    found = recorded_side(source)
+    if found is None and not insist:
+        found = apparent_side(next(iter(source.blocks(_LOOKED_AT))).waveforms)
+    if found is not None and found.side != wanted:
+        sure = "" if found.certain else f"; if they are {wanted}, say so with --insist"
+        raise CpunetError(
+            f"{source.path}: given as {wanted} pulses, but these {found.why}; {remedy}{sure}"
+        )
+
+
+def recorded_side(source: PulseSource) -> Recognised | None:
+    """What a file that this program wrote says of its pulses; None for others."""
+    told = source.describe()
+    if told["format"] not in ("LH5", "HDF5"):
+        return None
+    with opened(source.path) as file:
+        places = _places(file, told["table"])
+        side, made_by, translated_by = (
+            next((text for place in places if (text := text_attribute(place, name))), "")
+            for name in (SIDE, MADE_BY, TRANSLATED_BY)
+        )
+    if translated_by in (REN, IREN):
+        kind: Kind = "measured" if translated_by == REN else "simulated"
+        name = translated_by.rpartition(" ")[2].upper()
+        return Recognised(kind, f"were translated by {name} already", certain=True)
+    if made_by.startswith(SIMULATE) or side == "simulated":
+        return Recognised("simulated", f"were simulated by {made_by}", certain=True)
+    if side == "measured":
+        return Recognised(
+            "measured", f"are traces behind electronics ({made_by})", certain=True
+        )
+    return None
+
+
+def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
+    """What pulses look like; None if that does not tell.
+
+    Measured are whole numbers with noise before the pulse, simulated what has neither noise nor
+    a decay.  A charge signal with noise, or a trace without its baseline, may be either.
+
+    Parameters
+    ----------
+    waveforms
+        Traces, shape ``(n, samples)``.
+
+    Examples
+    --------
+    >>> time = np.arange(400)
+    >>> charge = 1 / (1 + np.exp((200 - time) / 5))
+    >>> apparent_side(charge[None]).side
+    'simulated'
+    >>> noise = np.random.default_rng(1).normal(0, 10, 400)
+    >>> apparent_side(np.round(3000 * charge + noise)[None]).side
+    'measured'
+    >>> apparent_side((charge + noise / 3000)[None]) is None
+    True
+    """
+    known = waveforms[np.isfinite(waveforms).all(axis=1)].astype(float)
+    known = known[np.ptp(known, axis=1) > 0] if known.size else known
+    if not len(known) or known.shape[1] < _FEWEST_SAMPLES:
+        return None
+    height = np.ptp(known, axis=1)
+    few = known.shape[1] // 10
+    before = np.median(_turns(known[:, :few], height))
+    after = np.median(_turns(known[:, -few:], height))
+    whole = (known == np.round(known)).all() and np.median(height) > _FULL_HEIGHT
+    if whole and before >= _TURNS:
+        why = "look measured (whole numbers with noise before the pulse)"
+        return Recognised("measured", why, certain=False)
+    end = (known[:, -few:].mean(axis=1) - known.min(axis=1)) / height
+    if max(before, after) < _TURNS and np.median(end) > _LEAST_END:
+        return Recognised("simulated", "look simulated (no noise, no decay)", certain=False)
+    return None
+
+
+def _turns(
+    part: npt.NDArray[np.float64], height: npt.NDArray[np.float64]
+) -> npt.NDArray[np.int64]:
+    """How often each trace turns from rising to falling or back."""
+    steps = np.diff(part, axis=1)
+    signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
+    return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
+
+
+def _places(file: h5py.File, waveforms: str) -> list[h5py.Group | h5py.Dataset]:
+    """Where attributes of pulses may be: their table, their column, its samples."""
+    column = file[waveforms]
+    places = [file[waveforms.rpartition("/")[0] or "/"], column]
+    if isinstance(column, h5py.Group) and "values" in column:
+        places.append(column["values"])
+    return places
