@@ -14,6 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cpunet import outputs
 from cpunet.errors import CpunetError
 from cpunet.training.checkpoints import (
     CHECKPOINT,
@@ -278,7 +279,8 @@ def beside(out: Path) -> Path:
 
 
 def test_a_training_that_died_is_finished(sets, recipe, out, whole):
-    assert {CHECKPOINT, PREVIOUS, LOSSES, MARKER} == content(beside(out)).keys()
+    files = {CHECKPOINT, PREVIOUS, LOSSES, MARKER, outputs.MARKER}
+    assert files == content(beside(out)).keys()
     assert not out.exists()
     # the log is ahead of the checkpoint, and is cut
     assert len((beside(out) / LOSSES).read_text().splitlines()) == 5

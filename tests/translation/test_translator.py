@@ -153,7 +153,7 @@ def test_pulses_that_cannot_be_translated_are_nan_and_counted(ren, sim):
 
 
 def test_a_single_pulse_that_cannot_be_translated_is_an_error(ren, sim):
-    with pytest.raises(CpunetError, match="^the pulse cannot be translated: 1 constant$"):
+    with pytest.raises(CpunetError, match=r"^the pulse cannot be translated: 1 constant$"):
         ren.translate(broken(sim)[3])
 
 

@@ -42,13 +42,21 @@ def print_table(table: Table) -> None:
     Words and headings are broken where there is no room for them; if that is not enough, the
     table is wider than the screen.
     """
+    _, right, _, left = table.padding
+    edges = 1 + len(table.columns) * (left + right + 1)
+    wanted = []
     for column in table.columns:
         cells = [Text.from_markup(str(cell)).plain for cell in column.cells]
+        wanted.append(max([1, *map(len, (Text.from_markup(str(column.header)).plain, *cells))]))
         if column.justify != "right":  # words
             cells = [word for cell in cells for word in cell.split()]
-        column.min_width = max([1, *map(len, cells)])
+        column.width = max([1, *map(len, cells)])
         column.no_wrap, column.overflow = False, "fold"
-    needed = 1 + sum(2 + (column.min_width or 0) for column in table.columns)  # with gaps
+    needed = edges + sum(column.width or 0 for column in table.columns)
+    spare = max(0, out.width - needed)
+    for column, width in zip(table.columns, wanted, strict=True):
+        more = min(spare, width - (column.width or 0))
+        column.width, spare = (column.width or 0) + more, spare - more
     Console(file=out.file, width=max(out.width, needed)).print(table)
 
 

@@ -1,0 +1,131 @@
+"""What README and docs print runs as it is printed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import tomllib
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+import yaml
+
+import cpunet
+from cpunet.cli.main import app
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.train import train_run
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.translation.translator import RejectionWarning
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+# Seconds of simulation each: their imports are tried only.
+TOO_LONG = {"simulation.md", "explorer.md"}
+KEV = 2614.511
+
+
+def blocks(*languages: str) -> list:
+    return [
+        pytest.param(page, code, id=f"{page.name}-{i}")
+        for page in PAGES
+        for i, (language, code) in enumerate(BLOCK.findall(page.read_text()))
+        if language in languages
+    ]
+
+
+def commands(code: str) -> list[list[str]]:
+    """The words of each line of a console, without comments; brackets hold what may be left."""
+    lines = code.replace("\\\n", " ").replace("[--", "--").replace("]\n", "\n").splitlines()
+    words = (shlex.split(line, comments=True) for line in lines if "…" not in line)
+    return [line for line in words if line]
+
+
+def require_parsed(words: list[str]) -> None:
+    """Have the command line's own parser read the words; nothing is run."""
+    command, name = typer.main.get_command(app), "cpunet"
+    while words and words[0] in getattr(command, "commands", {}):
+        name, *words = words
+        command = command.commands[name]
+    assert not hasattr(command, "commands"), f"no command {words[:1]}"
+    command.make_context(name, list(words))
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("", "sh", "console"))
+def test_the_commands(page, code):
+    for words in commands(code):
+        if "cpunet" in words:
+            require_parsed(words[words.index("cpunet") + 1 :])
+        for word in words:
+            if word.startswith(("benchmarks/", "workflow/")):
+                assert (ROOT / word).exists(), f"{page.name}: {word}"
+
+
+def test_a_wrong_option_would_be_found():
+    with pytest.raises(Exception, match="No such option"):
+        require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
+
+
+def edges(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
+    width = rng.uniform(1.0, 6.0, (n, 1))
+    return 1 / (1 + np.exp(-(np.arange(length) - 550 - rng.uniform(0, 1, (n, 1))) / width))
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """The files that the pages speak of, sim.lh5 as `cpunet simulate` may write it."""
+    folder, rng = tmp_path_factory.mktemp("docs"), np.random.default_rng(1)
+    sim = edges(260, 1200, rng)
+    sim[7] = 0  # of which nothing was collected
+    kev = np.full(len(sim), KEV)
+    kev[3] = 1.0  # the rest was lost in the lithium layer
+    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
+    decayed = edges(260, 1200, rng) * np.exp(-np.clip(np.arange(1200) - 550, 0, None) / 4000)
+    raw = np.round(1000 + 10 * KEV * decayed + rng.normal(0, 20, decayed.shape))
+    pulses = Pulses.of(raw, dt_ns=16, energy_kev=np.full(len(raw), KEV))
+    write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
+    fine = Pulses.of(edges(4, 3000, rng), dt_ns=1, energy_kev=np.full(4, KEV))
+    write_pulses(folder / "fine.lh5", fine)
+    short = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
+    recipe = load_recipe("fast", [f"training.{value}" for value in (*short, "noise_sets=1")])
+    sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")
+    train_run(*sides, folder / "run", recipe, device="cpu")
+    for seed in ("seed_000", "seed_001"):
+        shutil.copytree(folder / "run", folder / "ens" / seed)
+    return folder
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("python"))
+def test_the_python(page, code, home, monkeypatch):
+    monkeypatch.chdir(home)
+    if page.name in TOO_LONG:
+        compile(code, page.name, "exec")
+        code = "\n".join(line for line in code.splitlines() if re.match("from|import", line))
+    names: dict[str, object] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RejectionWarning)
+        exec(compile(code, page.name, "exec"), names)
+    if page.name == "README.md":
+        lost = np.isnan(names["measured_like"]).any(axis=1)
+        assert lost[7]  # and the one of 1 keV, if its noise is too high
+        assert set(np.flatnonzero(lost)) <= {3, 7}
+
+
+def test_the_readmes_files_are_told_of(home):
+    pulses = cpunet.open_pulses(home / "sim.lh5").read()
+    ren = cpunet.REN.load(home / "run")
+    with pytest.warns(RejectionWarning, match=r"of 260 pulses .* rows of NaN: .*1 constant"):
+        ren.translate(pulses.waveforms, energy_kev=pulses.energy_kev, seed=1)
+
+
+def test_the_distribution_is_not_the_authors():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == "cpunet-hpge"
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == cpunet.__version__

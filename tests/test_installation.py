@@ -1,0 +1,89 @@
+"""The authors' package, installed over this one, is told of in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+
+import cpunet
+from cpunet import installation
+
+HERE = Path(cpunet.__file__).parent
+
+
+class Other:
+    """A distribution called cpunet."""
+
+    version = "1.0.0"
+
+    def __init__(self, folder: Path, *names: str) -> None:
+        self.folder, self.files = folder, [Path(name) for name in names]
+
+    def locate_file(self, name: Path) -> Path:
+        return self.folder / name
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Pretend that a distribution is installed."""
+
+    def install(other: Other | None) -> None:
+        def find(name: str) -> Other:
+            assert name == "cpunet"
+            if other is None:
+                raise PackageNotFoundError(name)
+            return other
+
+        monkeypatch.setattr(installation, "distribution", find)
+        installation.other_package.cache_clear()
+
+    yield install
+    installation.other_package.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        None,
+        Other(HERE.parent, "_editable_impl_cpunet.pth", "cpunet-0.1.0.dist-info/RECORD"),
+        Other(HERE.parent.parent, "cpunet/__init__.py"),  # elsewhere, not over this one
+    ],
+)
+def test_alone(installed, other):
+    installed(other)
+    assert installation.other_package() is None
+    assert cpunet.Pulses
+
+
+def test_over_this_one(installed):
+    installed(Other(HERE.parent, "cpunet/__init__.py", "cpunet/model.py"))
+    told = (
+        "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "
+        "pip uninstall cpunet cpunet-hpge, then install the one you want"
+    )
+    assert installation.other_package() == told
+    with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
+        assert cpunet.Pulses
+
+
+def test_the_command_line_tells_it(installed, capsys, monkeypatch):
+    from cpunet.cli import main
+
+    installed(Other(HERE.parent, "cpunet/__init__.py"))
+    monkeypatch.setattr(sys, "argv", ["cpunet", "--version"])
+    with pytest.raises(SystemExit):
+        main.main()
+    printed = capsys.readouterr()
+    assert printed.out == f"cpunet {cpunet.__version__}\n"
+    assert printed.err.startswith("warning: the package cpunet 1.0.0 is installed over")
+    assert printed.err.count("\n") == 1
+
+
+def test_importing_looks_for_nothing():
+    """`import cpunet` takes no time for it."""
+    code = "import sys, cpunet; sys.exit('torch' in sys.modules or 'h5py' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
