@@ -78,7 +78,7 @@ def test_export(command, trained, tmp_path):
     assert "data.lh5" in card
     refused = command("export", trained, "--format", "torchscript", "--out", out)
     assert refused.code == 2
-    refused = command("export", tmp_path, "--out", tmp_path / "x.onnx")
+    refused = command("export", tmp_path / "none", "--out", tmp_path / "x.onnx")
     assert refused.code == 2
     assert "no finished run" in refused.err
     assert command("export", trained, "--format", "tflite", "--out", out).code == 2

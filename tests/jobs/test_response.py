@@ -229,7 +229,11 @@ def test_the_closed_form_is_the_chain_of_the_stand():
 def test_a_folder_with_numbers_and_figure(run, tmp_path):
     out = tmp_path / "out"
     told = describe_responses([run], truth=electronics(), out=out)
-    assert {file.name for file in out.iterdir()} == {"response.json", "response.png"}
+    assert {file.name for file in out.iterdir()} == {
+        ".cpunet.json",
+        "response.json",
+        "response.png",
+    }
     assert json.loads((out / "response.json").read_text()) == told
     assert (out / "response.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(CpunetError, match="exists already"):

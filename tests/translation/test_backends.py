@@ -214,7 +214,7 @@ def test_low_energies_have_large_noise(ren, sim) -> None:
     done = ren.translate(sim, energy_kev=low, seed=1)
     rms = done[:, :200].std(axis=1)
     assert rms[::2].mean() == pytest.approx(10 * rms[1::2].mean(), rel=0.2)
-    low[::2] = KEV / 300
+    low[::2] = KEV / 50
     with pytest.warns(RejectionWarning, match="rows of NaN: .* (amplitude|tail)"):
         done = ren.translate(sim, energy_kev=low, seed=1)
     assert np.isfinite(done[1::2]).all()

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import PulseWriter
 
@@ -45,6 +46,7 @@ def merge(
     CpunetError
         If a file cannot be read, or the files' pulses differ in length or sampling.
     """
+    refuse_inputs(out, *files, *energies)
     of_files = list(energies) or [None]
     if len(of_files) == 1:
         of_files *= len(files)

@@ -39,25 +39,25 @@ def warn(message: str) -> None:
 def print_table(table: Table) -> None:
     """Print a table with every number whole, on a narrow screen or in a log, too.
 
-    Words and headings are broken where there is no room for them; if that is not enough, the
-    table is wider than the screen.
+    Words and headings are broken if that makes the table fit; else it is wider than the screen.
     """
     _, right, _, left = table.padding
-    edges = 1 + len(table.columns) * (left + right + 1)
-    wanted = []
+    room = out.width - 1 - len(table.columns) * (left + right + 1)
+    least, most = [], []
     for column in table.columns:
+        head = Text.from_markup(str(column.header)).plain
         cells = [Text.from_markup(str(cell)).plain for cell in column.cells]
-        wanted.append(max([1, *map(len, (Text.from_markup(str(column.header)).plain, *cells))]))
+        most.append(max([1, *map(len, (head, *cells))]))
         if column.justify != "right":  # words
             cells = [word for cell in cells for word in cell.split()]
-        column.width = max([1, *map(len, cells)])
-        column.no_wrap, column.overflow = False, "fold"
-    needed = edges + sum(column.width or 0 for column in table.columns)
-    spare = max(0, out.width - needed)
-    for column, width in zip(table.columns, wanted, strict=True):
-        more = min(spare, width - (column.width or 0))
-        column.width, spare = (column.width or 0) + more, spare - more
-    Console(file=out.file, width=max(out.width, needed)).print(table)
+        least.append(max([1, *map(len, cells)]))
+    spare = room - sum(least)
+    for column, low, high in zip(table.columns, least, most, strict=True):
+        more = high - low if spare < 0 else min(spare, high - low)
+        column.width, column.no_wrap, column.overflow = low + more, False, "fold"
+        spare -= 0 if spare < 0 else more
+    whole = out.width - room + sum(column.width or 0 for column in table.columns)
+    Console(file=out.file, width=max(out.width, whole)).print(table)
 
 
 def monitor() -> Monitor:

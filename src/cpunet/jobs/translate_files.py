@@ -85,9 +85,11 @@ def translate_files(
     """
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
     read = [run, *(given for source in sources for given in source.files)]
+    if out.exists() and not out.is_dir():
+        raise CpunetError(f"{out}: is a file, but several outputs need a folder")
     for task in tasks:
         refuse_inputs(task.out, *read)
-    _require_apart(tasks, out, resume=resume, force=force)
+    _require_apart(tasks, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
     for note in FileTranslation(run, options, device).notes:
         monitor.note(note)
@@ -192,9 +194,7 @@ def _name(path: Path) -> str:
     return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
 
 
-def _require_apart(tasks: Sequence[_Task], out: Path, *, resume: bool, force: bool) -> None:
-    if out.exists() and not out.is_dir():
-        raise CpunetError(f"{out}: is a file, but several outputs need a folder")
+def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None:
     several = [name for name, n in Counter(task.out.name for task in tasks).items() if n > 1]
     if several:
         raise CpunetError(
