@@ -118,7 +118,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
     with pytest.raises(CpunetError, match="weights of another network"):
         train_run(files["sim"], files["one"], tmp_path / "b", TINY, init=chain)
     with pytest.raises(CpunetError, match="no finished run"):
-        train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path)
+        train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path / "none")
     fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
         train_run(*fast_sampled, tmp_path / "d", FAST, init=chain)

@@ -36,7 +36,7 @@ DETECTOR = read_detector(
 )
 WINDOWS = (Window("FEP", 2614.0, 2615.0), Window("1000-2000", 1000.0, 2000.0))
 EVENTS = (10, 30)
-FILES = ("data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
+FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -177,7 +177,7 @@ def test_the_recipes_own_spaces_can_be_searched(name):
 
 def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(CpunetError, match=r"pip install 'cpunet\[tune\]'"):
+    with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[tune\]'"):
         tune_recipe(*files, tmp_path / "tune", tiny())
     assert not [*tmp_path.iterdir()]
 

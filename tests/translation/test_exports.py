@@ -141,9 +141,9 @@ def test_the_card_and_the_noise(chain, tmp_path):
 
 def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match="no scores"):
-        export_run(chain, tmp_path / "ren.pt", "torchscript", report=tmp_path)
+        export_run(chain, tmp_path / "ren.pt", "torchscript", report=chain)
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
-    with pytest.raises(CpunetError, match=r"pip install 'cpunet\[onnx\]'"):
+    with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_run(chain, tmp_path / "ren.onnx", "onnx")
     graph = graph_of(REN.load(chain))
     with pytest.raises(CpunetError, match="not known"):
