@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,8 @@ import pytest
 import torch
 from torch import nn
 
+from cpunet.analysis.comparisons import compare
+from cpunet.analysis.report import write_report
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.export import export_run
@@ -41,10 +42,27 @@ def write_chain(folder: Path, recipe_name: str) -> Path:
             nn.init.normal_(residual.outlet.weight, std=0.05)
         residual.used.fill_(True)
         model["residual"] = residual
+    with torch.no_grad():  # elsewhere than where a fit begins
+        for times, found in (("log_poles_ns", [33.0, 71.0]), ("log_decay_us", [54.6])):
+            getattr(generator.response, times).copy_(torch.tensor(found).log())
     info = {"recipe": recipe_name, "peak": "FEP", "seed": 0, "dt_ns": 16.0, "seconds": 1.0}
+    info["fit"] = {"errors": {"log_poles_ns.2": 0.02, "log_decay_us.1": 0.002}}
     folder.mkdir()
     write_run(folder, model, recipe, info | {"device": "cpu"})
     return folder
+
+
+def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
+    """A report as a validation writes it, and its overlaps in percent."""
+    rng = np.random.default_rng(1)
+    data, ren = ({"drift_time": rng.normal(1000, 50, 400)} for _ in range(2))
+    scores = load_recipe("small").scores.model_copy(update={"bootstraps": 20})
+    compared = compare(data, {"ren": ren}, scores, seed=1)
+    folder.mkdir()
+    write_report(folder, {"peaks": {"SEP": {"parameters": compared}}}, {}, [])
+    overlaps = compared["drift_time"]["iou"]
+    assert 50 < overlaps["ren"] <= 100
+    return folder, overlaps
 
 
 @pytest.fixture(scope="module")
@@ -112,10 +130,7 @@ def test_torchscript_and_torch_export(run, chain, tmp_path):
 
 
 def test_the_card_and_the_noise(chain, tmp_path):
-    report = tmp_path / "report"
-    report.mkdir()
-    scores = {"SEP": {"parameters": {"drift_time": {"iou": {"ren": 0.87, "ceiling": 0.9}}}}}
-    (report / "metrics.json").write_text(json.dumps({"peaks": scores}))
+    report, scores = written_report(tmp_path / "report")
     done = export_run(chain, tmp_path / "ren.pt", "torchscript", report=report)
     assert (done.card.name, done.noise.name) == ("ren.card.md", "ren.noise.npz")
     card = done.card.read_text()
@@ -126,9 +141,15 @@ def test_the_card_and_the_noise(chain, tmp_path):
         "(batch, 1400)",
         "every 16 ns",
         "ren.noise.npz",
-        "| SEP | drift time | ren 87.0, ceiling 90.0 |",
+        f"| SEP | drift time | ceiling {scores['ceiling']:.1f}, ren {scores['ren']:.1f} |",
+        # what was fitted, not where the fit began
+        "`pole_1_ns` 71 ± 1.4, `pole_2_ns` 33,",
+        "`decay_us` 54.6 ± 0.11",
+        "keV RMS",
     ):
         assert words in card
+    assert "generator:" not in card
+    assert "poles_ns" not in card
     with np.load(done.noise) as noise:
         total = noise["shares"] @ (noise["continua"] + noise["lines"])
         np.testing.assert_allclose(total, 9.0, rtol=1e-5)

@@ -14,8 +14,10 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.response import describe_responses
 from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
 from cpunet.outputs import refuse_existing
+from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import NetworkBackend, ResponseBackend
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
@@ -93,7 +95,7 @@ def export_run(
             _write_noise(aside, translator.backend.chain.noise)
     done = Exported(out, card, noise_file if has_noise else None, difference)
     with written_aside(card) as aside:
-        aside.write_text(_card(translator, info, done, form, scores), encoding="utf-8")
+        aside.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
     return done
 
 
@@ -125,6 +127,7 @@ def _scores(report: Path) -> Mapping[str, Any]:
 
 
 def _card(
+    run: Path,
     translator: Translator,
     info: Mapping[str, Any],
     done: Exported,
@@ -139,7 +142,7 @@ def _card(
         f"batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of the "
         f"pulse height (refused above {TOLERANCE:g}).\n",
         "## Made from\n",
-        *_origin(translator, info),
+        *_origin(run, translator, info),
         "## In and out\n",
         *_interface(translator),
         "## Noise\n",
@@ -154,7 +157,7 @@ def _card(
     return "\n".join(parts)
 
 
-def _origin(translator: Translator, info: Mapping[str, Any]) -> list[str]:
+def _origin(run: Path, translator: Translator, info: Mapping[str, Any]) -> list[str]:
     lines = [f"* recipe {info['recipe']} (seed {info['seed']}), trained on {info['peak']}"]
     for side, what in (("sim", "simulation"), ("data", "data")):
         told = info.get(side)
@@ -167,8 +170,26 @@ def _origin(translator: Translator, info: Mapping[str, Any]) -> list[str]:
     if imported := info.get("imported"):
         names = ", ".join(Path(str(part.get("file"))).name for part in imported.values())
         lines.append(f"* weights imported from {names}")
-    settings = translator.recipe.generator.model_dump(mode="json")
-    lines.append(f"* generator: `{json.dumps(settings)}`\n")
+    return [*lines, *_fitted(run, translator), ""]
+
+
+def _fitted(run: Path, translator: Translator) -> list[str]:
+    """What was found of a readout chain; of a network, what it was made as."""
+    generator = translator.recipe.generator
+    if not isinstance(generator, ResponseConfig):
+        return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
+    told = describe_responses([run])["runs"][0]
+    errors = told["parameter_errors"]
+    numbers = [
+        f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")
+        for name, value in told["parameters"].items()
+    ]
+    lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
+    if rms := told["values"].get("noise_rms_kev"):
+        lines.append(f"* noise of the data: {rms:.3g} keV RMS")
+    if isinstance(generator, HybridConfig):
+        settings = generator.residual.model_dump(mode="json")
+        lines.append(f"* network beside it: `{json.dumps(settings)}`")
     return lines
 
 
@@ -246,7 +267,7 @@ def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
             if not isinstance(iou, dict):
                 continue
             told = ", ".join(
-                f"{method} {100 * score:.1f}"
+                f"{method} {score:.1f}"
                 for method, score in iou.items()
                 if isinstance(score, (int, float))
             )
