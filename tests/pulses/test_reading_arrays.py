@@ -52,6 +52,14 @@ def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, 
 
 
 @pytest.mark.parametrize(("write", "name"), WRITERS)
+def test_what_stands_beside_the_waveforms_can_be_read(tmp_path, write, name):
+    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, edep=ENERGY)
+    columns = open_pulses(path).columns
+    assert sorted(columns) == open_pulses(path).describe()["columns"]
+    np.testing.assert_array_equal(columns["edep"].read(2, 5), ENERGY[2:5])
+
+
+@pytest.mark.parametrize(("write", "name"), WRITERS)
 def test_an_energy_without_units_is_not_in_kev(tmp_path, write, name):
     path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy=ENERGY)
     assert np.isnan(open_pulses(path).read().energy_kev).all()

@@ -81,12 +81,10 @@ def train(
     from cpunet.jobs.inputs import InputFile
     from cpunet.jobs.train import train_run
     from cpunet.recipes import load_recipe
-    from cpunet.training.fast_step import keep_freed_memory
     from cpunet.training.loop import StoppedError
     from cpunet.training.team import ToldElsewhereError, launch
 
     refuse_inputs(out_folder, recipe)
-    keep_freed_memory()
     if threads is not None:
         torch.set_num_threads(threads)
     shown = monitor()

@@ -27,6 +27,7 @@ from cpunet.jobs.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.matching import Sides, match
+from cpunet.jobs.memory import keep_freed_memory
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train_team import team_for
 from cpunet.pulses.peaks import parse_selection
@@ -114,6 +115,7 @@ def train_run(
     StoppedError
         If `stop` asked for it.
     """
+    keep_freed_memory()
     with team_for(recipe, device) as (team, device):
         selection = parse_selection(peak, recipe.peaks)
         told = monitor if team.leads else QUIET

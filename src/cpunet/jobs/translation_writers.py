@@ -87,7 +87,7 @@ def other_columns(
         waveforms, n_pulses = pulses.describe()["table"], pulses.n_pulses or 0
         others = RowColumns.of_hdf5(pulses.path, waveforms, n_pulses, OWN_COLUMNS)
     else:
-        others = RowColumns.of_columns(pulses.path, pulses._layout.columns, OWN_COLUMNS)
+        others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
     for column, reason in others.left_out.items():
         note(f"warning: {pulses.path.name}: column {column} is left out: {reason}")
     return others

@@ -8,7 +8,6 @@ together (`cpunet.networks.gru_chains`).  On a GPU, cuDNN does better.
 
 from __future__ import annotations
 
-import ctypes
 from typing import NamedTuple
 
 from torch import Tensor
@@ -18,8 +17,6 @@ from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.time_major import translate
 from cpunet.training.generator_pass import Pass
-
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _LARGE = -1, -3, 2**31 - 1  # of glibc's malloc.h
 
 
 class Translations(NamedTuple):
@@ -58,18 +55,3 @@ def judge_together(*pairs: tuple[GruDiscriminator, Tensor]) -> list[Tensor]:
     return [
         network.judged(*result) for (network, _), result in zip(pairs, results, strict=True)
     ]
-
-
-def keep_freed_memory() -> None:
-    """Let the C library keep what is freed, for the whole process.
-
-    A step allocates and frees the same hundreds of megabytes again and again; given back to the
-    system and fetched anew, page by page, they take up to a third of it.  Without effect where
-    the C library is not glibc.
-    """
-    try:
-        library = ctypes.CDLL(None)
-        library.mallopt(_MMAP_THRESHOLD, _LARGE)
-        library.mallopt(_TRIM_THRESHOLD, _LARGE)
-    except (OSError, AttributeError, TypeError):
-        return

@@ -76,13 +76,11 @@ class Superpulse:
             # no shift of their own half height gives exactly.
             response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
             kernel = _kernel(wanted, _superpulses(spectra, response), length)
-        return cls(dt_ns, kernel, slope)._with_tail_of(slope, sim[:MOST], align)
-
-    def _with_tail_of(self, slope: float, sim: FloatArray, align: int) -> Self:
-        """Take from the decay what the late part of the kernel adds to the tail slope."""
-        windows = self.translate(sim)[:, ROOM_BEFORE : ROOM_BEFORE + sim.shape[1]]
-        excess = fitted_tail_slope(windows, self.dt_ns, align) - slope
-        return replace(self, tail_slope_per_ms=self.tail_slope_per_ms - excess)
+        found = cls(dt_ns, kernel, slope)
+        # what the late part of the kernel adds to the tail slope is taken from the decay
+        windows = found.translate(sim[:MOST])[:, ROOM_BEFORE : ROOM_BEFORE + sim.shape[1]]
+        excess = fitted_tail_slope(windows, dt_ns, align) - slope
+        return replace(found, tail_slope_per_ms=slope - excess)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Pass through the kernel and let decay, see `base.Rival.translate`."""

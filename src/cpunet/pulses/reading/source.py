@@ -155,6 +155,11 @@ class PulseSource(ABC):
         """All pulses of the file at once; for files that fit in memory."""
         return Pulses.concatenate(list(self.blocks()))
 
+    @property
+    def columns(self) -> Mapping[str, Column]:
+        """What stands beside the waveforms, by name."""
+        return self._layout.columns
+
     def describe(self) -> dict[str, Any]:
         """What the file says of itself without reading its waveforms."""
         return {
