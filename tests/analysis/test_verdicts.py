@@ -128,6 +128,31 @@ def test_the_summary_says_what_agrees_and_what_is_off():
     }
 
 
+def noise_of(ratio: float, worst: float = 0.3) -> dict[str, Any]:
+    """Noise of 1.95 ± 0.03 on the data's side, and that times a ratio on the other."""
+    ren = {"rms": 1.95 * ratio, "rms_std": 0.04, "rms_ratio": ratio, "spectrum_sigma": worst}
+    return {"frequency_mhz": [1.0], "data": {"rms": 1.95, "rms_std": 0.03}, "ren": ren}
+
+
+def test_noise_that_differs_is_said():
+    changed = metrics()
+    sep = changed["peaks"]["SEP"]
+    sep["noise"] = noise_of(1.01)
+    assert "A/E survival and noise agree with the data" in summary(changed, "SEP", "ren")
+    sep["noise"] = noise_of(1.11)
+    assert "; noise off by 4.3 sigma (RMS 1.11 of the data's)" in summary(changed, "SEP", "ren")
+    found = verdict_table(changed)["SEP"]["ren"]
+    assert found["noise"]["sigma"] == pytest.approx(1.95 * 0.11 / 0.05)
+    assert found["noise_spectrum"] == {"sigma": 0.3, "words": "agrees within errors"}
+    sep["noise"] = noise_of(0.89)  # too little of it is as wrong
+    assert "noise off by 4.3 sigma (RMS 0.89" in summary(changed, "SEP", "ren")
+    sep["noise"] = noise_of(1.01, worst=5.5)
+    words = "noise off by 5.5 sigma (worst band of its spectrum; RMS 1.01 of the data's)"
+    assert words in summary(changed, "SEP", "ren")
+    sep["noise"] = {m: {"missing": "7 baselines; 10 are needed"} for m in ("data", "ren")}
+    assert "noise not judged (7 baselines; 10 are needed)" in summary(changed, "SEP", "ren")
+
+
 def test_the_summary_quotes_the_worst_first():
     changed = metrics()
     sep = changed["peaks"]["SEP"]

@@ -2,10 +2,10 @@
 
 A score is compared with what two samples of one distribution would have: the IoU with
 its ceiling, the Wasserstein distance and the classifier's AUC with their nulls, the A/E
-survival with that of the data.  The question is whether chance alone explains a score, so
-the scale is the scatter that chance gives it, the *null's* spread.  The spread of the
-score itself under resampling says how well the score is known; a poor translation's
-would make it look closer to the ceiling than it is.
+survival and the noise before the pulse with those of the data.  The question is whether
+chance alone explains a score, so the scale is the scatter that chance gives it, the
+*null's* spread.  The spread of the score itself under resampling says how well the score
+is known; a poor translation's would make it look closer to the ceiling than it is.
 
 Of IoU, Wasserstein distance and AUC only one side is worse than chance.  A score on the
 other side, such as an IoU above its ceiling, agrees.  Up to `AGREES` sigma is agreement.
@@ -26,7 +26,7 @@ from cpunet.pulses.parameters import PARAMETERS
 
 AGREES = 2.0  # sigma
 TOO_CLOSE = 4.0  # sigma on the good side: no chance, but the same events twice
-LISTED = 5  # quantities that agree by name; more are counted
+LISTED = 6  # quantities that agree by name; more are counted
 BY_CHANCE = 0.08  # of the parameters of a perfect translation are off in IoU or distance
 WITHIN = "agrees within errors"
 
@@ -34,8 +34,9 @@ Worse = Literal["lower", "higher", "both"]
 Words = dict[str, float | str | None]
 
 _SHORT = {"ren": "REN", "iren": "IREN"}
-_W1 = "_wasserstein"
-_AUC, _SURVIVAL = "auc", "ae_survival"
+_W1, _SPECTRUM = "_wasserstein", "_spectrum"
+_SECOND = (_W1, _SPECTRUM)  # endings of what is judged together with the quantity before them
+_AUC, _SURVIVAL, _NOISE = "auc", "ae_survival", "noise"
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,8 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
         For each parameter, under its name, its IoU against the ceiling, and, with
         ``_wasserstein`` after the name, its distance against the null; ``auc``: the
         classifier against its null; ``ae_survival``: the difference to the data, of
-        peaks other than that from which the cut comes.
+        peaks other than that from which the cut comes; ``noise``: its RMS against the
+        data's, and ``noise_spectrum``: the worst of its bands.
     """
     found: dict[str, Verdict] = {}
     scores = part(metrics, "peaks", peak)
@@ -146,6 +148,20 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
         off, std = (number(survival, k, method) for k in ("difference", "difference_std"))
         reason = "too few events of the double-escape peak, or none of this one"
         found[_SURVIVAL] = _with_reason(verdict(off, 0.0, std, "both"), reason)
+    return found | _noise_verdicts(part(scores, "noise"), method)
+
+
+def _noise_verdicts(noise: Mapping[str, Any], method: str) -> dict[str, Verdict]:
+    own, data = part(noise, method), part(noise, "data")
+    if not own:
+        return {}
+    errors = [number(side, "rms_std") for side in (own, data)]
+    known = [error for error in errors if error is not None]
+    spread = math.hypot(*known) if len(known) == len(errors) else None
+    size = verdict(number(own, "rms"), number(data, "rms"), spread, "both")
+    found = {_NOISE: _with_reason(size, own.get("missing", data.get("missing")))}
+    if (worst := number(own, "spectrum_sigma")) is not None:
+        found[_NOISE + _SPECTRUM] = verdict(worst, 0.0, 1.0, "higher")
     return found
 
 
@@ -188,8 +204,8 @@ def summaries(metrics: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
     """Say in one line what agrees with the data and what is off.
 
-    A parameter is off if its IoU or its Wasserstein distance is; the one further off
-    is quoted.
+    A parameter is off if its IoU or its Wasserstein distance is, the noise if its RMS or
+    its spectrum is; the one further off is quoted.
 
     Returns
     -------
@@ -201,8 +217,9 @@ def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
     agreeing: list[str] = []
     off: list[tuple[float, str]] = []
     silent: list[str] = []
-    for name in [n for n in verdicts if not n.endswith(_W1)]:
-        pair = {n: verdicts[n] for n in (name, name + _W1) if n in verdicts}
+    for name in [n for n in verdicts if not n.endswith(_SECOND)]:
+        both = (name, *(name + ending for ending in _SECOND))
+        pair = {n: verdicts[n] for n in both if n in verdicts}
         known = {n: v for n, v in pair.items() if v.agrees is not None}
         if not known:
             silent.append(f"{_called(name)} not judged ({pair[name].words})")
@@ -284,6 +301,11 @@ def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -
     if quantity == _SURVIVAL:
         survival = part(metrics, "ae_survival", peak)
         return f" ({number(survival, 'difference', method):+.1f} points)"
+    if quantity in (_NOISE, _NOISE + _SPECTRUM):
+        ratio = number(scores, "noise", method, "rms_ratio")
+        worst = [] if quantity == _NOISE else ["worst band of its spectrum"]
+        size = [] if ratio is None else [f"RMS {ratio:.2f} of the data's"]
+        return f" ({'; '.join(worst + size)})" if worst + size else ""
     name = quantity.removesuffix(_W1)
     one = part(scores, "parameters", name)
     if name == quantity:

@@ -200,7 +200,8 @@ def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
 
 def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:
     """Size of the noise by method, without the spectrum."""
-    shown = ("rms", "rms_std", "rms_ratio", "sigma", "worst_band_sigma", "missing")
+    sizes, judged = ("n", "samples", "rms", "rms_std"), ("rms_ratio", "sigma")
+    shown = (*sizes, *judged, "worst_band_sigma", "spectrum_sigma", "missing")
     return {
         method: {key: found[key] for key in shown if key in found}
         for method, found in spectra.items()

@@ -66,8 +66,12 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     }
     scores["further"] = _compared(further, recipe, seed)
     noisy = {method: w for method, w in windows.items() if not method.endswith(NO_NOISE)}
+    align, dt_ns = recipe.preparation.samples_before, peak.raw.dt_ns
     scores["noise"] = baseline_spectra(
-        noisy, recipe.preparation.baseline_samples, peak.raw.dt_ns
+        noisy,
+        {method: align + values[method]["t01"] / dt_ns for method in noisy},
+        recipe.preparation.baseline_samples,
+        dt_ns,
     )
     if peak.truth is not None:
         scores["paired"] = _paired(peak, recipe.scores.edge_samples)
