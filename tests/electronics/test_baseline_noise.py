@@ -64,6 +64,15 @@ def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
     assert 200 < noise.n_baselines <= 275  # not those on a tail
 
 
+def test_the_error_of_the_rms_covers_the_truth() -> None:
+    found = [BaselineNoise.from_traces(traces(100, seed), CONFIG) for seed in range(20, 40)]
+    true = NOISE_KEV * 0.8 / np.exp(-397 * DT_NS / 54_600)
+    errors = np.array([noise.rms_error for noise in found])
+    pulls = (np.array([noise.rms for noise in found]) - true) / errors
+    assert np.median(errors) < 0.03 * true
+    assert 0.5 < np.sqrt((pulls**2).mean()) < 1.5
+
+
 def test_noise_goes_as_one_over_energy(noise) -> None:
     rng = np.random.default_rng(2)
     energy = np.repeat([1000.0, 2000.0], 200)

@@ -191,7 +191,39 @@ def test_mean_and_spread_of_several_runs(tmp_path):
     told = describe_responses(runs, truth=electronics(bandwidth_poles_ns=[50]))
     assert told["mean"]["pole_1_ns"] == pytest.approx(51)
     assert told["spread"]["pole_1_ns"] == pytest.approx(np.std([48, 50, 55], ddof=1))
-    assert told["truth"]["sigma"]["pole_1_ns"] == pytest.approx(1 / told["spread"]["pole_1_ns"])
+    # the runs share their data, so that without errors of the fit nothing says how far it is
+    assert told["truth"]["difference"]["pole_1_ns"] == pytest.approx(1)
+    assert told["truth"]["sigma"] == {}
+
+
+def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
+    """Noise of 1.98 against 1.95 keV, the same in both runs but for the last digits."""
+    density = np.full(NOISE_BINS, (1.98 * 0.8) ** 2)
+    noise = {"baselines": 1500, "rms": 1.98 * 0.8, "rms_error": 0.02 * 1.98 * 0.8}
+    runs = [
+        write_response(
+            tmp_path / f"run{tau}",
+            f"generator.poles_ns=[{tau}]",
+            "generator.decay_us=500",
+            noise_density=density * np.exp(2 * 397.5 * DT_NS / 500e3),
+            fit=FIT | {"noise": noise, "errors": {"log_poles_ns.1": 0.02}},
+        )
+        for tau in (50, 50.01)
+    ]
+    told = describe_responses(runs, truth=electronics(bandwidth_poles_ns=[49]))
+    sigma, spread = told["truth"]["sigma"], told["spread"]
+    assert told["mean"]["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
+    assert spread["noise_rms_kev"] < 1e-3
+    # 2 % of the baselines, and 1 µs of the decay
+    assert told["runs"][0]["errors"]["noise_rms_kev"] == pytest.approx(
+        1.98 * np.hypot(0.02, 1 / 500), rel=0.01
+    )
+    assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
+    assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)  # of the fit, not of the seeds
+    assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}
+    # one run and two of the same data say the same
+    alone = describe_responses(runs[:1], truth=electronics(bandwidth_poles_ns=[49]))["truth"]
+    assert alone["sigma"] == pytest.approx(sigma, rel=0.02)
 
 
 def test_the_closed_form_is_the_chain_of_the_stand():

@@ -84,7 +84,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     for time_us in (1, 5):
         left = chain.whole.step(1e3 * time_us) / chain.undecayed.step(1e3 * time_us)
         numbers[f"droop_{time_us}_us"] = float(1 - left)
-    return numbers | _noise_numbers(chain)
+    return numbers | noise_numbers(chain)
 
 
 def align_ns(chain: Chain, preparation: PreparationConfig) -> float:
@@ -211,7 +211,8 @@ def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
         panels["noise"].set_axis_off()
 
 
-def _noise_numbers(chain: Chain) -> Numbers:
+def noise_numbers(chain: Chain) -> Numbers:
+    """RMS and corner of a chain's noise, see `chain_numbers`; none if it is not known."""
     frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
     if frequency is None or density is None:
         return {}

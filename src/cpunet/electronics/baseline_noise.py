@@ -55,6 +55,9 @@ class BaselineNoise:
         their mean.  None for Gaussian noise of one spectrum.  Traces of several channels, or
         of different days, have noise of different sizes and colours, which a mean would
         hide; and a line is a sine of fixed height, not Gaussian noise.
+    rms_error
+        Standard error of `rms`: from the spread of the baselines, and as much as is guessed
+        of noise slower than they are long.  None if it was not estimated from baselines.
     """
 
     density: Values
@@ -64,6 +67,7 @@ class BaselineNoise:
     kinds: Values | None = None
     lines: Values | None = None
     shares: Values | None = None
+    rms_error: float | None = None
 
     @classmethod
     def from_traces(cls, raw: Pulses, config: PreparationConfig) -> Self:
@@ -102,7 +106,13 @@ class BaselineNoise:
             for kind in range(len(counts))
         ]
         kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
-        return replace(mean, kinds=kinds, lines=kinds_lines, shares=counts / counts.sum())
+        return replace(
+            mean,
+            kinds=kinds,
+            lines=kinds_lines,
+            shares=counts / counts.sum(),
+            rms_error=_rms_error(flat, mean.rms),
+        )
 
     @classmethod
     def from_windows(cls, windows: Pulses, samples: int) -> Self:
@@ -210,6 +220,14 @@ def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
             f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
             "1/energy, so give the energies"
         )
+
+
+def _rms_error(flat: Values, rms: float) -> float:
+    """Standard error of an RMS, part of which is slower than the baselines."""
+    power = flat.var(axis=1)
+    seen = float(np.sqrt(power.mean()))
+    chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
+    return float(np.hypot(chance, rms - seen))
 
 
 def _add_lines(

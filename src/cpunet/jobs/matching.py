@@ -151,7 +151,11 @@ def match(
     told = {
         "parameters": response.describe(),
         **asdict(fit),
-        "noise": {"baselines": noise.n_baselines, "rms": noise.rms},
+        "noise": {
+            "baselines": noise.n_baselines,
+            "rms": noise.rms,
+            "rms_error": noise.rms_error,
+        },
     }
     if more:
         told["residual"] = more

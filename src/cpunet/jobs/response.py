@@ -17,6 +17,7 @@ from cpunet.analysis.response_figure import (
     Numbers,
     align_ns,
     chain_numbers,
+    noise_numbers,
     response_figure,
 )
 from cpunet.electronics.chain import Electronics
@@ -44,6 +45,7 @@ RESPONSE = FolderKind(
 _DPI = 150
 _LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
 _FOREVER_US = 1e9  # instead of a decay
+_LONG_DRIFT_NS = 1000.0  # by which a charge may come earlier than all at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +93,12 @@ def describe_responses(
     dict
         The content of ``response.json``.  ``runs``: for each its ``values`` by name, the unit
         at the end (shares of the full charge have none), and ``errors`` of those that are
-        parameters of the fit; all ``parameters`` and their ``parameter_errors``.  ``mean`` and
-        ``spread`` (standard deviation) of several runs.  ``truth``: the same ``values`` of
-        the true chain, ``difference`` from it of the run or the mean of the runs, and
-        ``sigma``: that in units of the error or the spread, whichever is larger.
+        parameters of the fit, and of the noise; all ``parameters`` and their
+        ``parameter_errors``.  ``mean`` and ``spread`` (standard deviation) of several runs.
+        ``truth``: the same ``values`` of the true chain, ``difference`` from it of the run or
+        the mean of the runs, and ``sigma``: that in units of the error or the spread,
+        whichever is larger.  What has no error has no sigma: runs share their data, so that
+        their spread alone says how well they agree, not how far they may be off.
 
     Raises
     ------
@@ -300,10 +304,22 @@ def _told(run: _Learned) -> dict[str, Any]:
         "peak": run.info["peak"],
         "seed": run.info["seed"],
         "values": values,
-        "errors": {name: e for name, e in run.errors.items() if name in values},
+        "errors": {n: e for n, e in run.errors.items() if n in values} | _noise_error(run),
         "parameters": run.parameters,
         "parameter_errors": run.errors,
     }
+
+
+def _noise_error(run: _Learned) -> Numbers:
+    """Error of the noise in keV: of the baselines, and of the height of a full charge."""
+    measured, chain = run.fit.get("noise") or {}, run.chain
+    error, rms = measured.get("rms_error"), measured.get("rms")
+    if not error or not rms or chain.noise_kev2_per_mhz is None:
+        return {}
+    end_ns = align_ns(chain, run.preparation) + run.preparation.samples_after * run.dt_ns
+    sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
+    kev = noise_numbers(chain)["noise_rms_kev"]
+    return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
 
 
 def _true_parameters(electronics: Electronics) -> Numbers:
@@ -341,10 +357,9 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     difference = {n: found[n] - true for n, true in values.items() if n in found}
     sigma = {}
     for name, apart in difference.items():
-        errors = [run["errors"].get(name, 0.0) for run in runs]
-        width = max(spread.get(name, 0.0), float(np.mean(errors)))
-        if width > 0:
-            sigma[name] = apart / width
+        errors = [run["errors"][name] for run in runs if name in run["errors"]]
+        if len(errors) == len(runs) and any(errors):
+            sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
