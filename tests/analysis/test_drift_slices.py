@@ -1,4 +1,4 @@
-"""Superpulses in slices of drift time against plain loops, and their errors against draws."""
+"""Superpulses in slices of rise time against plain loops, and their errors against draws."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from cpunet.analysis.drift_slices import (
     slice_edges,
     slice_residuals,
     slice_table,
-    slicing_time,
     superpulses,
 )
 from cpunet.analysis.paired import align_half_maximum
@@ -47,16 +46,10 @@ def test_edges_hold_equally_many_and_ignore_what_is_not_finite():
 
 
 def test_times_without_one_are_refused():
-    with pytest.raises(CpunetError, match="no measured pulse has a drift time"):
+    with pytest.raises(CpunetError, match="no measured pulse has a rise time"):
         slice_edges(np.full(3, np.nan))
     with pytest.raises(CpunetError, match="1 or more"):
         slice_edges(np.ones(3), slices=0)
-
-
-def test_the_slicing_time_spans_the_drift():
-    values = {"t01": np.array([-900.0, np.nan]), "t90": np.array([-160.0, 0.0])}
-    assert slicing_time(values)[0] == 740
-    assert np.isnan(slicing_time(values)[1])
 
 
 def test_superpulses_are_those_of_a_plain_loop():

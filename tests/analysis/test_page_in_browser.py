@@ -110,8 +110,8 @@ def test_axes_have_units(seen):
     distribution, slices, pulses, scatter = seen["labels"]
     assert distribution[-1] == "Current amplitude Iₘₐₓ [1/sample]"
     assert slices[-1] == pulses[-1] == "Time from half maximum [ns]"
-    assert scatter == ["Current amplitude Iₘₐₓ [1/sample]", "Drift time [ns]"]
-    assert seen["chosen"] == "Drift time [ns]"
+    assert scatter == ["Current amplitude Iₘₐₓ [1/sample]", "Drift time, 1 % to maximum [ns]"]
+    assert seen["chosen"] == "Drift time, 1 % to maximum [ns]"
 
 
 def test_a_method_is_switched_off_in_all_charts_at_once(seen):

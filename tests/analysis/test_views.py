@@ -74,7 +74,7 @@ def test_distributions_count_every_pulse_in_the_bins_of_the_scores():
     comparison = compare(data, {"raw": raw}, SCORES, seed=0)
     found = distributions({"SEP": {"data": data, "raw": raw}}, {"SEP": comparison})["SEP"]
     shown = found["drift_time"]
-    assert (shown["label"], shown["unit"]) == ("Drift time", "ns")
+    assert (shown["label"], shown["unit"]) == ("Drift time, 1 % to maximum", "ns")
     assert {method: sum(counts) for method, counts in shown["counts"].items()} == {
         "data": 302,
         "raw": 200,

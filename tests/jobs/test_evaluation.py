@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cpunet.analysis.drift_slices import slice_edges
 from cpunet.errors import CpunetError
 from cpunet.jobs.energy_ranges import validation_selection
 from cpunet.jobs.evaluation import Evaluation, evaluate
@@ -111,6 +112,19 @@ def test_what_is_compared(whole) -> None:
     ]
     # energies of all pulses of the file are there, for its spectrum
     assert len(whole.data.energies_kev) == 380
+
+
+def test_slices_and_axes_say_which_time_they_mean(whole) -> None:
+    data = whole.values["FEP"]["data"]
+    np.testing.assert_allclose(
+        whole.details["FEP"].slices["data"].edges, slice_edges(data["rise_01_90"])
+    )
+    makers = figure_makers(whole)
+    slices, amplitude = makers["FEP superpulses"](), makers["FEP A over E"]()
+    assert "slices of rise time 1–90 %" in slices.legends[0].get_title().get_text()
+    labels = [axes.get_xlabel() for axes in amplitude.axes]
+    assert "Drift time, 1 % to maximum [ns]" in labels
+    assert makers["FEP drift_time"]().axes[0].get_xlabel() in labels
 
 
 def test_every_figure_can_be_drawn(whole) -> None:

@@ -136,6 +136,7 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.05)
     assert fit["noise"]["baselines"] > 0.9 * N
+    assert 0 < fit["noise"]["rms_error"] < 0.2 * fit["noise"]["rms"]
 
 
 def test_what_is_told_on_the_way(run: Run) -> None:

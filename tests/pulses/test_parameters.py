@@ -214,7 +214,7 @@ def test_records_too_short_are_refused_in_one_line():
 
 
 def test_axis_labels_name_the_unit():
-    assert PARAMETERS["drift_time"].axis_label == "Drift time [ns]"
+    assert PARAMETERS["drift_time"].axis_label == "Drift time, 1 % to maximum [ns]"
 
 
 def test_current_amplitude_of_measured_traces_equals_the_production_chain(reference_data):

@@ -87,6 +87,7 @@ def test_times_and_areas_of_a_ramp(samples):
     for name, fraction in TIME_POINTS.items():
         assert found[name] == pytest.approx((fraction - 1) * rise_ns, abs=0.01)
     assert found["rise_10_90"] == pytest.approx(0.8 * rise_ns, abs=0.01)
+    assert found["rise_01_90"] == pytest.approx(0.89 * rise_ns, abs=0.01)
     assert found["rise_01_99"] == pytest.approx(0.98 * rise_ns, abs=0.01)
     assert found["rise_10_99"] == pytest.approx(0.89 * rise_ns, abs=0.01)
     assert found["rise_90_99"] == pytest.approx(0.09 * rise_ns, abs=0.01)

@@ -34,7 +34,7 @@ def test_planar_detector_has_straight_edges(planar: Maps) -> None:
     np.testing.assert_allclose(signals.waveforms[0], expected, atol=1e-3)
     assert signals.valid.all()
     assert signals.collected.all()
-    assert signals.drift_time_ns[0] == pytest.approx(6 / speeds[0], abs=2)
+    assert signals.collection_time_ns[0] == pytest.approx(6 / speeds[0], abs=2)
 
 
 @given(st.floats(0, 18), st.floats(0, 6.28), st.floats(2.5, 11.5))

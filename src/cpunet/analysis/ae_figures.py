@@ -13,6 +13,7 @@ from cpunet.analysis.style import colours, label, styled
 from cpunet.pulses.parameters import PARAMETERS
 
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
+DRIFT_TIME = PARAMETERS["drift_time"].axis_label
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
 COLUMNS = 3  # panels beside each other
 
@@ -49,7 +50,7 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
             below.errorbar(*_ratio(rows, methods["data"]), **look)
     below.axhline(0, color="black", linewidth=0.8)
     above.set(ylabel=AMPLITUDE)
-    below.set(xlabel="Drift time [ns]", ylabel="Median,\nmethod / data − 1 [%]")
+    below.set(xlabel=DRIFT_TIME, ylabel="Median,\nmethod / data − 1 [%]")
     figure.legend(
         *above.get_legend_handles_labels(),
         loc="outside upper left",
@@ -129,5 +130,5 @@ def _label_outer(grid: list[list[Axes]], drawn: int) -> None:
         if i % columns == 0:
             axes.set_ylabel(AMPLITUDE)
         if i + columns >= drawn:
-            axes.set_xlabel("Drift time [ns]")
+            axes.set_xlabel(DRIFT_TIME)
             axes.tick_params(labelbottom=True)

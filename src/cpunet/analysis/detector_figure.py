@@ -1,4 +1,4 @@
-"""The fields of a detector in one picture: potentials, drift paths and drift times."""
+"""The fields of a detector in one picture: potentials, drift paths and times of collection."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from cpunet.simulation.geometry import (
 )
 from cpunet.simulation.settings import SimulationSettings
 
-# Paths and drift times need no fine steps, and must not end before the charge arrives.
+# Paths and times need no fine steps, and must not end before the charge arrives.
 _SETTINGS = SimulationSettings(step_ns=2.0, dt_ns=16.0, length_ns=6000.0, diffusion=False)
-_MAP_POINTS = 70  # of the drift times, along the longer side of the crystal
+_MAP_POINTS = 70  # of the collection times, along the longer side of the crystal
 _OUTLINE_POINTS = 900  # along the same side
 _BLOCK = 500  # paths held at once
 _ELECTRON, _HOLE = COLOURS["ren"], COLOURS["raw"]
@@ -34,10 +34,10 @@ _RAY_RAD = np.deg2rad(55)
 
 @styled
 def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True) -> Figure:
-    """Potential, weighting potential and drift times on the cross-section r, z.
+    """Potential, weighting potential and collection times on the cross-section r, z.
 
-    Drift times are those of holes to the point contact, from the plane y = 0, in which
-    the paths start too.  Paths end where a carrier is collected or can induce no more:
+    Collection times are those of holes at the point contact, from the plane y = 0, in
+    which the paths start too.  Paths end where a carrier is collected or can induce no more:
     those of electrons far from the point contact soon after they start.
 
     Parameters
@@ -54,7 +54,7 @@ def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     _potential(figure, panels[0], fields)
     _weighting_potential(figure, panels[1], fields)
-    _drift_times(figure, panels[2], detector, fields)
+    _collection_times(figure, panels[2], detector, fields)
     if paths:
         _paths(panels[0], detector, fields)
     for axes in panels:
@@ -119,7 +119,9 @@ def _along_a_ray(fields: FieldMaps) -> list[tuple[float, float]]:
     return [(float(r[i]), float(z[i])) for i in firsts if i]
 
 
-def _drift_times(figure: Figure, axes: Axes, detector: Detector, fields: FieldMaps) -> None:
+def _collection_times(
+    figure: Figure, axes: Axes, detector: Detector, fields: FieldMaps
+) -> None:
     step = max(detector.crystal_length, detector.crystal_radius) / _MAP_POINTS
     r = np.arange(step / 2, detector.crystal_radius + step / 2, step)
     z = np.arange(step / 2, detector.crystal_length + step / 2, step)
@@ -136,7 +138,7 @@ def _drift_times(figure: Figure, axes: Axes, detector: Detector, fields: FieldMa
     levels = np.arange(spacing, top, spacing)
     lines = axes.contour(r, z, times.T, levels, colors="black", linewidths=0.7)
     axes.clabel(lines, levels=levels[1::2], fmt="%g", fontsize=7.5)
-    axes.set_title("Hole drift time")
+    axes.set_title("Hole collection time")
     _bar(figure, axes, image, f"To the p⁺ contact [ns], lines every {spacing:g} ns")
 
 

@@ -1,9 +1,13 @@
-"""Mean pulses of slices in drift time: where in the detector a translation is wrong.
+"""Mean pulses of slices in rise time: where in the detector a translation is wrong.
 
 Pulses of one slice come from the same places of the detector, and differ by their
 sites and by noise; their mean, aligned at half maximum, is the slice's superpulse.
 Its standard error is known, so a difference between simulation and data can be told
 from chance.
+
+Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``): it begins where the
+pulse does, and ends while that still rises.  The paper's drift time ends at the maximum, on a
+flat top that of the noise, which would smear the slices.
 
 The slices are bounded by quantiles of the *data's* times, and each method is sliced by its
 own: one with the wrong response has other events in a slice, which is its fault as well.
@@ -81,37 +85,13 @@ class Residual:
         return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
 
 
-def slicing_time(parameters: Mapping[str, Values]) -> Values:
-    """Time from 1 to 90 % of the pulse, which orders pulses by their drift.
-
-    The drift begins where the pulse does, at 1 %.  The paper's drift time ends at the
-    maximum, on a flat top that of the noise, which smears slices; at 90 % the pulse rises.
-
-    Parameters
-    ----------
-    parameters
-        As of `cpunet.pulses.shape_parameters.all_parameters`.
-
-    Returns
-    -------
-    numpy.ndarray
-        In ns, shape ``(n,)``; NaN where a time does not exist.
-
-    Examples
-    --------
-    >>> slicing_time({"t01": np.array([-900.0]), "t90": np.array([-160.0])})
-    array([740.])
-    """
-    return np.asarray(parameters["t90"] - parameters["t01"])
-
-
-def slice_edges(drift_time: Values, slices: int = SLICES) -> Values:
+def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     """Edges of slices that hold equally many of the data.
 
     Parameters
     ----------
-    drift_time
-        Of the measured pulses in ns, best `slicing_time`; NaN and infinity are ignored.
+    rise_time
+        Of the measured pulses in ns; NaN and infinity are ignored.
     slices
         How many; the edges, in ns, are one more.
 
@@ -125,16 +105,16 @@ def slice_edges(drift_time: Values, slices: int = SLICES) -> Values:
     >>> slice_edges(np.arange(101.0), slices=4)
     array([  0.,  25.,  50.,  75., 100.])
     """
-    finite = drift_time[np.isfinite(drift_time)]
+    finite = rise_time[np.isfinite(rise_time)]
     if slices < 1:
-        raise CpunetError(f"{slices} slices of the drift time; give 1 or more")
+        raise CpunetError(f"{slices} slices of the rise time; give 1 or more")
     if not finite.size:
-        raise CpunetError("no measured pulse has a drift time; check the peak's selection")
+        raise CpunetError("no measured pulse has a rise time; check the peak's selection")
     return np.quantile(finite, np.linspace(0, 1, slices + 1))
 
 
 def superpulses(
-    windows: FloatArray, drift_time: Values, edges: Values, before: int, after: int
+    windows: FloatArray, rise_time: Values, edges: Values, before: int, after: int
 ) -> Slices:
     """Mean pulse of each slice, aligned at half maximum.
 
@@ -142,7 +122,7 @@ def superpulses(
     ----------
     windows
         Pulses of shape ``(n, length)`` with the baseline at 0.
-    drift_time
+    rise_time
         By which they are sliced, shape ``(n,)``, in ns.
     edges
         Of the slices, see `slice_edges`; the last slice includes its upper one.
@@ -154,14 +134,14 @@ def superpulses(
     CpunetError
         If times and pulses are not equally many, or the pulses have no such shape.
     """
-    if drift_time.shape != (len(windows),):
+    if rise_time.shape != (len(windows),):
         raise CpunetError(
-            f"{len(windows)} pulses beside drift times of shape {drift_time.shape}; "
+            f"{len(windows)} pulses beside rise times of shape {rise_time.shape}; "
             "give one for each"
         )
-    timed = np.isfinite(drift_time)
-    inside = timed & (drift_time >= edges[0]) & (drift_time <= edges[-1])
-    place = np.searchsorted(edges[1:-1], drift_time, side="right")
+    timed = np.isfinite(rise_time)
+    inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
+    place = np.searchsorted(edges[1:-1], rise_time, side="right")
     found, unaligned = [], 0
     for i in range(len(edges) - 1):
         aligned = align_half_maximum(windows[inside & (place == i)], before, after)

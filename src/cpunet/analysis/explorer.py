@@ -22,7 +22,7 @@ from cpunet.analysis.nearest import Nearest
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import COLOURS, LABELS
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import Values, current_amplitude_kernel
+from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude_kernel
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import POINT_CONTACT, Detector
@@ -32,7 +32,7 @@ Indices = npt.NDArray[np.int64]
 EDGE = 150  # samples on both sides of half maximum that are kept one by one
 TAIL_STEP = 4  # of the samples after them, one in so many
 NUMBERS = {
-    "drift_time": ("Drift time", "ns", 1),
+    "drift_time": (PARAMETERS["drift_time"].label, "ns", 1),
     "current_amplitude": ("Current amplitude", "1/sample", 5),
     "rise_10_90": ("Rise time 10–90 %", "ns", 1),
 }

@@ -55,10 +55,11 @@ VIEWS = {
         "fitted without the raw simulation's points. The IoU beside the data is the ceiling.",
     ),
     "slices": (
-        "Mean pulses by drift time",
-        "Pulses aligned at half maximum and averaged within slices of drift time; below, the "
-        "differences from the data's, with the standard error of each mean as a band and that "
-        "of the data in grey about zero. Errors of neighbouring samples are correlated.",
+        "Mean pulses by rise time",
+        "Pulses aligned at half maximum and averaged within slices of rise time, 1 to 90 %; "
+        "below, the differences from the data's, with the standard error of each mean as a "
+        "band and that of the data in grey about zero. Errors of neighbouring samples are "
+        "correlated.",
     ),
     "pulses": (
         "Single pulses",
@@ -66,13 +67,14 @@ VIEWS = {
     ),
     "scatter": (
         "Current amplitude and drift time",
-        "One point a pulse; of larger sets a part, drawn at random.",
+        "One point a pulse; of larger sets a part, drawn at random. The drift time ends at the "
+        "maximum, which on a flat top is that of the noise.",
     ),
 }
 # parts of the metrics that are shown as they are
 DETAILS = {
     "ae_details": "A/E in detail",
-    "drift_slices": "Slices of drift time",
+    "drift_slices": "Slices of rise time, 1 to 90 %",
     "linearity": "Linearity",
     "noise": "Noise",
 }

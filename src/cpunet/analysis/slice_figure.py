@@ -1,4 +1,4 @@
-"""The superpulses of slices in drift time, and how methods differ from the data in them."""
+"""The superpulses of slices in rise time, and how methods differ from the data in them."""
 
 from __future__ import annotations
 
@@ -87,6 +87,6 @@ def _label(figure: Figure, first: Axes, below: list[Axes], peak: str) -> None:
         names,
         loc="outside upper left",
         ncols=len(names),
-        title=f"{peak}: superpulses in slices of drift time; bands: ±1 standard error",
+        title=f"{peak}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error",
         alignment="left",
     )

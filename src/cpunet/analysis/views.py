@@ -95,7 +95,7 @@ def superpulse_views(
     dt_ns: float,
     n_before: int = BEFORE,
 ) -> View:
-    """Mean pulses of each slice of drift time.
+    """Mean pulses of each slice of rise time.
 
     Parameters
     ----------

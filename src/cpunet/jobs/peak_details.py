@@ -1,4 +1,4 @@
-"""What an analyst looks at beyond distributions: slices of drift time, A/E, two dimensions."""
+"""What an analyst looks at beyond distributions: slices of rise time, A/E, two dimensions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from cpunet.analysis.drift_slices import (
     Slices,
     slice_edges,
     slice_table,
-    slicing_time,
     superpulses,
 )
 from cpunet.analysis.style import NO_NOISE
@@ -49,7 +48,7 @@ class PeakDetails:
 
 
 def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -> PeakDetails:
-    """Compare a peak's pulses in slices of drift time, and A/E with drift time.
+    """Compare a peak's pulses in slices of rise time, and A/E with drift time.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
 
 def _slices(peak: PeakSets, values: ByMethod) -> tuple[dict[str, Slices], dict[str, Any]]:
     windows = peak.by_method()
-    times = {method: slicing_time(of_method) for method, of_method in values.items()}
+    times = {method: of_method["rise_01_90"] for method, of_method in values.items()}
     try:
         edges = slice_edges(times["data"])
     except CpunetError as error:

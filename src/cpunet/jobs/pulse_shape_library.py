@@ -40,8 +40,9 @@ def write_library(
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
     under the detector's name: r and z in mm from the centre of the point contact, times in
     ns from when the charge is set free, pulses of unit charge as float32 arrays of shape
-    (r, z, samples).  Places that give no signal, and those whose charge is not collected
-    within the record, are NaN.
+    (r, z, samples).  What the format calls drift times are the collection times of all
+    charge, `Signals.collection_time_ns`.  Places that give no signal, and those whose charge
+    is not collected within the record, are NaN.
 
     Parameters
     ----------
@@ -137,7 +138,7 @@ def _fill(
         signals = hit_signals(fields, x, y, z_mm, energy_kev, settings)
         good = signals.valid & signals.collected
         waveforms[i] = _kept(signals, good)
-        drift_times[i] = np.where(good, signals.drift_time_ns, np.nan)
+        drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
         counts["templates"] += len(z_mm)
         counts["written"] += int(good.sum())
         counts["outside"] += int((~signals.valid).sum())

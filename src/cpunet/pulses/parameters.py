@@ -29,13 +29,13 @@ class Parameter:
 
     @property
     def axis_label(self) -> str:
-        """Label and unit as one string, ``"Drift time [ns]"``."""
+        """Label and unit as one string, ``"Tail slope [1/ms]"``."""
         return f"{self.label} [{self.unit}]"
 
 
 PARAMETERS = {
     "current_amplitude": Parameter("Current amplitude $I_{max}$", "1/sample"),
-    "drift_time": Parameter("Drift time", "ns"),
+    "drift_time": Parameter("Drift time, 1 % to maximum", "ns"),
     "tail_slope": Parameter("Tail slope", "1/ms"),
 }
 
@@ -107,6 +107,9 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     is searched backward for its crossing of `start_fraction` times the maximum, whose
     time is interpolated linearly between two samples; a whole number of samples would
     put steps of `dt_ns` into the distribution.
+
+    Where a pulse has a long flat top the maximum is wherever noise puts it: this is the
+    paper's number, and no time after which the charge is collected.
 
     Parameters
     ----------

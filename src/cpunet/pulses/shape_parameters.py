@@ -15,6 +15,7 @@ from cpunet.pulses import _shape_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import (
     BLOCK,
+    PARAMETERS,
     Parameter,
     Values,
     current_amplitude,
@@ -29,6 +30,7 @@ TIME_POINTS = {"t01": 0.01, "t10": 0.1, "t50": 0.5, "t90": 0.9, "t99": 0.99}
 # Rise times: the time points at which they begin and end.
 RISE_TIMES = {
     "rise_10_90": ("t10", "t90"),
+    "rise_01_90": ("t01", "t90"),
     "rise_01_99": ("t01", "t99"),
     "rise_10_99": ("t10", "t99"),
     "rise_90_99": ("t90", "t99"),
@@ -85,10 +87,10 @@ SHAPE_PARAMETERS: dict[str, ShapeParameter] = {
         "smoothing as for A",
     ),
     "drift_time": ShapeParameter(
-        "Drift time",
+        PARAMETERS["drift_time"].label,
         "ns",
         "time from the last crossing of `drift_start_fraction` of the maximum to the first "
-        "sample that holds the maximum",
+        "sample that holds the maximum; on a flat top that of the noise",
         f"{_PAPER}, section 4.3.1",
     ),
     **{name: _time_point(fraction) for name, fraction in TIME_POINTS.items()},

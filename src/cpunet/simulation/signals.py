@@ -37,7 +37,7 @@ class Signals:
         germanium without a field.
     collected
         Hits whose carriers both arrived within the record.
-    drift_time_ns
+    collection_time_ns
         Time at which the last carrier arrived, or the record ended; NaN if not valid.
     cloud_fwhm_ns
         Duration (FWHM) by which the charge cloud smears the pulse; NaN if not valid.
@@ -47,7 +47,7 @@ class Signals:
     dt_ns: float
     valid: npt.NDArray[np.bool_]
     collected: npt.NDArray[np.bool_]
-    drift_time_ns: FloatArray
+    collection_time_ns: FloatArray
     cloud_fwhm_ns: FloatArray
 
 
@@ -97,7 +97,7 @@ def hit_signals(
         dt_ns=settings.dt_ns,
         valid=valid,
         collected=facts[:, 1] == 1.0,
-        drift_time_ns=facts[:, 0] * settings.step_ns,
+        collection_time_ns=facts[:, 0] * settings.step_ns,
         cloud_fwhm_ns=facts[:, 2] * settings.step_ns,
     )
 

@@ -1,4 +1,4 @@
-// Mean pulses by slice of drift time, and single events; both above their differences.
+// Mean pulses by slice of rise time, and single events; both above their differences.
 const EDGE = [0.01, 0.99]; // of the maximum
 
 // the times at which a pulse begins and ends its rise, with some room
@@ -29,7 +29,7 @@ function mountSuperpulses(host, data) {
     onCursor: (x) => readout(x),
   });
   const peak = view.select("Peak", peakChoices(data.peaks), update);
-  const slice = view.select("Drift time", [], update);
+  const slice = view.select("Rise time 1–90 %", [], update);
   view.button("Edge", edge, "Show the rising edge");
   view.button("All", () => view.plot.zoomTo(null), "Show the whole pulse");
   const scale = scaleBox(view, update);
@@ -71,7 +71,7 @@ function mountSuperpulses(host, data) {
     }
     view.plot.show({
       key: "one",
-      title: `${peak.value}, drift time ${found.slices[k]}: mean pulses`,
+      title: `${peak.value}, rise time 1–90 % ${found.slices[k]}: mean pulses`,
       x: { label: "Time from half maximum [ns]", home: [xs[0], xs[xs.length - 1]] },
       stride: data.dt_ns,
       snap: nearestTo(xs),

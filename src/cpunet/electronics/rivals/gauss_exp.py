@@ -1,7 +1,7 @@
 """Gaussian and exponential kernel fitted to superpulses: the method of LEGEND's production.
 
 The response to a step is the convolution of a Gaussian (sigma) with an exponential (tau)
-and a decay; sigma and tau are fitted to mean current pulses in slices of the drift time.
+and a decay; sigma and tau are fitted to mean current pulses in slices of the rise time.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class GaussExp:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit superpulses in slices of the drift time, see `base.Rival.fit`."""
+        """Fit superpulses in slices of the rise time, see `base.Rival.fit`."""
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)

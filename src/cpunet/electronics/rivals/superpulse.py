@@ -1,6 +1,6 @@
 """A free kernel from superpulses: the Wiener-regularised ratio of mean spectra.
 
-In each slice of the drift time the mean measured current is the mean simulated one
+In each slice of the rise time the mean measured current is the mean simulated one
 passed through the kernel, so the kernel's transfer function is the ratio of their
 spectra, H = sum(D S*) / sum(|S|^2) over the slices.  Where the measured spectrum is no
 larger than its statistical error, a Wiener factor takes H to zero.

@@ -1,8 +1,8 @@
-"""Superpulses: mean currents of pulses alike in drift time, aligned at half height.
+"""Superpulses: mean currents of pulses alike in rise time, aligned at half height.
 
 Simulated and measured pulses are of different events, so single pulses cannot be
 compared.  Their means can, once both sets are divided at the same quantiles of the
-drift time: pulses of one slice come from the same places of the detector.
+rise time: pulses of one slice come from the same places of the detector.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def rise_times(steps: Values) -> Values:
 
 
 def slices(current: Values) -> Groups:
-    """Rows of the single-site-like pulses between quantiles of the drift time.
+    """Rows of the single-site-like pulses between quantiles of the rise time.
 
     Of each slice the pulses with the highest current are kept.  They differ far less
     from each other than pulses of several sites, and so do their means between sets.
@@ -126,8 +126,8 @@ def slices(current: Values) -> Groups:
     CpunetError
         If too few pulses rise from baseline to top.
     """
-    drift_times = rise_times(np.cumsum(current, axis=1))
-    rows = np.flatnonzero(np.isfinite(drift_times))
+    rise = rise_times(np.cumsum(current, axis=1))
+    rows = np.flatnonzero(np.isfinite(rise))
     if len(rows) < 2 * SLICES / SINGLE_SITE:
         raise CpunetError(
             f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
@@ -135,7 +135,7 @@ def slices(current: Values) -> Groups:
         )
     # Three samples: the peak then hardly depends on where on it the samples lie.
     height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
-    ordered = rows[np.argsort(drift_times[rows], kind="stable")]
+    ordered = rows[np.argsort(rise[rows], kind="stable")]
     return [
         group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
         for group in np.array_split(ordered, SLICES)
