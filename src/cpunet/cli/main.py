@@ -33,6 +33,10 @@ from cpunet.cli.validate import validate
 from cpunet.errors import CpunetError
 from cpunet.installation import other_package
 
+# Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
+# than most gaps between two operations and far shorter than others hold a core.
+SPIN_COUNT = "3000"
+
 
 def _tell_version(wanted: bool) -> None:
     if wanted:
@@ -105,9 +109,11 @@ def _stop(number: int, _frame: FrameType | None) -> None:
 def _share_the_machine() -> None:
     """Keep OpenMP's threads from spinning for long, before torch loads it.
 
-    By default they wait for each other in busy loops. On a machine where something
-    else runs too, that made a training step forty times slower; with shorter loops
-    it is as fast as on an idle one. Whoever sets OpenMP's own variables is obeyed.
+    By default they wait for each other in busy loops. Where something else runs too, the
+    thread that is waited for often has no core, and the loop takes the one it could have:
+    trainings then take several times as much of the machine. Short loops bridge the gaps
+    between two operations; whoever waits longer sleeps. Whoever sets OpenMP's own variables
+    is obeyed.
     """
     if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
-        os.environ["GOMP_SPINCOUNT"] = "30000"
+        os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT
