@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NonLinearity
 from cpunet.electronics.exponentials import ComplexArray, FloatArray
 from cpunet.errors import CpunetError
+from cpunet.kernels import kernel
 from cpunet.pulses.container import Pulses
 
 
@@ -137,7 +138,7 @@ def _steps(poles: ComplexArray, h_ns: FloatArray) -> ComplexArray:
     return np.stack([1 + gain, a, (a - h) / poles], axis=-1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _advance(
     state: Any, total: Any, factors: Any, x: float
 ) -> None:  # pragma: no cover - compiled
@@ -146,7 +147,7 @@ def _advance(
         state[k] = factors[k, 0] * state[k] + factors[k, 1] * x
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _read(total: Any, weights: Any) -> float:  # pragma: no cover - compiled
     value = 0.0
     for k in range(len(total)):
@@ -155,7 +156,7 @@ def _read(total: Any, weights: Any) -> float:  # pragma: no cover - compiled
     return value
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _follow(
     pulses: Any,
     to_tick: Any,
@@ -194,7 +195,7 @@ def _follow(
             row += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slewed(signal: Any, most: float) -> Any:  # pragma: no cover - compiled
     out = signal.copy()
     for i in range(signal.shape[0]):

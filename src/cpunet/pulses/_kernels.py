@@ -6,11 +6,12 @@ All sums are taken in float64; a trace is read where it lies, never copied.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from cpunet.kernels import kernel
 
 # Stable codes of the reasons a trace is refused here (`preparation.Rejection` names them).
 ACCEPTED = 0
@@ -60,11 +61,9 @@ class Settings(NamedTuple):
     saturation_run: int
 
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_compiled: Any = kernel(error_model="numpy")
 # Called on finite values only, so that the comparisons may be vectorised.
-_compiled_finite = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc"}
-)
+_compiled_finite: Any = kernel(error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
 
 
 @_compiled

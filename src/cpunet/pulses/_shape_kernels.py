@@ -6,11 +6,12 @@ All sums are taken in float64.  A pulse without a value gives NaN, never an exce
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -25,10 +26,10 @@ _SETTLED = 1e-9  # of the slow decay over the length of the fit
 _SLOWEST_FAST = 0.5
 _DEGENERATE = 1e-9  # determinant over the product of the diagonal
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_compiled: Any = kernel(error_model="numpy")
 # For sums over finite values, which the compiler may then reorder and vectorise.
-_compiled_sum = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
+_compiled_sum: Any = kernel(
+    error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
 )
 
 

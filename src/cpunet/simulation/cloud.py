@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from cpunet.kernels import kernel
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,7 +53,7 @@ def starting_fwhm_mm(fwhm_mm: float, diffusion: bool) -> float:
     return max(fwhm_mm, _SMALLEST_FWHM_MM) if diffusion else fwhm_mm
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def cloud_after_step(
     size: float,
     speed: float,
@@ -84,7 +85,7 @@ def cloud_after_step(
     return size + growth * step_ns
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def smear_and_sample(
     signal: npt.NDArray[np.float64] | npt.NDArray[np.float32],
     per_sample: int,
@@ -124,7 +125,7 @@ def smear_and_sample(
         out[j] += weight * total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gaussian_block(per_sample: int, sigma: float, reach: int) -> FloatArray:
     """A Gaussian of `sigma` steps, cut at `reach`, summed over a block and normalised."""
     kernel = np.zeros(per_sample + 2 * reach)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.kernels import kernel
 from cpunet.simulation.hits import Hits
 
 Array = npt.NDArray[np.float64]
@@ -48,7 +48,7 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     return Hits(x, y, z, energy, offsets, hits.event_number)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _merge(
     position: Array, energy: Array, offsets: Integers, distance2: float
 ) -> tuple[Array, Integers]:
@@ -81,7 +81,7 @@ def _merge(
     return merged[:n], new_offsets
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _near(position: Array, a: int, b: int, distance2: float) -> bool:
     square = 0.0
     for axis in range(3):
@@ -89,7 +89,7 @@ def _near(position: Array, a: int, b: int, distance2: float) -> bool:
     return square <= distance2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _average(position: Array, energy: Array, members: Integers, row: Array) -> None:
     for member in members:
         row[3] += energy[member]

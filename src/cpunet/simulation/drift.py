@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cpunet.kernels import kernel
 from cpunet.simulation.cloud import cloud_after_step
 from cpunet.simulation.field_lookup import (
     DriftMaps,
@@ -39,7 +39,7 @@ class DriftPaths:
     holes: FloatArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drift(
     maps: DriftMaps,
     carrier: int,
@@ -129,7 +129,7 @@ def drift_paths(
     return DriftPaths(electrons=paths[ELECTRON], holes=paths[HOLE])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_paths(maps: DriftMaps, start: FloatArray, step_ns: float, paths: FloatArray) -> None:
     signal = np.zeros(paths.shape[2])
     for i in range(len(start)):

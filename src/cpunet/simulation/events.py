@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from cpunet.kernels import kernel
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
@@ -142,7 +143,7 @@ def simulate_events(
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _sum_exact(
     maps: DriftMaps,
     hits: FloatArray,
@@ -170,7 +171,7 @@ def _sum_exact(
             waveforms[event] = out / collected
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _sum_library(
     maps: DriftMaps,
     library: Library,
@@ -214,7 +215,7 @@ def _sum_library(
                     waveforms[event, j] = (out[j] + quick[j] + flat) * share
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_drifted(
     maps: DriftMaps,
     hit: FloatArray,

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.interpolate import RectBivariateSpline
 
 from cpunet.errors import CpunetError
+from cpunet.kernels import kernel
 from cpunet.simulation.geometry import DITCH
 from cpunet.simulation.velocity import FloatArray, velocity_table
 
@@ -178,7 +178,7 @@ def _shifted(array: npt.NDArray[Any], by: int, axis: int) -> npt.NDArray[Any]:
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, float, bool]:
     """Field in r and z (V/cm), weighting potential, potential (V); False outside."""
     p, q = r * maps.per_mm, z * maps.per_mm
@@ -205,7 +205,7 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
     return er, ez, min(max(wp, 0.0), 1.0), potential, True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_active_volume(maps: DriftMaps, x: float, y: float, z: float) -> bool:
     """Whether a charge set free here drifts: germanium with a field, no contact."""
     _, _, _, potential, usable = look_up(maps, math.hypot(x, y), z)

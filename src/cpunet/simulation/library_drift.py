@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
+from cpunet.kernels import kernel
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, in_active_volume
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, Float32Array, Library, add_pulse
@@ -37,7 +38,7 @@ class Task(NamedTuple):
     n_samples: int
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> None:
     """How far the half-height time bends in r and in z: ``bend u (1 - u)`` is added.
 
@@ -69,7 +70,7 @@ def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> N
                 bends[c, axis] *= 0.5 / found
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def drift_nodes(
     library: Library,
     maps: DriftMaps,
@@ -103,13 +104,13 @@ def drift_nodes(
             facts[node, 3] = signal[-1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _at_azimuth(r: float, z: float, k: float, azimuths: int, energy: float) -> FloatArray:
     phi = 0.25 * math.pi * k / (azimuths - 1)
     return np.array([r * math.cos(phi), r * math.sin(phi), z, energy])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fine_pulse(
     library: Library,
     maps: DriftMaps,
@@ -147,7 +148,7 @@ def _fine_pulse(
     return min(end, rows.shape[1]), arrived
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _half_time(signal: FloatArray, zero: int) -> float:
     """Step, with its fraction, after `zero` at which a pulse first passes half its end."""
     half = 0.5 * signal[-1]
@@ -157,7 +158,7 @@ def _half_time(signal: FloatArray, zero: int) -> float:
     return 0.0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def compare(
     library: Library, maps: DriftMaps, task: Task, places: FloatArray, worst: FloatArray
 ) -> None:
@@ -182,7 +183,7 @@ def compare(
             worst[place] = max(worst[place], deviation)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _between(energies: FloatArray, k: int) -> float:
     """An energy in the middle between two of the library's; another two with each k."""
     if len(energies) == 1:
@@ -191,7 +192,7 @@ def _between(energies: FloatArray, k: int) -> float:
     return float(0.5 * (energies[e] + energies[e + 1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread(library: Library, place: FloatArray, k: int) -> float:
     """Difference (ns) between the half-height times of the corners around a place."""
     size = library.cell[int(place[0]), int(place[1])]
@@ -204,7 +205,7 @@ def _spread(library: Library, place: FloatArray, k: int) -> float:
     return high - low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _deviation(library: Library, hit: FloatArray, rows: Float32Array) -> float:
     """Largest difference between interpolated and exact samples, and of their largest
     rise relative to itself, whichever phase of a sample the record starts at.

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cpunet.kernels import kernel
 from cpunet.simulation.velocity import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
@@ -61,7 +61,7 @@ class Library(NamedTuple):
     per_mm: float
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def covers(library: Library, x: float, y: float, z: float, energy_kev: float) -> bool:
     """Whether the pulse of a hit can be interpolated."""
     i, j = int(math.hypot(x, y) * library.per_mm), int(z * library.per_mm)
@@ -73,7 +73,7 @@ def covers(library: Library, x: float, y: float, z: float, energy_kev: float) ->
     return bool(within and library.cell[i, j] > 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_pulse(
     library: Library,
     hit: FloatArray,
@@ -130,7 +130,7 @@ def add_pulse(
             _add_shifted(library, node, row, part * share, shift, out, steps)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smooth_half(
     library: Library,
     cos4: float,
@@ -160,7 +160,7 @@ def _smooth_half(
     return above / below
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _energy_weight(energies: FloatArray, row: int, energy: float) -> float:
     """Weight of a row's pulse: a polynomial through all, in the cloud's squared width.
 
@@ -175,13 +175,13 @@ def _energy_weight(energies: FloatArray, row: int, energy: float) -> float:
     return weight
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cloud_scale(energy_kev: float) -> float:
     """How the squared width of a self-repelling cloud goes with energy, roughly."""
     return float((1.0 + energy_kev / _REPELLING_KEV) ** (2.0 / 3.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_shifted(
     library: Library,
     node: int,
@@ -225,7 +225,7 @@ def _add_shifted(
     steps[end] += weight * library.final[node]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _add_mixed(
     a: Float32Array,
     b: Float32Array,

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
 from cpunet.errors import CpunetError
+from cpunet.kernels import kernel
 from cpunet.simulation.cloud import (
     FWHM_PER_SIGMA,
     diffusion_constant,
@@ -136,7 +137,7 @@ def cloud_numbers(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def point_signal(
     maps: DriftMaps,
     hit: FloatArray,
@@ -160,7 +161,7 @@ def point_signal(
     return max(steps_e, steps_h), arrived_e and arrived_h, fwhm
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cloud_steps(size: float, speed: float, step_ns: float, whole: bool) -> float:
     """Steps (FWHM) a cloud takes into the contact; siggen counts them in `whole` ones."""
     if speed <= 0.0:
@@ -172,7 +173,7 @@ def cloud_steps(size: float, speed: float, step_ns: float, whole: bool) -> float
     return fwhm
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _all_signals(
     maps: DriftMaps,
     hits: FloatArray,

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from cpunet.kernels import kernel
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -113,7 +114,7 @@ def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
     return mean
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def carrier_velocity(
     coefficients: FloatArray,
     per_field: float,
@@ -153,7 +154,7 @@ def carrier_velocity(
     return vx, vy, vz, strength, speed, slope
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _velocities(table: VelocityTable, field: FloatArray, carrier: int) -> FloatArray:
     out = np.empty_like(field)
     for i in range(len(field)):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, ElectronTable
 from cpunet.simulation.gammas.processes import (
     Direction,
@@ -22,7 +22,7 @@ from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
 Array = npt.NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> int:
     """Append a deposit (mm, MeV) to the hits; the new number of hits."""
     if energy > 0.0 and n < len(hits):
@@ -31,7 +31,7 @@ def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> 
     return n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def put_photon(
     stack: Array, n: int, x: float, y: float, z: float, direction: Direction, energy: float
 ) -> int:
@@ -43,7 +43,7 @@ def put_photon(
     return n + 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float) -> bool:
     """Whether everything within `reach` (mm) surely is germanium: false nearby a surface."""
     r = math.sqrt(x * x + y * y)
@@ -62,7 +62,7 @@ def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float)
     return z + reach < shape.bore_end or r - reach > widest
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def row_of(table: ElectronTable, kinetic: float) -> int:
     """The step an energy (MeV) lies in, at its upper end or below."""
     if kinetic <= ELECTRON_CUT:
@@ -71,7 +71,7 @@ def row_of(table: ElectronTable, kinetic: float) -> int:
     return min(max(row, 0), len(table.energy) - 2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def slow_down(
     shape: CrystalShape,
     table: ElectronTable,

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_MASS
 
 
@@ -23,7 +23,7 @@ class Direction(NamedTuple):
     z: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def isotropic(rng: np.random.Generator) -> Direction:
     """A direction, all equally probable."""
     cosine = 2.0 * rng.random() - 1.0
@@ -32,7 +32,7 @@ def isotropic(rng: np.random.Generator) -> Direction:
     return Direction(sine * math.cos(azimuth), sine * math.sin(azimuth), cosine)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
     """The direction at a polar angle and an azimuth (rad) around an axis."""
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
@@ -47,7 +47,7 @@ def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direction:
     """A direction isotropic in the rest frame of an electron of this energy along the axis.
 
@@ -61,7 +61,7 @@ def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direct
     return turned(axis, cosine, 2.0 * math.pi * rng.random())
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def remainder(total: float, axis: Direction, part: float, direction: Direction) -> Direction:
     """Direction of what is left of a momentum along `axis` without a part of it."""
     x = total * axis.x - part * direction.x
@@ -73,7 +73,7 @@ def remainder(total: float, axis: Direction, part: float, direction: Direction) 
     return Direction(x / size, y / size, z / size)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def compton_energy(energy: float, rng: np.random.Generator) -> float:
     """Energy of a photon after Compton scattering on a free electron at rest."""
     k = energy / ELECTRON_MASS
@@ -91,7 +91,7 @@ def compton_energy(energy: float, rng: np.random.Generator) -> float:
             return energy * share
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def pair_share(rng: np.random.Generator) -> float:
     """Electron's share of a pair's kinetic energy: p+ p-, the phase space near threshold."""
     while True:
@@ -100,7 +100,7 @@ def pair_share(rng: np.random.Generator) -> float:
             return share
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float, float]:
     """Energy of one of the two photons and the cosine of its angle to the positron."""
     gamma = 1.0 + kinetic / ELECTRON_MASS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
+from cpunet.kernels import kernel
 
 from cpunet.simulation.geometry import Detector
 
@@ -59,7 +59,7 @@ class CrystalShape(NamedTuple):
         )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def in_germanium(shape: CrystalShape, x: float, y: float, z: float) -> bool:
     """Whether a point (mm) lies in germanium."""
     if z < 0.0 or z > shape.length:
@@ -72,7 +72,7 @@ def in_germanium(shape: CrystalShape, x: float, y: float, z: float) -> bool:
     return not _in_bore(shape, r, z)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _outer_wall(shape: CrystalShape, z: float) -> float:
     """Radius of the crystal at a height; tapers and bullets are never on the same end."""
     into_top = z - shape.length + shape.top_bullet
@@ -87,13 +87,13 @@ def _outer_wall(shape: CrystalShape, z: float) -> float:
     return wall
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _rounded_off(bullet: float, depth: float) -> float:
     """What a quarter circle of radius `bullet` takes off a wall `depth` after it begins."""
     return bullet - math.sqrt(max(bullet * bullet - depth * depth, 0.0))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _in_bore(shape: CrystalShape, r: float, z: float) -> bool:
     above = z - shape.bore_end
     if above <= 0.0:
@@ -107,7 +107,7 @@ def _in_bore(shape: CrystalShape, r: float, z: float) -> bool:
     return r < wall
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def way_to_cylinder(
     radius: float, length: float, x: float, y: float, z: float, u: float, v: float, w: float
 ) -> float:

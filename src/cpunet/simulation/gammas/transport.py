@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.kernels import kernel
 from cpunet.simulation.gammas.electrons import put_photon, record, slow_down
 from cpunet.simulation.gammas.germanium import (
     ELECTRON_MASS,
@@ -44,7 +44,7 @@ class Source(NamedTuple):
     least_cosine: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def follow_photons(
     shape: CrystalShape,
     photons: PhotonTable,
@@ -118,7 +118,7 @@ def follow_photons(
     return n_hits
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Generator) -> int:
     """Put a photon of the source where it meets the crystal's cylinder; 0: it misses."""
     r = source.radius * math.sqrt(rng.random())
@@ -136,7 +136,7 @@ def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Gener
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def simulate_block(
     shape: CrystalShape,
     source: Source,

@@ -1,0 +1,94 @@
+"""Compiled loops, kept on disk: compiled again when code that they use changes, and then only.
+
+numba's own cache looks at the file of a function alone, so that a function goes on with old
+code of what it calls in other files; and of two processes that compile at once, as the first
+jobs after an installation do, one may be given the other's code.  Neither happens here.
+Where the code is kept is numba's choice: beside the package, or in ``NUMBA_CACHE_DIR``.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+import sys
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+_IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
+
+
+@overload
+def kernel(function: Loop) -> Loop: ...
+
+
+@overload
+def kernel(**options: Any) -> Callable[[Loop], Loop]: ...
+
+
+def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a loop by numba's ``njit``, without the interpreter's lock, and keep its code."""
+    if function is None:
+        return functools.partial(kernel, **options)
+    compiled = numba.njit(nogil=True, **options)(function)
+    compiled._cache = _Cache(function)
+    return compiled
+
+
+@functools.cache
+def sources(module: str) -> frozenset[Path]:
+    """Files of a module and of all that it imports at its top from its own package."""
+    package = module.partition(".")[0]
+    seen, ahead = {module}, [module]
+    found = set()
+    while ahead:
+        file = Path(str(sys.modules[ahead.pop()].__file__))
+        found.add(file)
+        names = set(_IMPORT.findall(file.read_text(encoding="utf-8"))) - seen
+        ours = [n for n in names if n.partition(".")[0] == package and n in sys.modules]
+        seen.update(ours)
+        ahead += ours
+    return frozenset(found)
+
+
+@functools.cache
+def digest(module: str) -> str:
+    """Digest of the sources of a module, wherever they lie."""
+    contents = sorted(file.read_bytes() for file in sources(module))
+    return hashlib.sha256(b"\0".join(contents)).hexdigest()
+
+
+class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
+    """Files of one function: an index, and one with the code for each kind of arguments."""
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep code; another process may do so at the same time."""
+        # numba counts from 1, and two processes give different code the same name
+        name = self._data_name_pattern.format(number=uuid.uuid4().int)
+        self._save_data(name, data)  # first: what the index names is there
+        kept = self._load_index() | {key: name}
+        self._save_index(kept)
+        # code of older sources, and what another process's index no longer names
+        pattern = self._data_name_pattern.format(number=0).replace(".0.", ".*.")
+        for file in Path(self._cache_path).glob(pattern):
+            if file.name not in kept.values():
+                with suppress(OSError):
+                    file.unlink()  # one who looks for it compiles
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of one function, which holds as long as its sources do."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = KernelFiles(
+            self._cache_path, self._impl.filename_base, digest(function.__module__)
+        )
