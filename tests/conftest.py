@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import os
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
+import platformdirs
 import pytest
 import torch
 from hypothesis import settings
@@ -14,18 +22,80 @@ from hypothesis import settings
 settings.register_profile("cpunet", deadline=None)
 settings.load_profile("cpunet")
 
+# What other packages compile when it is imported, half a minute in all; half in each process.
+COMPILED = (
+    ["lh5.compression.radware"],
+    [
+        "lh5.compression.varlen",
+        *(
+            f"dspeed.processors.{name}"
+            for name in ("min_max", "moving_windows", "time_point_thresh", "upsampler")
+        ),
+    ],
+)
 
-def pytest_configure() -> None:
-    """Give each process its own compiled code, and those that it starts one thread.
 
-    Two that write the same cache at once, as in a fresh checkout, may read what the other has
-    half written, and crash.  The last bits of a training depend on the number of threads, and
-    a server that processes are forked from keeps that of the first test that needs it.
+def pytest_configure(config: pytest.Config) -> None:
+    """Have all compile once, and processes that are started use one thread.
+
+    The last bits of a training depend on the number of threads, and a server that processes
+    are forked from keeps that of the first test that needs it.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-        caches = Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba"
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(caches / worker))
+        own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
+        os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
+        share_code(own)
+    elif getattr(config.option, "dist", "no") != "no":
+        folder = tempfile.mkdtemp(prefix="cpunet-tests-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        os.environ["NUMBA_CACHE_DIR"] = folder
+        code_of_others()
+
+
+def code_of_others() -> Path:
+    """Folder of compiled code of other packages; made if there is none of these versions.
+
+    Only copies of it are used: two processes that add code to one folder at once may each
+    be given the other's, and crash.
+    """
+    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
+    packages = ("numba", "llvmlite", "numpy", "dspeed", "legend-lh5io", "legend-pydataobj")
+    depends_on = [sys.version, sys.prefix, *map(version, packages), *COMPILED]
+    depends_on += [get_host_cpu_name(), get_host_cpu_features().flatten()]
+    key = hashlib.sha256(repr(depends_on).encode()).hexdigest()[:16]
+    made = platformdirs.user_cache_path("cpunet") / "tests" / key
+    made.parent.mkdir(parents=True, exist_ok=True)
+    with made.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            aside = Path(tempfile.mkdtemp(dir=made.parent))
+            compiling = [
+                subprocess.Popen(
+                    [sys.executable, "-c", f"import {', '.join(modules)}"],
+                    env=os.environ | {"NUMBA_CACHE_DIR": str(aside)},
+                )
+                for modules in COMPILED
+            ]
+            if any([process.wait() for process in compiling]):
+                raise pytest.UsageError("what other packages compile cannot be imported")
+            aside.replace(made)
+    return made
+
+
+def share_code(own: Path) -> None:
+    """Fill a process's folder of compiled code: a copy of others', and links to our own."""
+    from numba.core.caching import _CacheLocator
+
+    import cpunet
+
+    shutil.copytree(code_of_others(), own)
+    for folder in {file.parent for file in Path(cpunet.__file__).parent.rglob("*.py")}:
+        kept = folder / "__pycache__"
+        kept.mkdir(exist_ok=True)
+        name = _CacheLocator.get_suitable_cache_subpath(str(folder / "any.py"))
+        (own / name).symlink_to(kept)
 
 
 @pytest.fixture(scope="session")
