@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
 import platformdirs
 import pytest
@@ -78,7 +80,8 @@ def code_of_others() -> Path:
                 )
                 for modules in COMPILED
             ]
-            if any([process.wait() for process in compiling]):
+            ended = [process.wait() for process in compiling]
+            if any(ended):
                 raise pytest.UsageError("what other packages compile cannot be imported")
             aside.replace(made)
     return made
@@ -96,6 +99,17 @@ def share_code(own: Path) -> None:
         kept.mkdir(exist_ok=True)
         name = _CacheLocator.get_suitable_cache_subpath(str(folder / "any.py"))
         (own / name).symlink_to(kept)
+
+
+@pytest.fixture(scope="session")
+def held() -> ModuleType:
+    """The program whose trainings wait for a signal, see there."""
+    spec = importlib.util.spec_from_file_location("held", Path(__file__).with_name("held.py"))
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,7 @@ def test_the_run_folder(trained, stand):
     info = json.loads((trained / "run.json").read_text())
     assert (info["recipe"], info["peak"], info["seed"]) == ("small", "FEP", 3)
     assert info["dt_ns"] == 16
-    assert 0 < info["seconds"] < 60
+    assert info["seconds"] > 0
     for side, kev in (("sim", stand.sim_kev), ("data", stand.data_kev)):
         told = info[side]
         assert told["file"] == str(getattr(stand, side))

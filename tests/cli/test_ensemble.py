@@ -6,73 +6,37 @@ import json
 import os
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-
-PROGRAM = "import sys; from cpunet.cli.main import main; sys.exit(main())"
-LONG = [
-    "training.iterations=30",
-    "training.decay_start=15",
-    "training.log_interval=1",
-    "training.checkpoint_interval=1",
-]
-
-
-def children(pid: int) -> list[int]:
-    """Processes that a process has started, and theirs."""
-    try:
-        own = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:
-        return []
-    return [p for child in map(int, own) for p in (child, *children(child))]
-
-
-def is_running(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["INT", "KILL"])
 def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
-    stand, tiny, command, tmp_path: Path, how
+    stand, tiny, held, command, tmp_path: Path, how
 ):
     folder = tmp_path / "ens"
-    more = [word for value in LONG for word in ("--set", value)]
+    more = [word for value in held.SETTINGS for word in ("--set", value)]
     n = 2 if how == signal.SIGINT else 1
     seeds = ["--seeds", n, "--jobs", 2, "--threads", 1, "--no-validate"]
     words = ["ensemble", *stand.inputs, "--out", folder, *tiny, *more, *seeds]
-    job = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *map(str, words)], stderr=subprocess.PIPE, text=True
-    )
-    logs = [
-        folder / f"seed_00{seed}.unfinished" / "checkpoint.safetensors" for seed in range(n)
-    ]
+    job = subprocess.Popen([*held.PROGRAM, *map(str, words)], stderr=subprocess.PIPE, text=True)
+    unfinished = [folder / f"seed_00{seed}.unfinished" for seed in range(n)]
     try:
-        deadline = time.monotonic() + 120
-        while not all(log.exists() for log in logs) and job.poll() is None:
-            assert time.monotonic() < deadline, "the trainings did not start"
-            time.sleep(0.05)
-        started = children(job.pid)
+        held.wait_until_held(lambda: job.poll() is None, *unfinished)
+        started = held.children(job.pid)
         assert len(started) >= n
         job.send_signal(how)
-        told = job.communicate(timeout=90)[1]
+        told = job.communicate()[1]
     finally:
         job.kill()
-    while any(map(is_running, started)):
-        assert time.monotonic() < deadline, "a process was left behind"
-        time.sleep(0.1)
+    held.wait_until_gone(started)
     assert "Traceback" not in told
     if how == signal.SIGINT:
         assert job.returncode == 130
         assert "go on with --resume" in told.splitlines()[-1]
-    assert all(log.exists() for log in logs)
+    assert all((one / "checkpoint.safetensors").exists() for one in unfinished)
     if how == signal.SIGKILL:
         return
     done = command(*words, "--resume")
@@ -81,7 +45,7 @@ def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
     for seed in (0, 1):
         info = json.loads((folder / f"seed_00{seed}" / "run.json").read_text())
         assert info["seed"] == seed
-        assert len(info["resumed_at"]) == 1
+        assert info["resumed_at"] == [3]
     assert not list(folder.glob("*.unfinished"))
 
 

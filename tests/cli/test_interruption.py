@@ -1,40 +1,39 @@
-"""A job that is stopped leaves nothing half-written."""
+"""A job that is stopped or killed leaves nothing half-written, and goes on."""
 
 from __future__ import annotations
 
+import json
+import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
 
-@pytest.mark.parametrize(
-    ("how", "code"), [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 130)]
-)
-def test_a_stopped_training_leaves_what_it_can_go_on_from(
-    stand, tiny, tmp_path: Path, how, code
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["TERM", "KILL"])
+def test_a_training_that_was_ended_goes_on(
+    stand, tiny, trained, held, command, tmp_path: Path, how
 ):
-    endless = ["--set", "training.iterations=100000", "--set", "training.log_interval=1"]
-    words = ["train", *stand.inputs, "--out", tmp_path / "run", *tiny, *endless]
-    program = "import sys; from cpunet.cli.main import main; sys.exit(main())"
-    job = subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, words)], stderr=subprocess.PIPE, text=True
-    )
-    log = tmp_path / "run.unfinished" / "losses.jsonl"
-    try:
-        deadline = time.monotonic() + 120
-        while not (log.exists() and log.stat().st_size) and job.poll() is None:
-            assert time.monotonic() < deadline, "the training did not start"
-            time.sleep(0.1)
-        job.send_signal(how)
-        told = job.communicate(timeout=60)[1]
-    finally:
-        job.kill()
-    assert job.returncode == code
-    assert told.splitlines()[-1].startswith("error: stopped after ")
+    settings = [word for setting in held.SETTINGS for word in ("--set", setting)]
+    words = ["train", *stand.inputs, "--out", tmp_path / "run", "--seed", "3", *tiny, *settings]
+    unfinished, errors = tmp_path / "run.unfinished", tmp_path / "errors"
+    given = {"words": [*map(str, words), "--threads", "1"], "errors": str(errors)}
+    job = held.forked(held.__file__, {"GIVEN": given})
+    held.wait_until_held(job.is_alive, unfinished)
+    os.kill(job.pid, how)
+    job.join()
+    told = errors.read_text()
+    errors.unlink()
+    if how == signal.SIGTERM:
+        assert job.exitcode == 128 + how
+        assert told.splitlines()[-1].startswith("error: stopped after 3 of 4 iterations")
+    else:
+        assert job.exitcode == -how
     assert "Traceback" not in told
-    assert [path.name for path in tmp_path.iterdir()] == [log.parent.name]
-    assert (log.parent / "checkpoint.safetensors").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == [unfinished.name]
+    assert (unfinished / "checkpoint.safetensors").is_file()
+    assert command(*words, "--resume").code == 0
+    info = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert info["resumed_at"] == [3 if how == signal.SIGTERM else held.AFTER]
+    for name in ("weights.safetensors", "losses.jsonl"):
+        assert (tmp_path / "run" / name).read_bytes() == (trained / name).read_bytes()

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-import random
+import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +16,8 @@ import torch
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.train import train_run
 from cpunet.recipes import load_recipe
+from cpunet.training.checkpoints import CHECKPOINT
+from cpunet.training.run_folder import LOSSES
 from cpunet.training.unfinished import UnfinishedRun
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
@@ -162,72 +160,78 @@ def test_too_little_memory(command, words, tmp_path, monkeypatch, error, line):
     assert list(tmp_path.iterdir()) == []
 
 
-def size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
+# Each is where a training is killed: what has happened to an iteration, and its number.
+MOMENTS = [
+    ("its line is half written", 1),
+    ("its checkpoint is not in place", 1),
+    ("its line is written", 2),
+    ("its checkpoint is in place", 2),
+    ("its line is half written", 4),
+    ("its checkpoint is not in place", 5),  # and the one before is the previous one
+    ("the run is not in place", 6),
+]
+PROCESS = "a training that is killed"  # the name of this module in its process
 
 
-def trains(log: Path, done: int, alive: Callable[[], bool]) -> bool:
-    """Wait until a training adds to its log; whether it does before it ends."""
-    deadline = time.monotonic() + 120
-    while alive() and time.monotonic() < deadline:
-        if size(log) > done:
-            return True
-        time.sleep(0.01)
-    return False
+def die_at(moment: str, iteration: int) -> None:
+    """Have this process killed by force at a moment of its training."""
+    log, save, finish = UnfinishedRun.log, UnfinishedRun.save, UnfinishedRun.finish
+    replace, logged = Path.replace, [0]
+
+    def is_now(name: str) -> bool:
+        return (moment, iteration) == (name, logged[-1])
+
+    def die_if(now: bool) -> None:
+        if now:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def watched_log(self, records):
+        logged.append(records[-1]["iteration"] + 1)
+        if is_now("its line is half written"):
+            with (self.folder / LOSSES).open("ab") as stream:
+                stream.write(b'{"iterat')
+            die_if(True)
+        log(self, records)
+        die_if(is_now("its line is written"))
+
+    def watched_replace(self, target):
+        checkpoint = Path(target).name == CHECKPOINT
+        die_if(checkpoint and is_now("its checkpoint is not in place"))
+        return replace(self, target)
+
+    def watched_save(self, state):
+        save(self, state)
+        die_if(is_now("its checkpoint is in place"))
+
+    def watched_finish(self):
+        finish(self)
+        die_if(is_now("the run is not in place"))
+
+    UnfinishedRun.log, UnfinishedRun.save = watched_log, watched_save
+    UnfinishedRun.finish, Path.replace = watched_finish, watched_replace
 
 
-def test_killed_at_any_moment(stand, tiny, tmp_path, monkeypatch):
-    """Killed by force thrice and resumed: the weights of a training in one go."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def test_killed_at_any_moment(stand, tiny, held, tmp_path):
+    """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
     recipe = load_recipe("small", overrides)
     files = InputFile(stand.sim), InputFile(stand.data)
     train_run(*files, tmp_path / "whole", recipe, seed=5, device="cpu")
-    # forked from a server that has everything imported
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["cpunet.cli.main", "cpunet.jobs.train"])
-    rng = random.Random(11)
-    run, log = tmp_path / "run", tmp_path / "run.unfinished" / "losses.jsonl"
-    arguments = (*files, run, recipe)
-    options = {"seed": 5, "device": "cpu", "resume": True}
-    for kill in range(4):
-        job = context.Process(target=train_run, args=arguments, kwargs=options)
-        done = size(log)
-        job.start()
-        if kill < 3 and trains(log, done, job.is_alive):
-            time.sleep(rng.uniform(0, 0.5))
-            job.kill()
-        job.join(120)
-        assert job.exitcode == (-signal.SIGKILL if kill < 3 else 0)
-    assert result(run) == result(tmp_path / "whole")
+    for moment in MOMENTS:
+        given = {"MOMENT": moment, "ARGUMENTS": (*files, tmp_path / "run", recipe)}
+        job = held.forked(__file__, given, PROCESS)
+        job.join()
+        assert job.exitcode == -signal.SIGKILL, moment
+    train_run(*files, tmp_path / "run", recipe, seed=5, device="cpu", resume=True)
+    assert result(tmp_path / "run") == result(tmp_path / "whole")
     # one killed before its first checkpoint began again
-    assert json.loads((run / "run.json").read_text())["resumed_at"]
-    assert not log.parent.exists()
+    info = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert info["resumed_at"] == [1, 2, 3, 4, 6]
+    assert not (tmp_path / "run.unfinished").exists()
 
 
-@pytest.mark.slow
-def test_ten_kills_of_the_command(stand, tiny, tmp_path):
-    """As above, through the program as it is started."""
-    length = ["--set", "training.iterations=60", *KEPT]
-    words = [*stand.inputs, *tiny, *length, "--threads", "1", "--resume"]
-    program = "from cpunet.cli.main import main; main()"
-
-    def start(out: Path) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, "-c", program, "train", *map(str, words), "--out", str(out)],
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-
-    assert start(tmp_path / "whole").wait(600) == 0
-    rng = random.Random(12)
-    run, log = tmp_path / "run", tmp_path / "run.unfinished" / "losses.jsonl"
-    for _ in range(10):
-        done = size(log)
-        job = start(run)
-        assert trains(log, done, lambda job=job: job.poll() is None)
-        time.sleep(rng.uniform(0, 0.4))
-        job.kill()
-        assert job.wait() == -signal.SIGKILL
-    assert start(run).wait(600) == 0
-    assert result(run) == result(tmp_path / "whole")
+if __name__ == PROCESS:
+    asked = globals()
+    torch.set_num_threads(1)
+    die_at(*asked["MOMENT"])
+    train_run(*asked["ARGUMENTS"], seed=5, device="cpu", resume=True)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
-import runpy
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,13 +22,6 @@ from cpunet.cli.main import main
 from cpunet.training.unfinished import UnfinishedRun
 
 PROCESS = "one of a team"  # the name of this module in a process of a team
-# what takes long to import
-PRELOADED = [
-    "cpunet.cli.main",
-    "cpunet.jobs.train",
-    "cpunet.pulses.reading.hdf5",
-    "torch._dynamo",
-]
 SETTINGS = [
     "training.checkpoint_interval=1",
     "training.log_interval=1",
@@ -40,28 +31,35 @@ SETTINGS = [
 ]
 
 
-def start(folder: Path, rank: int, environment: dict[str, str], words: list[str]) -> Any:
-    """Start the command as a process of a team, forked from what has all imported."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
+def start(
+    held: ModuleType, folder: Path, rank: int, environment: dict[str, str], words: list[str]
+) -> Any:
+    """Start the command as a process of a team."""
     own = {"RANK": str(rank), "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1"}
     given = {"ENVIRONMENT": environment | own, "WORDS": words, "FOLDER": str(folder)}
-    process = context.Process(target=runpy.run_path, args=(__file__, given, PROCESS))
-    process.start()
-    return process
+    return held.forked(__file__, given, PROCESS)
 
 
-def pair(folder: Path, *words: object, environment: dict[str, str] | None = None) -> Any:
+Pair = Callable[..., Any]
+
+
+@pytest.fixture
+def pair(held) -> Pair:
+    return partial(run_pair, held)
+
+
+def run_pair(
+    held: ModuleType, folder: Path, *words: object, environment: dict[str, str] | None = None
+) -> Any:
     """Run the command in two processes; their statuses and all that they printed."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     told = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
     told |= environment or {}
     folder.mkdir(exist_ok=True)
-    processes = [start(folder, rank, told, [*map(str, words)]) for rank in range(2)]
+    processes = [start(held, folder, rank, told, [*map(str, words)]) for rank in range(2)]
     for process in processes:
-        process.join(120)
-        process.kill()
+        process.join()
     printed = [(folder / f"err-{rank}").read_text() for rank in range(2)]
     return SimpleNamespace(
         codes=[process.exitcode for process in processes],
@@ -86,7 +84,7 @@ def words(stand, tiny, tmp_path) -> list[object]:
 
 
 @pytest.mark.slow
-def test_a_team_trains_and_goes_on(words, tmp_path, command):
+def test_a_team_trains_and_goes_on(words, pair, tmp_path, command):
     told, run = tmp_path / "told", tmp_path / "out" / "run"
     done = pair(told, *words)
     assert (done.codes, done.errors) == ([0, 0], [])
@@ -134,7 +132,7 @@ def test_a_team_trains_and_goes_on(words, tmp_path, command):
         (["--device", "gpu"], "error: device 'gpu' is not known"),
     ],
 )
-def test_an_error_is_one_line(words, tmp_path, more, line):
+def test_an_error_is_one_line(words, pair, tmp_path, more, line):
     refused = pair(tmp_path / "told", *words, *more)
     assert refused.codes == [2, 2]
     assert len(refused.errors) == 1
@@ -142,7 +140,7 @@ def test_an_error_is_one_line(words, tmp_path, more, line):
     assert not (tmp_path / "out" / "run").exists()
 
 
-def test_a_matching_recipe_needs_no_team(stand, tmp_path):
+def test_a_matching_recipe_needs_no_team(stand, pair, tmp_path):
     refused = pair(tmp_path / "told", "train", *stand.inputs, "--out", tmp_path / "run")
     assert refused.codes == [2, 2]
     assert refused.errors == [
@@ -151,41 +149,35 @@ def test_a_matching_recipe_needs_no_team(stand, tmp_path):
 
 
 @pytest.mark.slow
-def test_torchrun(words, tmp_path):
+def test_torchrun(words, held, tmp_path):
     """As above, through torchrun, which passes on a signal."""
-    program = "from cpunet.cli.main import main; main()"
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-    command = [*launcher, "--nproc-per-node", "2", "--no-python", sys.executable, "-c", program]
-    words = [*words, "--set", "training.iterations=12", "--resume"]
+    command = [*launcher, "--nproc-per-node", "2", "--no-python"]
+    plain = [sys.executable, "-c", "from cpunet.cli.main import main; main()"]
     run = tmp_path / "out" / "run"
-    log = run.parent / "run.unfinished" / "losses.jsonl"
 
-    def begin() -> subprocess.Popen[str]:
+    def begin(program: list[str]) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [*command, *map(str, words)],
+            [*command, *program, *map(str, words), "--resume"],
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"OMP_NUM_THREADS": "1"},
         )
 
-    job = begin()
-    assert "Traceback" not in job.communicate(timeout=300)[1]
+    job = begin(plain)
+    assert "Traceback" not in job.communicate()[1]
     assert job.returncode == 0
     expected = result(run)
     shutil.rmtree(run)
-    job = begin()
-    deadline = time.monotonic() + 200
-    while not (log.exists() and log.stat().st_size):
-        assert job.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    job = begin(held.PROGRAM)
+    held.wait_until_held(lambda: job.poll() is None, run.parent / "run.unfinished")
     job.terminate()
-    told = job.communicate(timeout=100)[1].splitlines()
+    told = job.communicate()[1].splitlines()
     assert job.returncode != 0
     assert sum(line.startswith("error: ") for line in told) == 1
     assert any(line.startswith("error: stopped after ") for line in told)
-    job = begin()
-    assert "Traceback" not in job.communicate(timeout=300)[1]
+    job = begin(plain)
+    assert "Traceback" not in job.communicate()[1]
     assert job.returncode == 0
     assert result(run) == expected
 

@@ -19,8 +19,7 @@ def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_pat
     """Trained on FEP, judged on SEP and DEP, which it has not seen."""
     folder = reference_data / "closure"
     sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
-    info = train_run(sim, data, tmp_path / "run", load_recipe("small"), device="cpu")
-    assert info["seconds"] <= 600
+    train_run(sim, data, tmp_path / "run", load_recipe("small"), device="cpu")
     metrics = validate_run(
         tmp_path / "run", sim, data, tmp_path / "report", truth=folder / "truth.npz"
     )

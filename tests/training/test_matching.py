@@ -237,7 +237,8 @@ def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> No
     assert per_moment > 3 * near.fit.chi_square / near.fit.moments
 
 
-def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> None:
+@pytest.mark.slow  # the next but one finds one, too
+def test_a_ringing_is_found_where_there_is_one() -> None:
     ringing = {"frequency_MHz": 6.0, "fraction": 0.25, "damping_ns": 160.0}
     chain = Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing})
     rings = measured_with(chain)
@@ -253,7 +254,9 @@ def test_a_ringing_is_found_where_there_is_one(problem: Problem, near: Told) -> 
     assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
     assert max(pole_errors) < 0.1
     assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
-    # and none where there is none
+
+
+def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
     assert "ringing_mhz" not in near.response.describe()
 
 
