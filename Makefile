@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: install install-dev demo test test-slow lint clean
+.PHONY: install install-dev demo test test-slow ci lint clean
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
@@ -22,12 +22,19 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 demo: install
 	$(BIN)/cpunet demo --out demo
 
-# a process a core: most tests wait for compilers or other processes
-test: install-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile
+# a process a core; those that tests start need not compile the package's modules each time
+PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
+test: install-dev
+	$(PYTEST)
+
+# with CPUNET_SLOW_MINUTES=15 none is begun after so long
 test-slow: install-dev
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
+
+# what a change has to pass: half an hour on two cores, on slow ones with fewer slow tests
+ci: lint test
+	CPUNET_SLOW_MINUTES=15 $(MAKE) test-slow
 
 lint: install-dev
 	$(BIN)/ruff check .

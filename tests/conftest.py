@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +24,8 @@ from hypothesis import settings
 # compilation and a shared machine make single examples slow now and then
 settings.register_profile("cpunet", deadline=None)
 settings.load_profile("cpunet")
+
+BEGUN = time.monotonic()
 
 # What other packages compile when it is imported, half a minute in all; half in each process.
 COMPILED = (
@@ -99,6 +102,13 @@ def share_code(own: Path) -> None:
         kept.mkdir(exist_ok=True)
         name = _CacheLocator.get_suitable_cache_subpath(str(folder / "any.py"))
         (own / name).symlink_to(kept)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip slow tests when the time for them is over: on a slow machine some are left out."""
+    minutes = float(os.environ.get("CPUNET_SLOW_MINUTES", "inf"))
+    if item.get_closest_marker("slow") and time.monotonic() - BEGUN > 60 * minutes:
+        pytest.skip(f"the {minutes:g} minutes for slow tests are over")
 
 
 @pytest.fixture(scope="session")
