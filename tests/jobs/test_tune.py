@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from cpunet.jobs.held_out import HeldOut
 from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.tune import tune_recipe
+from cpunet.jobs.tuning_study import _is_gone, this_worker
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
@@ -178,6 +180,18 @@ def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[tune\]'"):
         tune_recipe(*files, tmp_path / "tune", tiny())
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_a_process_is_gone_before_anyone_asks_how_it_ended():
+    ended = subprocess.Popen(["true"])
+    os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+    host = this_worker().rpartition(":")[0]
+    assert _is_gone(f"{host}:{ended.pid}")
+    ended.wait()
+    assert _is_gone(f"{host}:{ended.pid}")
+    assert not _is_gone(this_worker())
+    assert not _is_gone(f"another host:{ended.pid}")
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
