@@ -119,12 +119,12 @@ def test_slices_and_axes_say_which_time_they_mean(whole) -> None:
     np.testing.assert_allclose(
         whole.details["FEP"].slices["data"].edges, slice_edges(data["rise_01_90"])
     )
-    makers = figure_makers(whole)
-    slices, amplitude = makers["FEP superpulses"](), makers["FEP A over E"]()
+    made = drawings(whole)
+    slices, amplitude = made["FEP superpulses"].draw(), made["FEP A over E"].draw()
     assert "slices of rise time 1–90 %" in slices.legends[0].get_title().get_text()
     labels = [axes.get_xlabel() for axes in amplitude.axes]
     assert "Drift time, 1 % to maximum [ns]" in labels
-    assert makers["FEP drift_time"]().axes[0].get_xlabel() in labels
+    assert made["FEP drift_time"].draw().axes[0].get_xlabel() in labels
 
 
 def test_every_figure_can_be_drawn(whole) -> None:

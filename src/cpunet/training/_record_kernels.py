@@ -10,7 +10,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from cpunet.kernels import kernel
 
 
 class Window(NamedTuple):
@@ -46,9 +47,9 @@ class Window(NamedTuple):
     edge: int
 
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
-_compiled_finite = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
+_compiled: Any = kernel(error_model="numpy")
+_compiled_finite: Any = kernel(
+    error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
 )
 
 
@@ -112,9 +113,9 @@ def _tail_slope(record: Any, w: Window, tail: Any, logs: Any) -> Any:  # pragma:
 
 
 @_compiled_finite
-def _amplitude(current: Any, first: int, stop: int, kernel: Any) -> Any:  # pragma: no cover
+def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pragma: no cover
     """Largest weighted mean of the current on its fine grid."""
-    phases, width = kernel.shape
+    phases, width = weights.shape
     half, n = width // 2, len(current)
     best = np.float32(-np.inf)
     for centre in range(first, stop):
@@ -122,10 +123,10 @@ def _amplitude(current: Any, first: int, stop: int, kernel: Any) -> Any:  # prag
             total = np.float32(0)
             if centre - half >= 0 and centre + half < n:
                 for k in range(width):
-                    total += kernel[phase, k] * current[centre - half + k]
+                    total += weights[phase, k] * current[centre - half + k]
             else:
                 for k in range(width):
-                    total += kernel[phase, k] * current[min(max(centre - half + k, 0), n - 1)]
+                    total += weights[phase, k] * current[min(max(centre - half + k, 0), n - 1)]
             best = max(best, total)
     return best
 
@@ -160,7 +161,7 @@ def _window(
 
 @_compiled
 def read_records(
-    records: Any, w: Window, kernel: Any, aligned: Any, slopes: Any, amplitudes: Any
+    records: Any, w: Window, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
 ) -> None:  # pragma: no cover - compiled
     """Align and read each record; baseline and height of the records are changed.
 
@@ -168,7 +169,7 @@ def read_records(
     ----------
     records
         Float32, shape (pulses, samples).
-    w, kernel
+    w, weights
         Where to read, and the weights of the current amplitude (phases, samples).
     aligned, slopes, amplitudes
         To be filled: (pulses, before + after) float32, and two of (pulses,) float64. NaN for a
@@ -177,8 +178,8 @@ def read_records(
     tail = np.empty(w.fit_samples, np.float32)
     logs = np.empty(w.fit_samples, np.float32)
     current = np.empty(w.before + w.after - 1, np.float32)
-    reach = kernel.shape[1] // 2 + w.edge // 3
-    half = kernel.shape[1] // 2
+    reach = weights.shape[1] // 2 + w.edge // 3
+    half = weights.shape[1] // 2
     for row in range(len(records)):
         record = records[row]
         _, sample = _crossing(record, w.level, w.last)
@@ -196,7 +197,7 @@ def read_records(
             if current[i] > current[steepest]:
                 steepest = i
         first = steepest - reach + half
-        amplitudes[row] = _amplitude(current, first, first + 2 * (reach - half) + 1, kernel)
+        amplitudes[row] = _amplitude(current, first, first + 2 * (reach - half) + 1, weights)
 
 
 @_compiled_finite

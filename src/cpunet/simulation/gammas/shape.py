@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 from cpunet.kernels import kernel
-
 from cpunet.simulation.geometry import Detector
 
 
