@@ -39,7 +39,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     if function is None:
         return functools.partial(kernel, **options)
     compiled = numba.njit(nogil=True, **options)(function)
-    compiled._cache = _Cache(function)
+    compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
     return compiled
 
 

@@ -47,13 +47,10 @@ class Window(NamedTuple):
     edge: int
 
 
-_compiled: Any = kernel(error_model="numpy")
-_compiled_finite: Any = kernel(
-    error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
-)
+FAST = {"nnan", "nsz", "reassoc", "contract"}  # where all numbers are finite
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _mean(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - compiled
     """Mean of a stretch; edge values stand for what lies beyond the record."""
     total, n = 0.0, len(record)
@@ -64,7 +61,7 @@ def _mean(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - comp
     return total / (stop - first)
 
 
-@_compiled
+@kernel(error_model="numpy")
 def _crossing(record: Any, level: float, last: int) -> Any:  # pragma: no cover - compiled
     """Time of the last upward crossing before `last`, and the sample before it."""
     before = min(last, len(record) - 1) - 1
@@ -74,7 +71,7 @@ def _crossing(record: Any, level: float, last: int) -> Any:  # pragma: no cover 
     return before + (level - low) / max(high - low, 1e-6), before
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _highest(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - compiled
     highest = record[first]
     for i in range(first, stop):
@@ -82,7 +79,7 @@ def _highest(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - c
     return highest
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
     """Slope per sample of the logarithm."""
     n = len(tail)
@@ -94,7 +91,7 @@ def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
     return moment / (n * (n * n - 1.0) / 12.0)
 
 
-@_compiled
+@kernel(error_model="numpy")
 def _tail_slope(record: Any, w: Window, tail: Any, logs: Any) -> Any:  # pragma: no cover
     """Tail slope of the window that the preparation would cut from the record."""
     first, stop = w.last - w.align_before, min(w.last + w.align_after, len(record))
@@ -112,7 +109,7 @@ def _tail_slope(record: Any, w: Window, tail: Any, logs: Any) -> Any:  # pragma:
     return _slope(tail, logs)
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pragma: no cover
     """Largest weighted mean of the current on its fine grid."""
     phases, width = weights.shape
@@ -131,7 +128,7 @@ def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pra
     return best
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _normalise(record: Any, sample: int, w: Window) -> None:  # pragma: no cover - compiled
     base = _mean(record, sample - w.base_first, sample - w.base_stop)
     tail = _mean(record, sample + w.after - w.level_samples, sample + w.after) - base
@@ -140,7 +137,7 @@ def _normalise(record: Any, sample: int, w: Window) -> None:  # pragma: no cover
         record[i] = (record[i] - offset) * factor
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def _window(
     record: Any, time: float, w: Window, aligned: Any
 ) -> None:  # pragma: no cover - compiled
@@ -159,7 +156,7 @@ def _window(
             aligned[i] = low + fraction * (high - low)
 
 
-@_compiled
+@kernel(error_model="numpy")
 def read_records(
     records: Any, w: Window, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
 ) -> None:  # pragma: no cover - compiled
@@ -200,7 +197,7 @@ def read_records(
         amplitudes[row] = _amplitude(current, first, first + 2 * (reach - half) + 1, weights)
 
 
-@_compiled_finite
+@kernel(error_model="numpy", fastmath=FAST)
 def project(aligned: Any, matrix: Any, out: Any) -> None:  # pragma: no cover - compiled
     """Product of aligned pulses and a matrix (samples, columns), without threads of its own."""
     columns = matrix.shape[1]
