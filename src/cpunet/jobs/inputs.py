@@ -97,6 +97,38 @@ def load_measured(
     return _load(file, recipe, selection, monitor, measured=True)
 
 
+def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
+    """Look for energies that one of the sides does not have.
+
+    Returns
+    -------
+    list of str
+        What is to be told of the selection: lines that it takes away from the test.
+
+    Raises
+    ------
+    CpunetError
+        If a line or range that was chosen has pulses of one side only.
+    """
+    for part in selection.parts:
+        counts = [
+            int(part.select(side.prepared.pulses.energy_kev).sum()) for side in (sim, data)
+        ]
+        if min(counts) == 0:
+            missing, there = (sim, data) if counts[0] == 0 else (data, sim)
+            raise CpunetError(
+                f"{missing.path}: no pulse of {part.name} can be used, {there.path.name} has "
+                f"{max(counts)}; leave it out of --peak, or give a file that has them"
+            )
+    lines = selection.lines_in_ranges
+    if not lines:
+        return []
+    are = "is" if len(lines) == 1 else "are"
+    return [
+        f"warning: {', '.join(lines)} {are} in the range trained on, and no test of it any more"
+    ]
+
+
 def require_same_sampling(sim: InputSet, data: InputSet) -> None:
     """Raise a `CpunetError` if the two sides differ in their sampling period."""
     if not np.isclose(sim.dt_ns, data.dt_ns):

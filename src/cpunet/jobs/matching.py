@@ -25,8 +25,6 @@ from cpunet.training.matching import fit_response
 from cpunet.training.residual import fit_residual
 from cpunet.training.run_folder import load_network, read_recipe
 
-POOR_FIT = 3.0  # chi-square per moment from which on a response does not describe the data
-
 
 @dataclass(frozen=True, eq=False)
 class Sides:
@@ -120,11 +118,9 @@ def match(
         known=known,
         listener=tell,
     )
-    if fit.chi_square > POOR_FIT * fit.moments:
-        monitor.note(
-            f"warning: the response describes the data poorly, chi-square "
-            f"{fit.chi_square:.0f} for {fit.moments} moments; look at the report"
-        )
+    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+    monitor.note(f"compared (simulated/measured pulses): {compared}")
+    monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
     recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
@@ -151,6 +147,7 @@ def match(
     told = {
         "parameters": response.describe(),
         **asdict(fit),
+        "verdict": fit.verdict,
         "noise": {
             "baselines": noise.n_baselines,
             "rms": noise.rms,

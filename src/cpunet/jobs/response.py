@@ -26,6 +26,7 @@ from cpunet.electronics.noise import noise_power
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.response_errors import propagated
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
 from cpunet.outputs import FolderKind, refuse_existing
@@ -216,7 +217,22 @@ def _read_run(path: Path) -> _Learned:
     fit = info.get("fit")
     fit = fit if isinstance(fit, Mapping) else {}
     errors = _errors_by_name(response, fit.get("errors") or {})
+    dt_ns = float(info["dt_ns"])
+    errors |= propagated(
+        response,
+        fit.get("covariance") or [],
+        lambda moved: _shape_numbers(moved, preparation, dt_ns),
+    )
     return _Learned(path, info, fit, preparation, chain, parameters, errors)
+
+
+def _shape_numbers(
+    response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
+) -> Numbers:
+    """Numbers of a response that are no parameters of it."""
+    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
+    return _slow(slow) | numbers
 
 
 def _with_noise(

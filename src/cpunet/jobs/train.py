@@ -24,6 +24,7 @@ from cpunet.jobs.inputs import (
     InputSet,
     load_measured,
     load_simulated,
+    require_both_sides,
     require_same_sampling,
 )
 from cpunet.jobs.matching import Sides, match
@@ -124,6 +125,8 @@ def train_run(
             sim_set = load_simulated(sim, recipe, selection, told)
             data_set = load_measured(data, recipe, selection, told)
             require_same_sampling(sim_set, data_set)
+            for note in require_both_sides(sim_set, data_set, selection):
+                told.note(note)
             if init is not None:
                 _require_sampling(init, data_set)
             sides = sim_set, data_set, data

@@ -75,6 +75,25 @@ class EnergySelection:
     chosen: tuple[str, ...] = ()
     ranges_kev: tuple[tuple[float, float], ...] = ()
 
+    @property
+    def parts(self) -> list[EnergySelection]:
+        """Its lines and ranges, one by one."""
+        lines = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
+        return lines + [
+            EnergySelection(f"{low:g}-{high:g}", self.peaks, (), ((low, high),))
+            for low, high in self.ranges_kev
+        ]
+
+    @property
+    def lines_in_ranges(self) -> list[str]:
+        """Lines that were not chosen by name, but lie in a range that was."""
+        return [
+            name
+            for name, line in self.peaks.items()
+            if name not in self.chosen
+            and any(low <= line.energy_kev < high for low, high in self.ranges_kev)
+        ]
+
     def select(self, energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Mask of the energies (keV, shape ``(n,)``) selected; never of NaN."""
         energies = np.asarray(energy_kev, np.float64)

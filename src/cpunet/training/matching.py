@@ -71,6 +71,10 @@ class Fit:
         Measured pulses that the moments leave out: a second pulse, or no baseline.
     pairs
         Number of pulses that the errors go with: the harmonic sum of both sides.
+    covariance
+        Of the parameters, in the order of `errors`.
+    bands
+        Energies compared, with the pulses of each side.
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
         the data's, see `cpunet.training.misfit`.
@@ -83,8 +87,27 @@ class Fit:
     pulls: dict[str, float]
     data_left_out: int
     pairs: float
+    covariance: list[list[float]]
+    bands: dict[str, list[int]]
     amplitude_shift: float
     amplitude_shift_error: float
+
+    @property
+    def verdict(self) -> str:
+        """What is left between translation and data, in a sentence."""
+        shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
+        size = f"the current amplitude is off by {shift:+.2f} ± {error:.2f} %"
+        if abs(shift) < 2 * error:
+            size = f"the current amplitude is right to {abs(shift) + error:.2f} %"
+        per = self.chi_square / self.moments
+        if self.poor:
+            return f"chi-square is {per:.1f} per moment, too much for chance; {size}"
+        if per > GOOD_FIT:
+            return (
+                f"chi-square is {per:.1f} per moment, of a misfit that only so many pulses "
+                f"tell; {size}"
+            )
+        return f"chi-square is {per:.1f} per moment, as by chance; {size}"
 
     @property
     def poor(self) -> bool:
@@ -212,11 +235,14 @@ def _refined(
     listener: Listener | None,
 ) -> Fit:
     """Let all pulses say where in its valley the response is."""
-    steps, covariance = found.steps, found.covariance
+    compared, steps = ResponseProblem(problem.response, bands), found.steps
     for _ in range(ROUNDS):
-        covariance, taken = refine(problem, bands, training.conditional_bins, listener)
-        steps += taken
-    return _fit(ResponseProblem(problem.response, bands), covariance, steps)
+        covariance = refine(problem, bands, training.conditional_bins)
+        steps += 1
+        fit = _fit(compared, covariance, steps)
+        if listener is not None:
+            listener(steps, fit.chi_square)
+    return fit
 
 
 def _checked(
@@ -258,6 +284,8 @@ def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
         errors=parameters.by_name(np.sqrt(covariance.diagonal())),
         pulls=dict(zip(problem.names, pulls.tolist(), strict=True)),
         data_left_out=problem.left_out,
+        covariance=covariance.tolist(),
+        bands={b.name: [len(b.sim), len(b.moments.data)] for b in problem.bands},
         amplitude_shift=shift,
         amplitude_shift_error=shift_error,
     )

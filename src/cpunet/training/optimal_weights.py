@@ -23,7 +23,6 @@ import numpy as np
 import scipy.linalg
 
 from cpunet.networks.response import ElectronicsResponse
-from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 
@@ -67,9 +66,7 @@ class ConditionalFunctions:
         return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
 
 
-def refine(
-    near: ResponseProblem, bands: Sequence[Band], bins: int, listener: Listener | None
-) -> tuple[Values, int]:
+def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     """Move a response to where the optimally weighted means of both sides agree.
 
     Weights and derivatives are those of where the response is, to which the end is near.  What
@@ -83,13 +80,11 @@ def refine(
         All pulses.
     bins
         Of the current amplitude.
-    listener
-        Told step and the sum of squared deviations.
 
     Returns
     -------
-    tuple
-        Covariance of the parameters, and the number of steps.
+    array
+        Covariance of the parameters.
     """
     parameters = near.parameters
     weighted = [_Weighted(band, parameters, bins) for band in bands]
@@ -105,23 +100,20 @@ def refine(
         return np.concatenate([*found, (vector - parameters.centre) * inverse_widths])
 
     vector = parameters.vector()
-    left, taken = residuals(vector), 0
+    left = residuals(vector)
     for _ in range(PASSES):
         move = told @ np.linalg.lstsq(columns, -left)[0]
         tried = vector + np.clip(move, -LONGEST / inverse_widths, LONGEST / inverse_widths)
         found = residuals(tried)
         if found @ found >= left @ left:
             break
-        taken += 1
         fall = left @ left - found @ found
         vector, left = tried, found
-        if listener is not None:
-            listener(taken, float(left @ left))
         if fall < CONVERGED:
             break
     parameters.set(vector)
     information = slopes.T @ slopes + np.diag(inverse_widths**2)
-    return np.linalg.inv(information), taken
+    return np.asarray(np.linalg.inv(information))
 
 
 class _Weighted:
