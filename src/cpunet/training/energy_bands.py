@@ -23,7 +23,7 @@ Rows = npt.NDArray[np.intp]
 
 WIDEST = 1.3  # ratio of a band's ends
 LEAST = 200  # pulses of each side without which a band is not compared
-SLICES = 8  # of a band, in which spectra are made alike
+SLICES, IN_SLICE = 32, 50  # of a band at most, and pulses of each: spectra are made alike there
 HEAVIEST = 5.0  # weight of a simulated pulse
 
 
@@ -119,9 +119,10 @@ def _continuum(sim_kev: Values, data_kev: Values, sim: Rows, data: Rows) -> list
 
 def _weights(sim_kev: Values, data_kev: Values) -> Values:
     """Weights of simulated pulses that give them the data's spectrum."""
-    edges = np.quantile(data_kev, np.linspace(0, 1, SLICES + 1)[1:-1])
+    slices = max(2, min(SLICES, min(len(sim_kev), len(data_kev)) // IN_SLICE))
+    edges = np.quantile(data_kev, np.linspace(0, 1, slices + 1)[1:-1])
     of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
-    counts = [np.bincount(of, minlength=SLICES) for of in (of_sim, of_data)]
+    counts = [np.bincount(of, minlength=slices) for of in (of_sim, of_data)]
     ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
     weights = np.minimum(ratio, HEAVIEST)[of_sim]
     return np.asarray(weights / weights.mean())

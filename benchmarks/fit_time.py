@@ -1,0 +1,79 @@
+"""Time and memory of a fit against the number of pulses.
+
+Run with ``python benchmarks/fit_time.py STAND --pulses 1000 2000 5000 10000 20000``; STAND has
+sim.lh5 and data.lh5 (``cpunet stand --events FEP=20000,…``).  More pulses than there are, are
+those there are again: time and memory do not care.  Each fit has a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.noise import measured_noise
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes import load_recipe
+from cpunet.training.matching import fit_response
+
+
+def first(pulses: Pulses, n: int) -> Pulses:
+    rows = np.arange(n) % len(pulses)
+    return Pulses.of(
+        pulses.waveforms[rows], dt_ns=pulses.dt_ns, energy_kev=pulses.energy_kev[rows]
+    )
+
+
+def one(stand: Path, n: int) -> dict[str, float]:
+    recipe = load_recipe("fast")
+    selection = parse_selection("FEP", recipe.peaks)
+    files = [InputFile(stand / f"{side}.lh5") for side in ("sim", "data")]
+    sim = load_simulated(files[0], recipe, selection, Monitor()).prepared.pulses
+    data = load_measured(files[1], recipe, selection, Monitor()).prepared.pulses
+    noise, _ = measured_noise(files[1], data, recipe.preparation)
+    sides = first(sim, n), first(data, n)
+    loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    wall, cpu = time.perf_counter(), time.process_time()
+    _, fit = fit_response(*sides, noise, recipe, seed=0)
+    return {
+        "pulses": n,
+        "wall_s": time.perf_counter() - wall,
+        "cpu_s": time.process_time() - cpu,
+        "before_mb": loaded,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "chi_square_per_moment": fit.chi_square / fit.moments,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("stand", type=Path)
+    parser.add_argument("--pulses", type=int, nargs="+", default=[1000, 2000, 5000, 20000])
+    parser.add_argument("--one", action="store_true", help="in this process, as JSON")
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(one(arguments.stand, arguments.pulses[0])))
+        return
+    print("  pulses  wall s   cpu s  loaded MB  peak MB  chi2/moment")
+    for n in arguments.pulses:
+        command = [sys.executable, __file__, str(arguments.stand), "--pulses", str(n), "--one"]
+        found = subprocess.run(command, check=True, capture_output=True, text=True)
+        row = json.loads(found.stdout.splitlines()[-1])
+        print(
+            f"{n:8d}{row['wall_s']:8.1f}{row['cpu_s']:8.1f}{row['before_mb']:11.0f}"
+            f"{row['peak_mb']:9.0f}{row['chi_square_per_moment']:13.2f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

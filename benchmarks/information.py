@@ -1,0 +1,181 @@
+"""How well pulses tell the current amplitude, and how well the fit uses them.
+
+Run with ``python benchmarks/information.py STAND --pulses 3300``; STAND has many full-energy
+pulses on both sides, and the truth.  It is parted into sets of so many pulses, each is fitted
+by the moments alone and by optimal weights, and the shift of the translated current amplitude
+of the double-escape peak from the truth is given for each.  Beside them stands a bound: the
+Fisher information of the best function of a pulse that a small network finds (Charnock et al.,
+Phys. Rev. D 97 (2018) 083004), on pulses that it has not seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cpunet.electronics.finishing import finish
+from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.noise import measured_noise
+from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import current_amplitude
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.preparation import prepare
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.recipes import load_recipe
+from cpunet.training import matching
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
+from cpunet.training.moments import Moments, Readings
+from cpunet.training.optimal_weights import refine
+from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from cpunet.training.translated import Noise, Translated
+
+RECIPE = load_recipe("fast")
+CONFIG, TRAINING = RECIPE.matching
+
+
+def judged(stand: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated windows of the double-escape peak, and their true current amplitudes."""
+    sim = open_pulses(stand / "sim.lh5").read()
+    truth = np.load(stand / "truth.npz")
+    prepared = prepare(sim, RECIPE.preparation, "simulated")
+    rows = np.flatnonzero(truth["label"][prepared.index] == 0)[:1000]
+    traces = truth["response"][prepared.index[rows]].astype(np.float32)
+    windows = finish(traces, RECIPE.preparation, dt_ns=sim.dt_ns)
+    return prepared.pulses.waveforms[rows], current_amplitude(windows)
+
+
+def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray) -> float:
+    """Median relative error of the translated current amplitude in percent."""
+    with torch.no_grad():
+        records = response(torch.from_numpy(windows)).numpy()
+    found = finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns))
+    return 100 * float(np.nanmedian(np.log(current_amplitude(found) / wanted)))
+
+
+def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
+    moments = Moments.of_data(data.waveforms, TRAINING, RECIPE.preparation)
+    length = record_length(sim.waveforms.shape[1])
+    drawn = Noise.draw(noise, sim.energy_kev, length, TRAINING.noise_sets, rng)
+    return Band("FEP", Translated(sim.waveforms, drawn, moments, np.ones(len(sim))))
+
+
+def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:
+    """What is read of each pulse, as a network takes it."""
+    seen: list[Readings] = []
+    with torch.no_grad():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # in the order of the pulses
+        band.sim.sums(
+            response, lambda r: (seen.append(r), (np.zeros(1),))[1], cut=False, draws=1
+        )
+        torch.set_num_threads(threads)
+    linear = np.clip(np.concatenate([r.linear for r in seen]), -4, 4)
+    logs = np.concatenate([r.log_amplitude for r in seen])
+    middle, top = np.median(logs), np.quantile(logs, 0.9)
+    near = np.clip((logs - top) / 0.01, -6, 6)
+    wide = (logs - middle) / logs.std()
+    return torch.from_numpy(np.column_stack([linear, wide, near])).float()
+
+
+def bound(
+    band: Band, response: ElectronicsResponse, direction: np.ndarray, pairs: float
+) -> float:
+    """Error of the shift, in percent, of the best function that a network finds."""
+    parameters = Parameters(response)
+    vector, shifted = parameters.vector(), []
+    for i, step in enumerate(parameters.steps):
+        ends = []
+        for sign in (1, -1):
+            moved = vector.copy()
+            moved[i] += sign * step
+            parameters.set(moved)
+            ends.append(readings(band, response))
+        shifted.append((ends[0], ends[1], 2 * step))
+    parameters.set(vector)
+    here = readings(band, response)
+    width, n = here.shape[1], len(parameters.labels)
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(
+        torch.nn.Linear(width, 64), torch.nn.SiLU(), torch.nn.Linear(64, 64), torch.nn.SiLU(),
+        torch.nn.Linear(64, n),
+    )  # fmt: skip
+    straight = torch.nn.Linear(width, n)
+    prior = torch.diag(torch.from_numpy(parameters.widths**-2.0))
+    wanted = torch.from_numpy(direction)
+
+    def error(rows: torch.Tensor) -> torch.Tensor:
+        def of(values: torch.Tensor) -> torch.Tensor:
+            return net(values[rows]) + straight(values[rows])
+
+        slopes = torch.stack([(of(a) - of(b)).mean(0) / d for a, b, d in shifted], dim=1)
+        spread = torch.cov(of(here).T) + 1e-4 * torch.eye(n)
+        told = (slopes.T @ torch.linalg.solve(spread, slopes)).double()
+        return (wanted @ torch.linalg.solve(told * pairs + prior, wanted)).sqrt()
+
+    learned, held = torch.arange(len(here)).split([len(here) // 2, len(here) - len(here) // 2])
+    optimiser = torch.optim.Adam([*net.parameters(), *straight.parameters()], lr=2e-3)
+    best = float("inf")
+    for step in range(400):
+        loss = error(learned[torch.randperm(len(learned))[:1500]]).log()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        if step % 50 == 49:
+            with torch.no_grad():
+                best = min(best, 100 * float(error(held)))
+    return best
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("stand", type=Path)
+    parser.add_argument("--pulses", type=int, default=3300)
+    parser.add_argument("--sets", type=int, default=5)
+    arguments = parser.parse_args()
+    files = [InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
+    selection = parse_selection("FEP", RECIPE.peaks)
+    sim = load_simulated(files[0], RECIPE, selection, Monitor()).prepared.pulses
+    data = load_measured(files[1], RECIPE, selection, Monitor()).prepared.pulses
+    noise, _ = measured_noise(files[1], data, RECIPE.preparation)
+    windows, wanted = judged(arguments.stand)
+    start, _ = matching.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
+    state = {name: value.clone() for name, value in start.state_dict().items()}
+    shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
+    n = arguments.pulses
+    for k in range(min(arguments.sets, len(sim) // n, len(data) // n)):
+        rows = slice(k * n, (k + 1) * n)
+        response = ElectronicsResponse(CONFIG, sim.dt_ns)
+        response.load_state_dict(state)
+        band = band_of(sim[rows], data[rows], noise, np.random.default_rng(k))
+        problem = ResponseProblem(response, [band])
+        levenberg_marquardt(problem, 20, None, coarse=False)
+        shifts["moments"].append(shift(response, windows, wanted))
+        for _ in range(matching.ROUNDS):
+            refine(problem, [band], TRAINING.conditional_bins)
+        shifts["weighted"].append(shift(response, windows, wanted))
+        print(
+            k, *(f"{name} {values[-1]:+.3f} %" for name, values in shifts.items()), flush=True
+        )
+    for name, values in shifts.items():
+        print(f"{name}: mean {np.mean(values):+.3f}, spread {np.std(values, ddof=1):.3f} %")
+    parameters = Parameters(start)
+    vector, here = parameters.vector(), shift(start, windows, wanted)
+    direction = []
+    for i, step in enumerate(parameters.steps):
+        moved = vector.copy()
+        moved[i] += step
+        parameters.set(moved)
+        direction.append((shift(start, windows, wanted) - here) / (100 * step))
+    parameters.set(vector)
+    many = min(len(sim), len(data), 10_000)
+    band = band_of(sim[:many], data[:many], noise, np.random.default_rng(0))
+    print(f"bound: {bound(band, start, np.array(direction), n / 2):.3f} %")
+
+
+if __name__ == "__main__":
+    main()

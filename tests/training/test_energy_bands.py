@@ -1,0 +1,92 @@
+"""Which pulses of two sets are compared, and with which weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.recipes import load_recipe
+from cpunet.training.energy_bands import HEAVIEST, LEAST, WIDEST, EnergyBand, energy_bands
+
+PEAKS = load_recipe("fast").peaks
+FEP = PEAKS["FEP"].energy_kev
+
+
+def continuum(n: int, low: float, high: float, power: float, seed: int) -> np.ndarray:
+    uniform = np.random.default_rng(seed).random(n)
+    return low + (high - low) * uniform**power
+
+
+def test_lines_and_continua_are_kept_apart() -> None:
+    sim = np.r_[np.full(300, FEP), continuum(3000, 1000, 1580, 1, 1)]
+    data = np.r_[continuum(2000, 1000, 1580, 1, 2), np.full(500, FEP + 1)]
+    fep, *others = energy_bands(sim, data, PEAKS)
+    assert fep.name == "FEP"
+    np.testing.assert_array_equal(fep.sim, np.arange(300))
+    np.testing.assert_array_equal(fep.data, np.arange(2000, 2500))
+    np.testing.assert_array_equal(fep.weights, 1)
+    assert len(others) == 2
+    assert sum(len(band.sim) for band in others) == pytest.approx(3000, abs=5)
+
+
+def test_a_line_with_few_pulses_is_part_of_its_continuum() -> None:
+    kev = np.sort(np.r_[continuum(4000, 1500, 1700, 1, 3), np.full(LEAST - 50, 1592.5)])
+    bands = energy_bands(kev, kev, PEAKS)
+    assert [band.name for band in bands] != ["DEP"]
+
+
+def test_spectra_are_made_alike_within_a_band() -> None:
+    sim, data = continuum(20_000, 1000, 1290, 1, 4), continuum(20_000, 1000, 1290, 2, 5)
+    (band,) = energy_bands(sim, data, {})
+    assert band.weights.mean() == pytest.approx(1)
+    plain = sim[band.sim].mean() - data[band.data].mean()
+    weighted = np.average(sim[band.sim], weights=band.weights) - data[band.data].mean()
+    assert abs(weighted) < 0.05 * abs(plain)
+
+
+@settings(max_examples=25)
+@given(
+    low=st.floats(100, 1500),
+    ratio=st.floats(1.01, 4),
+    n=st.integers(LEAST, 4000),
+    share=st.floats(0.3, 3),
+    seed=st.integers(0, 99),
+)
+def test_no_pulse_is_in_two_bands_and_none_is_far_from_its_own(
+    low: float, ratio: float, n: int, share: float, seed: int
+) -> None:
+    sim = continuum(n, low, low * ratio, 1, seed)
+    data = continuum(max(LEAST, int(share * n)), low, low * ratio, 1.5, seed + 1)
+    try:
+        bands = energy_bands(sim, data, {})
+    except CpunetError:
+        assert n < 20 * LEAST  # thinly spread
+        return
+    for side, rows in ((sim, [b.sim for b in bands]), (data, [b.data for b in bands])):
+        together = np.concatenate(rows)
+        assert len(np.unique(together)) == len(together)
+        for of_band in rows:
+            assert len(of_band) >= LEAST
+            # but for a rest of the lowest energies, that goes along
+            narrow = side[of_band] >= side[of_band].max() / (WIDEST + 0.01)
+            assert narrow.sum() >= len(of_band) - 2 * LEAST
+    for band in bands:
+        assert band.weights.shape == band.sim.shape
+        assert band.weights.min() >= 0
+        assert band.weights.max() <= HEAVIEST / 0.1
+
+
+def test_spectra_that_do_not_overlap_are_refused() -> None:
+    with pytest.raises(
+        CpunetError, match=r"^900 simulated and 800 measured pulses; 200 of each"
+    ):
+        energy_bands(continuum(900, 300, 500, 1, 1), continuum(800, 900, 1500, 1, 2), PEAKS)
+
+
+def test_a_band_is_named_by_its_energies() -> None:
+    (band,) = energy_bands(np.linspace(1000, 1200, 500), np.linspace(1000, 1200, 400), {})
+    assert isinstance(band, EnergyBand)
+    assert band.name == "1000-1200 keV"

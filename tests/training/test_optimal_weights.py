@@ -1,0 +1,116 @@
+"""Optimally weighted functions: what they find, and what they leave alone."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.finishing import finish
+from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.pulses.container import FloatArray
+from cpunet.recipes import load_recipe
+from cpunet.training.misfit import amplitude_shift
+from cpunet.training.moments import Moments
+from cpunet.training.optimal_weights import ConditionalFunctions, refine
+from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.translated import Noise, Translated
+
+DT_NS, KEV, N = 16.0, 2614.5, 800
+RECIPE = load_recipe(
+    "fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]", "training.components=8",
+             "training.squares=4", "training.amplitude_bins=8"]
+)  # fmt: skip
+CONFIG, TRAINING = RECIPE.matching
+WHITE = BaselineNoise(np.full(4097, (6e-4 * KEV) ** 2), 8192, DT_NS, 100)
+
+
+def charge(seed: int) -> FloatArray:
+    """Prepared pulses of one or two sites, each a drift and a steep end."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(800, dtype=float)
+
+    def site() -> np.ndarray:
+        drift = rng.uniform(20, 60, (N, 1))
+        since = time - 400 + drift - rng.uniform(0, 1, (N, 1))
+        return 0.4 * np.clip(since / drift, 0, 1) ** 2 + 0.6 * np.clip(
+            (since - drift) / 3 + 1, 0, 1
+        )
+
+    share = np.where(rng.random((N, 1)) < 0.4, 1.0, rng.uniform(0.2, 0.8, (N, 1)))
+    return np.float32(share * site() + (1 - share) * site())
+
+
+def response(poles_ns: tuple[float, float], slow: float) -> ElectronicsResponse:
+    made = ElectronicsResponse(CONFIG, DT_NS)
+    made.log_poles_ns.data.copy_(torch.tensor(poles_ns, dtype=torch.float64).log())
+    made.log_decay_us.data.fill_(float(np.log(80.0)))
+    made.slow_weights.data.fill_(slow)
+    return made
+
+
+@pytest.fixture(scope="module")
+def band() -> Band:
+    """Pulses behind poles of 60 and 40 ns, and others to be translated."""
+    with torch.no_grad():
+        records = response((60.0, 40.0), 0.05)(torch.from_numpy(charge(1))).numpy()
+    energies = np.full(N, KEV)
+    data = finish(
+        records, RECIPE.preparation, dt_ns=DT_NS, noise=WHITE, energy_kev=energies, seed=3
+    )
+    moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
+    noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
+    return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)))
+
+
+def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
+    near = ResponseProblem(response((63.0, 39.0), 0.045), [band])
+    covariance = refine(near, [band], 6)
+    covariance = refine(near, [band], 6)
+    errors = np.sqrt(covariance.diagonal())
+    truth = np.array([np.log(60), np.log(40), np.log(80), 0.05])
+    found = near.parameters.vector()
+    assert near.parameters.labels[:3] == ["log_poles_ns", "log_poles_ns", "log_decay_us"]
+    assert (np.abs(found - truth) < 4 * errors).all()
+    # together the poles are known far better than one by one
+    together = np.array([0.6, 0.4, 0, 0])
+    assert np.sqrt(together @ covariance @ together) < 0.003
+    assert abs(together @ (found - truth)) < 0.01
+
+
+def test_two_equal_poles_stay_equal(band: Band) -> None:
+    """By how much they differ is hardly told, and not followed into nonsense."""
+    near = ResponseProblem(response((49.0, 48.9), 0.05), [band])
+    refine(near, [band], 6)
+    poles = near.response.log_poles_ns.detach().exp().numpy()
+    assert np.abs(np.diff(poles)).max() < 12
+
+
+def test_the_amplitude_is_right_after_it_and_wrong_before(band: Band) -> None:
+    off = response((66.0, 44.0), 0.05)
+    shift, error = amplitude_shift(off, [band])
+    assert shift > 5 * error  # a slower chain has lower currents than the data
+    near = ResponseProblem(copy.deepcopy(off), [band])
+    refine(near, [band], 6)
+    refine(near, [band], 6)
+    shift, error = amplitude_shift(near.response, [band])
+    assert abs(shift) < 3 * error
+
+
+def test_functions_are_components_in_bins_of_the_amplitude(band: Band) -> None:
+    functions = ConditionalFunctions.of(band.moments, 5)
+    readings = band.moments.data[slice(0, 7)]
+    values = functions(readings)
+    bins = len(functions.centres)
+    plain = band.moments.functions(readings)
+    assert values.shape == (7, plain.shape[1] + bins + bins * TRAINING.components)
+    np.testing.assert_array_equal(values[:, : plain.shape[1]], plain)
+    weights = values[:, plain.shape[1] : plain.shape[1] + bins]
+    first = len(TRAINING.segments) - 1
+    products = values[:, plain.shape[1] + bins :].reshape(7, TRAINING.components, bins)
+    expected = plain[:, first : first + TRAINING.components, np.newaxis] * weights[:, None]
+    np.testing.assert_allclose(products, expected)
+    assert (np.diff(functions.centres) > 0).all()
