@@ -39,7 +39,7 @@ def test_a_line_with_few_pulses_is_part_of_its_continuum() -> None:
 
 
 def test_spectra_are_made_alike_within_a_band() -> None:
-    sim, data = continuum(20_000, 1000, 1290, 1, 4), continuum(20_000, 1000, 1290, 2, 5)
+    sim, data = continuum(20_000, 1000, 1290, 1, 4), continuum(20_000, 1000, 1290, 1.4, 5)
     (band,) = energy_bands(sim, data, {})
     assert band.weights.mean() == pytest.approx(1)
     plain = sim[band.sim].mean() - data[band.data].mean()
