@@ -13,8 +13,10 @@ import numpy as np
 
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.training.moments import Readings, Values
+from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.response_problem import Band
 
+BINS = 32  # of the logarithm of the amplitude
 STEP = 0.002  # of the logarithm of the amplitude, for the derivative
 
 
@@ -35,23 +37,24 @@ def amplitude_shift(
     """
     weight = weighted = 0.0
     for band in bands:
-        bins = band.moments.config.amplitude_bins
-        density, slope = _density(band, response)
-        values = band.moments.values[:, -bins:]
-        inverse = np.linalg.inv(np.cov(values.T) / band.pairs + 1e-12 * np.eye(bins))
+        functions = ConditionalFunctions.of(band.moments, BINS)
+        density, slope = _density(band, functions, response)
+        values = functions.density(band.moments.data.log_amplitude)
+        inverse = np.linalg.inv(np.cov(values.T) / band.pairs + 1e-12 * np.eye(len(slope)))
         weight += float(slope @ inverse @ slope)
         weighted += float(slope @ inverse @ (values.mean(axis=0) - density))
     return weighted / weight, weight**-0.5
 
 
-def _density(band: Band, response: ElectronicsResponse) -> tuple[Values, Values]:
+def _density(
+    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
+) -> tuple[Values, Values]:
     """Mean densities of translated amplitudes, and their derivatives with a shift."""
-    moments = band.moments
 
     def of(readings: Readings) -> tuple[Values, ...]:
         logs = readings.log_amplitude
         return tuple(
-            readings.weights @ moments.density(logs + shift) for shift in (0.0, STEP, -STEP)
+            readings.weights @ functions.density(logs + shift) for shift in (0.0, STEP, -STEP)
         )
 
     (here, up, down), n = band.sim.sums(response, of)

@@ -214,13 +214,9 @@ class Moments:
         linear = np.clip(readings.linear, -limit, limit)
         first = len(self.config.segments) - 1
         squared = [linear[:, first : first + self.config.squares], linear[:, -1:]]
-        density = self.density(readings.log_amplitude)
+        distance = readings.log_amplitude[:, np.newaxis] - self.amplitude_centres
+        density = np.exp(-0.5 * (distance / self.amplitude_widths) ** 2)
         return np.concatenate([linear, np.concatenate(squared, axis=1) ** 2, density], axis=1)
-
-    def density(self, log_amplitude: Values) -> Values:
-        """Bins of the logarithm of the current amplitude, shape (pulses, bins)."""
-        distance = log_amplitude[:, np.newaxis] - self.amplitude_centres
-        return np.asarray(np.exp(-0.5 * (distance / self.amplitude_widths) ** 2))
 
     @property
     def model_errors(self) -> Values:

@@ -60,10 +60,14 @@ class ConditionalFunctions:
         values = self.moments.functions(readings)
         first = len(self.moments.config.segments) - 1
         components = values[:, first : first + self.moments.config.components]
-        distance = (readings.log_amplitude[:, np.newaxis] - self.centres) / self.widths
-        bins = np.exp(-0.5 * distance**2)
+        bins = self.density(readings.log_amplitude)
         both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
         return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
+
+    def density(self, log_amplitude: Values) -> Values:
+        """Bins of the current amplitude, shape (pulses, bins)."""
+        distance = (log_amplitude[:, np.newaxis] - self.centres) / self.widths
+        return np.asarray(np.exp(-0.5 * distance**2))
 
 
 def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
