@@ -17,11 +17,12 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.hit_sources import GammaSource, HitFile, OpenHits, Window, energy_windows
 from cpunet.jobs.inputs import InputFile, load_simulated
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.simulate import Resolution, merge_hits, simulate_file
+from cpunet.jobs.simulate import Resolution, simulate_file
 from cpunet.jobs.simulation_settings import load_settings
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
+from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import Transform, read_hits

@@ -29,7 +29,11 @@ DetectorFile = Annotated[
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+    typer.Option(
+        "--set",
+        help="Override a value of the detector or the settings: --set bias_V=3500 "
+        "(repeatable).",
+    ),
 ]
 Temperature = Annotated[
     float | None, typer.Option("--temperature", help="Of the crystal in K; the detector's own.")
@@ -205,7 +209,7 @@ def simulate(
     """
     from cpunet.jobs.hit_sources import GammaSource, HitFile, energy_windows
     from cpunet.jobs.simulate import simulate_file
-    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.jobs.simulation_settings import load_settings, split_overrides
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.hit_readers import Transform
@@ -228,10 +232,10 @@ def simulate(
     else:
         chosen, wanted = parse_events(str(events), peak, peaks, window_kev)
         source = GammaSource(tuple(chosen), wanted, source_height_mm, source_radius_mm, seed)
-    overrides = [*(set_values or ())]
+    overrides, set_settings = split_overrides(set_values or ())
     if temperature is not None:
         overrides.append(f"temperature_K={temperature}")
-    values = {
+    options_given = {
         "dt_ns": dt,
         "length_ns": length,
         "diffusion": diffusion,
@@ -239,6 +243,7 @@ def simulate(
         "cloud_fwhm_mm": cloud_fwhm_mm,
         "self_repulsion": self_repulsion,
     }
+    values = set_settings | {k: v for k, v in options_given.items() if v is not None}
     summary = simulate_file(
         read_detector(detector, overrides, crystal),
         source,
@@ -273,6 +278,8 @@ def summary_lines(summary: Summary) -> list[str]:
         f"{summary.mode} pulses, {summary.n_events / seconds:.0f} events/s, "
         f"{seconds:.1f} s: {spent}",
     ]
+    if summary.trapped_kev:
+        told.insert(3, f"{summary.trapped_kev / summary.energy_kev:.2%} of the energy trapped")
     if summary.not_collected:
         told.insert(3, f"{summary.not_collected} hits not collected in full; lengthen --length")
     return told

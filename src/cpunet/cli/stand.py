@@ -41,6 +41,23 @@ Events = Annotated[
 KindOption = Annotated[
     Kind, typer.Option("--kind", help="shifted: the data's detector differs a little.")
 ]
+ShiftParts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--shift",
+        help="By what a shifted stand's data differ, instead of the default: "
+        "temperature_K=1.5, or a YAML file of keys (repeatable).",
+    ),
+]
+SetValues = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", help="Override a value of the detector or of the settings (repeatable)."
+    ),
+]
+SettingsFile = Annotated[
+    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
+]
 WindowKev = Annotated[float, typer.Option(help="Half-width about a peak.")]
 
 
@@ -50,6 +67,10 @@ def stand(
     detector: DetectorFile = "icpc",
     events: Events = "FEP=4000,SEP=1500,DEP=1500",
     kind: KindOption = Kind.matched,
+    shift: ShiftParts = None,
+    set_values: SetValues = None,
+    settings_file: SettingsFile = None,
+    crystal: options.Crystal = None,
     window_kev: WindowKev = 0.5,
     seed: options.Seed = 0,
     force: options.Force = False,
@@ -57,22 +78,29 @@ def stand(
     """Make a test stand: simulated pulses, raw traces of other events, and the truth.
 
     Example: cpunet stand --preset legend200 --out stand
+
+    Example: cpunet stand --preset ornl --kind shifted --shift bias_V=20 --out stand2
     """
     from cpunet.electronics.presets import read_electronics
     from cpunet.jobs.hit_sources import energy_windows
+    from cpunet.jobs.simulation_settings import load_settings, split_overrides
     from cpunet.jobs.stand import make_stand
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.shifted import Shift
 
     refuse_inputs(out_folder, preset, detector)
     names, numbers = wanted_events(events)
+    overrides, values = split_overrides(set_values or ())
     summary = make_stand(
         read_electronics(preset),
-        read_detector(detector),
+        read_detector(detector, overrides, crystal),
         tuple(energy_windows(",".join(names), load_recipe("small").peaks, window_kev)),
         numbers,
         out_folder,
         kind=kind.value,
+        shift=Shift.of(shift) if shift else None,
+        settings=load_settings(settings_file, values),
         seed=seed,
         force=force,
         monitor=monitor(),

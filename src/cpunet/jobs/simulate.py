@@ -18,7 +18,7 @@ from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.jobs.simulation_summary import Clock, Summary
 from cpunet.outputs import refuse_inputs
 from cpunet.pulses.writing import PulseWriter
-from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.clustering import cluster_hits, merge_hits
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields, scaled_to_depletion
 from cpunet.simulation.gammas import with_resolution
@@ -72,8 +72,9 @@ def simulate_file(
 
     The table ``geds/sim`` is what `cpunet.jobs.train.train_run` reads: ``waveform`` in
     units of the collected charge, ``energy`` (keV) collected, ``event_number``; beside
-    them ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, and with a
-    resolution ``true_energy``.  Its attribute ``simulation`` tells in JSON how the file
+    them ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, with trapping
+    ``trapped_energy`` (keV, deposited elsewhere but not collected) and with a resolution
+    ``true_energy``.  Its attribute ``simulation`` tells in JSON how the file
     was made.  ``geds/hits`` holds the hits of the pulses, in the crystal's frame.
 
     Parameters
@@ -133,7 +134,7 @@ def simulate_file(
             events = _simulate(fields, block, settings, library, advance)
             clock.lap("pulses")
             summary.add(detector, block, events, windows)
-            _append(writer, block, events, resolution, seed)
+            _append(writer, block, events, settings, resolution, seed)
             clock.lap("writing")
         if not writer.n_pulses:
             raise CpunetError(
@@ -190,26 +191,6 @@ def _merged(
         yield merge_hits(block, detector, distance_mm)
 
 
-def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
-    """Merge near hits (see `cluster_hits`), but none across the edge of the active germanium.
-
-    A hit in the lithium layer gives no signal; merged with its neighbours in the bulk it
-    would, or take theirs away: at 0.1 mm that changed the collected energy of a gamma's
-    event by 4.5 keV on average.
-    """
-    if distance_mm == 0:
-        return hits
-    active = detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
-    parts = cluster_hits(hits.where(active), distance_mm), hits.where(~active)
-    order = np.argsort(np.concatenate([part.event_of_hit for part in parts]), kind="stable")
-    return Hits.of(
-        np.concatenate([part.position_mm for part in parts])[order],
-        np.concatenate([part.edep_kev for part in parts])[order],
-        parts[0].offsets + parts[1].offsets,
-        hits.event_number,
-    )
-
-
 def _simulate(
     fields: FieldMaps,
     hits: Hits,
@@ -237,6 +218,7 @@ def _append(
     writer: PulseWriter,
     hits: Hits,
     events: EventPulses,
+    settings: SimulationSettings,
     resolution: Resolution | None,
     seed: int,
 ) -> None:
@@ -246,6 +228,8 @@ def _append(
         "lost_energy": (events.lost_kev[kept], "keV"),
         "n_hits": (np.diff(hits.offsets)[kept], ""),
     }
+    if any(settings.trapping_per_ns):
+        columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
     if resolution is not None:
         columns["true_energy"] = (pulses.energy_kev, "keV")
         # each block draws anew, from where in the file it begins

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
@@ -47,6 +48,33 @@ def load_settings(
             message = f"no such setting; there are {', '.join(SimulationSettings.model_fields)}"
         where = "settings" if path is None else str(path)
         raise CpunetError(f"{where}: {f'{key}: ' if key else ''}{message}") from error
+
+
+def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]]:
+    """Of ``KEY=VALUE`` words, those of the detector, and values of settings by their key.
+
+    Raises
+    ------
+    CpunetError
+        If a setting's value is no plain one.
+
+    Examples
+    --------
+    >>> split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
+    (['bias_V=3500'], {'hole_trapping_per_us': 0.01})
+    """
+    detector: list[str] = []
+    settings: dict[str, Any] = {}
+    for word in overrides:
+        key, equals, value = word.partition("=")
+        if not equals or key.strip() not in SimulationSettings.model_fields:
+            detector.append(word)
+            continue
+        try:
+            settings[key.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise CpunetError(f"settings: {word!r} has no plain value") from error
+    return detector, settings
 
 
 def _mapping(path: Path) -> dict[str, Any]:

@@ -33,6 +33,7 @@ class Summary:
     not_collected: int = 0
     energy_kev: float = 0.0
     lost_kev: float = 0.0
+    trapped_kev: float = 0.0
     events_with_loss: int = 0
     lines: Counter[str] = field(default_factory=Counter)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -62,6 +63,7 @@ class Summary:
         self.not_collected += events.counts["hits not collected within the record"]
         self.energy_kev += float(events.energy_kev.sum())
         self.lost_kev += float(events.lost_kev.sum())
+        self.trapped_kev += float(events.trapped_kev.sum())
         self.events_with_loss += int((events.lost_kev > 0).sum())
         for window in windows:
             within = (collected >= window.low_kev) & (collected <= window.high_kev)

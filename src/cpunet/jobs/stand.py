@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +20,17 @@ from cpunet.files import folder_written_aside
 from cpunet.jobs.growing_archive import GrowingArchive
 from cpunet.jobs.hit_sources import Window
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.stand_plan import LABELS, OTHER, Kind, Labels, StandPlan
+from cpunet.jobs.stand_plan import CLUSTER_MM, LABELS, OTHER, Kind, Labels, Side, StandPlan
 from cpunet.outputs import FolderKind
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hit_readers.hit_table import hit_columns
 from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.shifted import Shift
 
 QUIET = Monitor()
 MARKER = "stand.json"
@@ -60,6 +64,8 @@ def make_stand(
     out: Path,
     *,
     kind: Kind = "matched",
+    shift: Shift | None = None,
+    settings: SimulationSettings | None = None,
     height_mm: float = 20.0,
     radius_mm: float = 5.0,
     seed: int = 0,
@@ -69,10 +75,12 @@ def make_stand(
     """Make a stand of two independent sets of Tl-208 events.
 
     The folder holds ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
-    digitiser's period), ``data.lh5`` (``geds/raw``: raw traces of other events),
-    ``truth.npz`` (``response``: the noise-free trace of each pulse of ``sim.lh5`` in units
-    of the full charge, beginning after ``n_pre`` samples; ``label``: 0 DEP, 1 SEP,
-    2 FEP, 3 other, by collected energy), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
+    digitiser's period; ``geds/hits``: their hits; the attribute ``simulation`` of the
+    former: detector and settings, as `cpunet.jobs.simulate` keeps them), ``data.lh5``
+    (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the noise-free
+    trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
+    ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
+    included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
     baseline, 2 pile-up, 4 saturated) and ``stand.json``, which tells how it was made.
 
     Parameters
@@ -80,14 +88,18 @@ def make_stand(
     electronics
         The chain of the data, and of the truth.
     detector
-        As simulated; of a ``"shifted"`` stand the data's differs by `Shift.default`, while
-        the truth remains the chain's response to the simulated pulses.
+        As simulated; of a ``"shifted"`` stand the data's differs by `shift`,
+        while the truth remains the chain's response to the simulated pulses.
     windows, events
         Windows of deposited energy, and the events wanted in each, for either side.
     out
         The folder; it appears when all is done.
     kind
         ``"matched"`` or ``"shifted"``.
+    shift
+        Of a ``"shifted"`` stand; `Shift.default` if None.
+    settings
+        Of the simulated pulses, but for the period; the data's differ by the shift.
     height_mm, radius_mm
         Of the source, a disc above the crystal.
     seed
@@ -107,6 +119,8 @@ def make_stand(
         windows,
         events,
         kind=kind,
+        shift=shift,
+        settings=settings,
         height_mm=height_mm,
         radius_mm=radius_mm,
         seed=seed,
@@ -145,10 +159,12 @@ def _write_sim(
     writer = PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated"))
     with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
         with writer:
-            for fine, label in side.blocks("Simulated events", library, monitor):
+            for fine, label, hits in side.blocks("Simulated events", library, monitor):
                 writer.append(_block_means(fine, per_sample))
+                writer.append_rows(HIT_TABLE, hit_columns(hits))
                 truth.append(respond(fine, electronics))
                 labels.append(label)
+            writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
         label = np.concatenate(labels)
         truth.close(label=label, n_pre=np.array(electronics.n_pre))
     summary.n_sim = len(label)
@@ -170,7 +186,7 @@ def _write_data(
         folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
     )
     with writer:
-        for fine, label in plan.data.blocks("Measured events", library, monitor):
+        for fine, label, _ in plan.data.blocks("Measured events", library, monitor):
             block_seed = np.random.SeedSequence(
                 (plan.readout_seed, writer.n_pulses)
             ).generate_state(1)
@@ -190,6 +206,17 @@ def _write_data(
     summary.data_lines = _by_line(label)
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         summary.flags[name] = int((flag & bit > 0).sum())
+
+
+def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
+    """How the pulses of a side were made; those of `dt_ns` are means of the fine ones."""
+    return {
+        "cpunet": cpunet.__version__,
+        "detector": side.detector.model_dump(mode="json"),
+        "settings": side.settings.model_dump(mode="json") | {"dt_ns": dt_ns},
+        "hits": side.source.provenance(),
+        "cluster_mm": CLUSTER_MM,
+    }
 
 
 def _block_means(pulses: Pulses, per_sample: int) -> Pulses:

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
 from cpunet.electronics.chain import Electronics
-from cpunet.electronics.shifted import Shift
 from cpunet.errors import CpunetError
 from cpunet.jobs.hit_sources import GammaSource, Window
 from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.simulate import merge_hits
 from cpunet.pulses.container import Pulses
+from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.shifted import Shift
 
 Kind = Literal["matched", "shifted"]
 Labels = npt.NDArray[np.int64]
@@ -31,7 +33,7 @@ OTHER = 3
 # Period of the simulated pulses that pass the chain; at 4 ns they are those of the library.
 _FINE_NS = 4.0
 # As `cpunet simulate` merges hits.
-_CLUSTER_MM = 0.05
+CLUSTER_MM = 0.05
 
 
 @dataclass(frozen=True)
@@ -49,20 +51,29 @@ class Side:
 
     def blocks(
         self, title: str, library: Library | None, monitor: Monitor
-    ) -> Iterator[tuple[Pulses, Labels]]:
-        """Its pulses, finely sampled, and their lines, block by block."""
+    ) -> Iterator[tuple[Pulses, Labels, Hits]]:
+        """Its pulses, finely sampled, their lines and their hits, block by block.
+
+        The energies are calibrated, as a measurement's are: where charge is trapped, a
+        factor brings the median of the first block to what it was before.
+        """
         with monitor.stage(f"Fields of {self.detector.name}"):
             fields = compute_fields(self.detector)
         mode: Literal["exact", "library"] = "exact" if library is None else "library"
         opened = self.source.open(self.detector)
+        gain = 0.0
         with monitor.stage(title, opened.n_events) as advance:
             for hits in opened.blocks:
-                merged = merge_hits(hits, self.detector, _CLUSTER_MM)
-                pulses = simulate_events(
-                    fields, merged, self.settings, mode, library=library
-                ).pulses()
+                merged = merge_hits(hits, self.detector, CLUSTER_MM)
+                events = simulate_events(fields, merged, self.settings, mode, library=library)
+                kept = events.collected_kev > 0
+                pulses = events.pulses()
                 if len(pulses):
-                    yield pulses, labels_of(pulses.energy_kev, self.source.windows)
+                    untrapped = pulses.energy_kev + events.trapped_kev[kept]
+                    gain = gain or float(np.median(untrapped / pulses.energy_kev))
+                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
+                    labels = labels_of(untrapped, self.source.windows)
+                    yield calibrated, labels, merged[kept]
                 advance(len(hits))
 
 
@@ -101,6 +112,8 @@ class StandPlan:
         events: tuple[int, ...],
         *,
         kind: Kind = "matched",
+        shift: Shift | None = None,
+        settings: SimulationSettings | None = None,
         height_mm: float = 20.0,
         radius_mm: float = 5.0,
         seed: int = 0,
@@ -110,14 +123,17 @@ class StandPlan:
         Raises
         ------
         CpunetError
-            If a window has no events, the chain's period is no multiple of the pulses', or
-            there can be no detector shifted so.
+            If a window has no events, the chain's period is no multiple of the pulses', the
+            settings give a period, or there can be no detector shifted so.
         """
         for window, number in zip(windows, events, strict=True):
             if number < 1:
                 raise CpunetError(f"--events {window.name}={number}: give at least 1 event")
-        settings = SimulationSettings(dt_ns=_fine_ns(electronics))
-        shift = Shift.default() if kind == "shifted" else None
+        settings = _finely_sampled(settings or SimulationSettings(), electronics)
+        if kind == "shifted":
+            shift = shift or Shift.default()
+        elif shift is not None:
+            raise CpunetError("--shift: a matched stand has none; give --kind shifted")
         # seeds of the events of both sides and of the readout's blocks
         sim_seed, data_seed, readout_seed = map(
             int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
@@ -160,6 +176,24 @@ def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) 
         inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
         labels[inside] = LABELS.get(window.name, OTHER)
     return labels
+
+
+def _finely_sampled(
+    settings: SimulationSettings, electronics: Electronics
+) -> SimulationSettings:
+    fine = _fine_ns(electronics)
+    if "dt_ns" in settings.model_fields_set and settings.dt_ns != fine:
+        raise CpunetError(
+            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
+            "period; leave dt_ns out"
+        )
+    try:
+        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": fine})
+    except ValidationError as error:
+        raise CpunetError(
+            f"settings: step_ns = {settings.step_ns:g} does not divide the {fine:g} ns of a "
+            "stand's pulses; give one that does"
+        ) from error
 
 
 def _fine_ns(electronics: Electronics) -> float:

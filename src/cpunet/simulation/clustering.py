@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 
 Array = npt.NDArray[np.float64]
@@ -46,6 +47,26 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, distance_mm**2)
     x, y, z, energy = merged.T.copy()
     return Hits(x, y, z, energy, offsets, hits.event_number)
+
+
+def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
+    """Merge near hits (see `cluster_hits`), but none across the edge of the active germanium.
+
+    A hit in the lithium layer gives no signal; merged with its neighbours in the bulk it
+    would, or take theirs away: at 0.1 mm that changed the collected energy of a gamma's
+    event by 4.5 keV on average.
+    """
+    if distance_mm == 0:
+        return hits
+    active = detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
+    parts = cluster_hits(hits.where(active), distance_mm), hits.where(~active)
+    order = np.argsort(np.concatenate([part.event_of_hit for part in parts]), kind="stable")
+    return Hits.of(
+        np.concatenate([part.position_mm for part in parts])[order],
+        np.concatenate([part.edep_kev for part in parts])[order],
+        parts[0].offsets + parts[1].offsets,
+        hits.event_number,
+    )
 
 
 @kernel

@@ -48,7 +48,7 @@ def drift(
     cloud: tuple[float, float, float],
     signal: FloatArray,
     path: FloatArray,
-) -> tuple[int, bool, float, float]:
+) -> tuple[int, bool, float, float, float]:
     """Move one charge until it is collected; add what it induces to `signal`.
 
     Parameters
@@ -65,12 +65,16 @@ def drift(
     Returns
     -------
     tuple
-        Last step, whether the charge was collected, FWHM (mm) and speed (mm/ns) there.
+        Last step, whether the charge was collected, FWHM (mm) and speed (mm/ns) there,
+        and what trapped charge would have added to the signal.
     """
     x, y, z = start
     sign = 1.0 if carrier == HOLE else -1.0
     size, diffusion, repulsion = cloud
-    first = last = speed = 0.0
+    first = last = speed = induced = 0.0
+    rate = maps.trapping_per_ns[carrier]
+    # of the charge, half a step ago
+    left, survival = math.exp(0.5 * rate * step_ns), math.exp(-rate * step_ns)
     n = len(signal)
     k, collected = 0, False
     while k < n:
@@ -82,7 +86,12 @@ def drift(
             collected = True
         if k == 0:
             first = wp
-        signal[k] += sign * (wp - first)
+        if rate == 0.0:
+            induced = sign * (wp - first)
+        elif k > 0:
+            left *= survival
+            induced += sign * (wp - last) * left
+        signal[k] += induced
         if len(path) > 0:
             path[k, 0], path[k, 1], path[k, 2] = x, y, z
         if carrier == HOLE:
@@ -108,10 +117,9 @@ def drift(
         # no charge leaves through the passivated face: it slides along
         x, y, z = x + vx * step_ns, y + vy * step_ns, max(z + vz * step_ns, 0.0)
         k += 1
-    rest = sign * (last - first)
     for later in range(k + 1, n):
-        signal[later] += rest
-    return k, collected, size, speed
+        signal[later] += induced
+    return k, collected, size, speed, sign * (last - first) - induced
 
 
 def drift_paths(
@@ -123,7 +131,7 @@ def drift_paths(
 ) -> DriftPaths:
     """Trajectories of both carriers from each starting point, one position per step."""
     start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
-    maps = drift_maps(fields)
+    maps = drift_maps(fields, settings)
     paths = np.full((2, len(start), settings.n_steps, 3), np.nan)
     _fill_paths(maps, start.reshape(-1, 3), settings.step_ns, paths)
     return DriftPaths(electrons=paths[ELECTRON], holes=paths[HOLE])

@@ -46,6 +46,8 @@ class EventPulses:
     lost_kev
         Part of it in hits without a signal: in a contact or its dead layer, outside the
         crystal, or in germanium without a field.
+    trapped_kev
+        Part of it whose signal is missing since charge was trapped on its way.
     event_number
         The source's own number of each event.
     counts
@@ -56,13 +58,14 @@ class EventPulses:
     dt_ns: float
     energy_kev: FloatArray
     lost_kev: FloatArray
+    trapped_kev: FloatArray
     event_number: npt.NDArray[np.int64]
     counts: dict[str, int]
 
     @property
     def collected_kev(self) -> FloatArray:
         """Energy that gives a signal: what a detector measures."""
-        return self.energy_kev - self.lost_kev
+        return self.energy_kev - self.lost_kev - self.trapped_kev
 
     def pulses(self) -> Pulses:
         """The events with a signal as `Pulses`, with the energy that is collected."""
@@ -108,17 +111,17 @@ def simulate_events(
         library = None
     elif library is None:
         library = build_library(fields, settings, library_progress)
-    maps = drift_maps(fields)
+    maps = drift_maps(fields, settings)
     n = hits.n_events
     waveforms = np.zeros((n, settings.n_samples), np.float32)
-    lost_kev = np.zeros(n)
+    lost_kev, trapped_kev = np.zeros(n), np.zeros(n)
     outcome = np.zeros(len(table), np.int8)
     cloud, times = cloud_numbers(fields, settings), time_numbers(settings)
     for begin in range(0, n, _BLOCK):
         end = min(begin + _BLOCK, n)
         part = slice(begin, end)
         offsets = hits.offsets[begin : end + 1]
-        sums = (waveforms[part], lost_kev[part], outcome)
+        sums = (waveforms[part], lost_kev[part], trapped_kev[part], outcome)
         if library is None:
             _sum_exact(maps, table, offsets, cloud, times, *sums)
         else:
@@ -131,6 +134,7 @@ def simulate_events(
         dt_ns=settings.dt_ns,
         energy_kev=energy,
         lost_kev=lost_kev,
+        trapped_kev=trapped_kev,
         event_number=hits.event_number,
         counts={
             "hits": len(table),
@@ -138,7 +142,7 @@ def simulate_events(
             "hits without signal": int((outcome == _NO_SIGNAL).sum()),
             "hits not collected within the record": int((outcome == _NOT_COLLECTED).sum()),
             "events": n,
-            "events without signal": int((energy - lost_kev <= 0).sum()),
+            "events without signal": int((energy - lost_kev - trapped_kev <= 0).sum()),
         },
     )
 
@@ -149,15 +153,16 @@ def _sum_exact(
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
     cloud: tuple[float, float, float, bool],
-    times: tuple[float, int],
+    times: tuple[float, int, int],
     waveforms: npt.NDArray[np.float32],
     lost_kev: FloatArray,
+    trapped_kev: FloatArray,
     outcome: npt.NDArray[np.int8],
 ) -> None:
     for event in prange(len(offsets) - 1):
         out = np.zeros(waveforms.shape[1])
         signal = np.empty(waveforms.shape[1] * times[1])
-        lost = collected = 0.0
+        lost = collected = trapped = 0.0
         for i in range(offsets[event], offsets[event + 1]):
             hit = hits[i]
             if not in_active_volume(maps, hit[0], hit[1], hit[2]):
@@ -165,10 +170,11 @@ def _sum_exact(
                 lost += hit[3]
                 continue
             collected += hit[3]
-            outcome[i] = _add_drifted(maps, hit, cloud, times, signal, out)
-        lost_kev[event] = lost
-        if collected > 0.0:
-            waveforms[event] = out / collected
+            outcome[i], share = _add_drifted(maps, hit, cloud, times, signal, out)
+            trapped += hit[3] * share
+        lost_kev[event], trapped_kev[event] = lost, trapped
+        if collected > trapped:
+            waveforms[event] = out / (collected - trapped)
 
 
 @kernel(parallel=True)
@@ -178,9 +184,10 @@ def _sum_library(
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
     cloud: tuple[float, float, float, bool],
-    times: tuple[float, int],
+    times: tuple[float, int, int],
     waveforms: npt.NDArray[np.float32],
     lost_kev: FloatArray,
+    trapped_kev: FloatArray,
     outcome: npt.NDArray[np.int8],
 ) -> None:
     n_events, n_samples = waveforms.shape
@@ -194,7 +201,7 @@ def _sum_library(
             out[:] = 0.0
             quick[:] = 0.0
             steps[:] = 0.0
-            lost = collected = 0.0
+            lost = collected = trapped = 0.0
             for i in range(offsets[event], offsets[event + 1]):
                 hit = hits[i]
                 if not in_active_volume(maps, hit[0], hit[1], hit[2]):
@@ -204,12 +211,13 @@ def _sum_library(
                 collected += hit[3]
                 if covers(library, hit[0], hit[1], hit[2], hit[3]):
                     outcome[i] = _INTERPOLATED
-                    add_pulse(library, hit, hit[3], 0, quick, steps)
+                    trapped += add_pulse(library, hit, hit[3], 0, quick, steps)
                 else:
-                    outcome[i] = _add_drifted(maps, hit, cloud, times, signal, out)
-            lost_kev[event] = lost
-            if collected > 0.0:
-                share, flat = 1.0 / collected, 0.0
+                    outcome[i], part = _add_drifted(maps, hit, cloud, times, signal, out)
+                    trapped += hit[3] * part
+            lost_kev[event], trapped_kev[event] = lost, trapped
+            if collected > trapped:
+                share, flat = 1.0 / (collected - trapped), 0.0
                 for j in range(n_samples):
                     flat += steps[j]
                     waveforms[event, j] = (out[j] + quick[j] + flat) * share
@@ -220,11 +228,11 @@ def _add_drifted(
     maps: DriftMaps,
     hit: FloatArray,
     cloud: tuple[float, float, float, bool],
-    times: tuple[float, int],
+    times: tuple[float, int, int],
     signal: FloatArray,
     out: FloatArray,
-) -> int:
-    """Add the pulse of one drifted hit to `out`; gives its outcome."""
-    last, arrived, fwhm = point_signal(maps, hit, cloud, times[0], signal)
+) -> tuple[int, float]:
+    """Add the pulse of one drifted hit to `out`; its outcome and the share trapped."""
+    last, arrived, fwhm, trapped = point_signal(maps, hit, cloud, times[0], times[2], signal)
     smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, hit[3], out)
-    return _COLLECTED if arrived else _NOT_COLLECTED
+    return _COLLECTED if arrived else _NOT_COLLECTED, trapped

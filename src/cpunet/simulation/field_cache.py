@@ -18,7 +18,7 @@ from cpunet.simulation.poisson import Potentials
 SOLVER_VERSION = 2
 
 _OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
-_OF_NODES = ("point_contact", "bias", "impurities", "surface")
+_OF_NODES = ("point_contact", "bias", "impurities", "tilt", "surface")
 
 
 def cache_file(key: str) -> Path:

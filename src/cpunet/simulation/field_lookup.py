@@ -18,6 +18,7 @@ from scipy.interpolate import RectBivariateSpline
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.geometry import DITCH
+from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import FloatArray, velocity_table
 
 BoolArray = npt.NDArray[np.bool_]
@@ -55,7 +56,8 @@ class DriftMaps(NamedTuple):
 
     ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential
     (V); ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, and
-    ``ditch`` (nr, nz) the nodes that stop it.
+    ``ditch`` (nr, nz) the nodes that stop it.  ``trapping_per_ns`` holds the rates of
+    electrons and holes.
     """
 
     values: FloatArray
@@ -65,10 +67,13 @@ class DriftMaps(NamedTuple):
     bias_V: float
     coefficients: FloatArray
     fields_per_V_per_cm: float
+    trapping_per_ns: FloatArray
 
 
-def drift_maps(fields: Maps) -> DriftMaps:
+def drift_maps(fields: Maps, settings: SimulationSettings) -> DriftMaps:
     """Arrange maps for the drift: extrapolated into the contacts, refined if coarse.
+
+    Of the `settings`, the factors of the velocities and the trapping matter.
 
     Raises
     ------
@@ -99,7 +104,7 @@ def drift_maps(fields: Maps) -> DriftMaps:
         values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
         ditch = _nodes_of(np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_)))
         usable = np.kron(usable, np.ones((parts, parts), np.bool_))
-    table = velocity_table(fields.temperature_K)
+    table = velocity_table(fields.temperature_K, settings.velocity_factors)
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,
@@ -108,6 +113,7 @@ def drift_maps(fields: Maps) -> DriftMaps:
         bias_V=bias,
         coefficients=table.coefficients,
         fields_per_V_per_cm=table.fields_per_V_per_cm,
+        trapping_per_ns=np.array(settings.trapping_per_ns),
     )
 
 
@@ -157,13 +163,15 @@ def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, 
         for axis in (0, 1):
             for near, far in ((1, 2), (-1, -2)):
                 usable = _shifted(known, near, axis) & _shifted(known, far, axis) & ~known
-                guess = 2 * _shifted(values, near, axis) - _shifted(values, far, axis)
-                total[usable] += guess[usable]
+                here = np.nonzero(usable)
+                one, two = list(here), list(here)
+                one[axis], two[axis] = here[axis] + near, here[axis] + far
+                total[here] += 2 * values[tuple(one)] - values[tuple(two)]
                 ways += usable
-        found = ways > 0
+        found = np.nonzero(ways)
         filled = values.copy()
         filled[found] = (total[found].T / ways[found]).T
-        values, known = filled, known | found
+        values, known = filled, known | (ways > 0)
     return values, known
 
 

@@ -60,14 +60,31 @@ def compute_fields(
         solution,
         bias_V=detector.bias_V,
         impurity_scale=detector.impurity_scale,
+        impurity_tilt=detector.impurity_tilt_1e10_per_cm4,
         temperature_K=detector.temperature_K,
     )
 
 
 def superposed_fields(
-    solution: Superposition, *, bias_V: float, impurity_scale: float, temperature_K: float
+    solution: Superposition,
+    *,
+    bias_V: float,
+    impurity_scale: float = 1.0,
+    impurity_tilt: float = 0.0,
+    temperature_K: float,
+    depletion: bool = True,
 ) -> FieldMaps:
-    """Fields at a bias and with scaled impurities, without solving again.
+    """Fields at a bias, with scaled and tilted (1e10/cm4) impurities, without solving again.
+
+    Parameters
+    ----------
+    solution
+        Of the detector.
+    bias_V, impurity_scale, impurity_tilt, temperature_K
+        As in `Detector`; the tilt is in 1e10/cm4.
+    depletion
+        Without it ``depletion_V`` is left NaN: with tilted impurities or a surface charge
+        finding it takes longer than all the rest.
 
     Raises
     ------
@@ -75,7 +92,7 @@ def superposed_fields(
         If the detector is not fully depleted.
     """
     grid, detector = solution.grid, solution.detector
-    potential = solution.potential_V(bias_V, impurity_scale)
+    potential = solution.potential_V(bias_V, impurity_scale, impurity_tilt)
     e_r, e_z = electric_field(potential, grid, mirror=not _charged_face(detector))
     return FieldMaps(
         r_mm=grid.r_mm,
@@ -88,7 +105,9 @@ def superposed_fields(
         point_type=point_types(grid),
         temperature_K=temperature_K,
         capacitance_pF=solution.potentials.capacitance_pF,
-        depletion_V=solution.depletion_V(impurity_scale),
+        depletion_V=solution.depletion_V(impurity_scale, impurity_tilt)
+        if depletion
+        else np.nan,
     )
 
 
@@ -113,7 +132,8 @@ def scaled_to_depletion(
             "add it to the file, or give measured_depletion_V=VALUE"
         )
     solution = solve(detector, cache=cache, progress=progress)
-    return detector.model_copy(update={"impurity_scale": solution.scale_of_depletion(measured)})
+    scale = solution.scale_of_depletion(measured, detector.impurity_tilt_1e10_per_cm4)
+    return detector.model_copy(update={"impurity_scale": scale})
 
 
 def _charged_face(detector: Detector) -> bool:

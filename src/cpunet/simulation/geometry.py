@@ -40,7 +40,8 @@ class Detector(Config):
     The net impurity is, in 1e10/cm3 with z and r in cm, ``z0 + gradient z
     + quadratic (1 - (2 z / L - 1)^2) + exponential exp(-z / exponential_length)``, times
     ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``,
-    all times ``impurity_scale``; it is negative for p-type germanium.
+    all times ``impurity_scale``, plus ``tilt (z - L/2)``, which adds to the gradient and not
+    to the mean; it is negative for p-type germanium.
     ``measured_depletion_V`` is what that scale can be found from (0: not known).
 
     ``siggen_conventions`` places the lithium boundary on tapers, the ditch's walls (half
@@ -79,6 +80,7 @@ class Detector(Config):
     impurity_radial_mult: NonNegative = 1.0
     impurity_radial_power: Positive = 2.0
     impurity_scale: Positive = 1.0
+    impurity_tilt_1e10_per_cm4: Annotated[float, Field(ge=-10, le=10)] = 0.0
     surface_charge_1e10_per_cm2: float = 0.0
     bias_V: Positive
     measured_depletion_V: NonNegative = 0.0
@@ -179,7 +181,12 @@ class Detector(Config):
         radial = (r / self.crystal_radius) ** self.impurity_radial_power
         scaled = axial * (1 + (self.impurity_radial_mult - 1) * radial)
         total = scaled + self.impurity_radial_add_1e10_per_cm3 * radial
-        return np.asarray(self.impurity_scale * total)
+        tilt = self.impurity_tilt_1e10_per_cm4 * self.per_tilt_cm(z)
+        return np.asarray(self.impurity_scale * total + tilt)
+
+    def per_tilt_cm(self, z: npt.ArrayLike) -> FloatArray:
+        """What ``impurity_tilt_1e10_per_cm4`` is multiplied by at `z` in mm: z - L/2 in cm."""
+        return (np.asarray(z, float) - self.crystal_length / 2) / 10
 
     def inside(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Where `r`, `z` (mm) lie in the germanium, lithium layer and surfaces included.

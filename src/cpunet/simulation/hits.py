@@ -134,6 +134,39 @@ class Hits:
             self.event_number,
         )
 
+    def of_events(self, event_number: npt.ArrayLike) -> Hits:
+        """The events with these numbers, in their order.
+
+        A number that none of them has becomes an event without hits, so that the result
+        has one event for each.
+
+        Raises
+        ------
+        CpunetError
+            If several events have one of the numbers.
+
+        Examples
+        --------
+        >>> hits = Hits.of([[0, 0, 1], [0, 0, 2]], [100, 300], [0, 1, 2], [7, 9])
+        >>> hits.of_events([9, 8, 7]).energy_kev
+        array([300.,   0., 100.])
+        """
+        wanted = np.asarray(event_number, np.int64)
+        order = np.argsort(self.event_number, kind="stable")
+        known = self.event_number[order]
+        first, last = (np.searchsorted(known, wanted, side) for side in ("left", "right"))
+        if np.any(last - first > 1):
+            number = wanted[np.argmax(last - first > 1)]
+            raise CpunetError(
+                f"hits: several events have the number {number}; number them anew"
+            )
+        found = last > first
+        kept = self[order[first[found]]]
+        counts = np.zeros(len(wanted), np.int64)
+        counts[found] = np.diff(kept.offsets)
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        return Hits.of(kept.position_mm, kept.edep_kev, offsets, wanted)
+
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:
         """Join sets into one, events in their order."""

@@ -71,7 +71,7 @@ def build_library(
     progress
         Called with the numbers of places done and known so far; the second grows.
     """
-    maps, task = drift_maps(fields), _task(fields, settings)
+    maps, task = drift_maps(fields, settings), _task(fields, settings)
     library = _empty(fields, settings)
     meter = _Meter(progress)
     size = 2**settings.library_halvings
@@ -117,6 +117,7 @@ def _empty(fields: Maps, settings: SimulationSettings) -> Library:
         samples=np.zeros(0, np.int64),
         half_ns=np.zeros(0),
         final=np.zeros(0, np.float32),
+        trapped=np.zeros(0),
         cell=np.zeros((nr, nz), np.int64),
         number=np.zeros((nr, nz), np.int64),
         bend_ns=np.zeros((0, 2, settings.library_angles), np.float32),
@@ -160,7 +161,7 @@ def _with_nodes(
     for block in meter.blocks(len(places)):
         here = places[block]
         scratch = np.empty((len(here) * azimuths, rows, longest), np.float32)
-        facts = np.zeros((len(here) * azimuths, 4))
+        facts = np.zeros((len(here) * azimuths, 5))
         drift_nodes(library, maps, task, here, scratch, facts)
         state = facts[:, 0].reshape(-1, azimuths).min(axis=1)
         stored = state >= 0
@@ -174,7 +175,7 @@ def _with_nodes(
         pulses.append(scratch[np.broadcast_to(within[:, None], scratch.shape)])
         found.append(facts)
         meter.add(block)
-    new = np.concatenate([np.zeros((0, 4)), *found])
+    new = np.concatenate([np.zeros((0, 5)), *found])
     samples = np.concatenate([library.samples, new[:, 1].astype(np.int64)])
     return library._replace(
         pulses=np.concatenate(pulses),
@@ -182,6 +183,7 @@ def _with_nodes(
         samples=samples,
         half_ns=np.concatenate([library.half_ns, new[:, 2]]),
         final=np.concatenate([library.final, new[:, 3].astype(np.float32)]),
+        trapped=np.concatenate([library.trapped, new[:, 4]]),
     )
 
 

@@ -80,7 +80,7 @@ def drift_nodes(
     facts: FloatArray,
 ) -> None:
     """Fill the rows of each node, and its state (0 or `OUTSIDE`, `LATE`), number of
-    samples, time of half height and final value.
+    samples, time of half height, final value and share trapped.
     """
     azimuths, energies = len(library.cos4), library.energies_kev
     for place in prange(len(places)):
@@ -95,13 +95,13 @@ def drift_nodes(
             for e in range(len(energies)):
                 hit = _at_azimuth(r, z, float(k), azimuths, energies[e])
                 own = rows[node, e * library.phases : (e + 1) * library.phases]
-                flat, arrived = _fine_pulse(library, maps, task, hit, signal, own)
+                flat, arrived, trapped = _fine_pulse(library, maps, task, hit, signal, own)
                 length = max(length, flat)
             if not arrived:
                 facts[node, 0] = LATE
             facts[node, 1] = length
             facts[node, 2] = _half_time(signal, task.per_sample * library.margin) * task.step_ns
-            facts[node, 3] = signal[-1]
+            facts[node, 3], facts[node, 4] = signal[-1], trapped
 
 
 @kernel
@@ -118,15 +118,18 @@ def _fine_pulse(
     hit: FloatArray,
     signal: FloatArray,
     rows: Float32Array,
-) -> tuple[int, bool]:
+) -> tuple[int, bool, float]:
     """Fill the rows (phases, samples) with a hit's smeared and averaged pulse.
 
     `signal` takes the point charge's, with zeros for the margin before.  Returns the
-    number of samples up to one that is flat, and whether the charge is collected.
+    number of samples up to one that is flat, whether the charge is collected, and the
+    share that is trapped.
     """
     before = library.margin * task.per_sample
     cloud = (task.cloud_fwhm_mm, task.diffusion, task.repulsion, False)
-    last, arrived, fwhm = point_signal(maps, hit, cloud, task.step_ns, signal[before:])
+    last, arrived, fwhm, trapped = point_signal(
+        maps, hit, cloud, task.step_ns, 1, signal[before:]
+    )
     fwhm += task.rounding if fwhm > 0.0 else 0.0
     group = task.per_sample // library.phases
     sample = np.empty(rows.shape[1])
@@ -145,7 +148,7 @@ def _fine_pulse(
         rows[p] = sample
     # two FWHM is where the cloud is cut
     end = (last + before + int(2.0 * fwhm) + 2) // task.per_sample + 2
-    return min(end, rows.shape[1]), arrived
+    return min(end, rows.shape[1]), arrived, trapped
 
 
 @kernel
@@ -175,7 +178,7 @@ def compare(
             ):
                 worst[place] = np.inf
                 break
-            _, arrived = _fine_pulse(library, maps, task, hit, signal, rows)
+            _, arrived, _ = _fine_pulse(library, maps, task, hit, signal, rows)
             if not arrived:
                 worst[place] = np.inf
                 break

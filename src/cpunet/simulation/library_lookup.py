@@ -40,7 +40,8 @@ class Library(NamedTuple):
     corner, negative where there is none.  Node ``column * azimuths + k`` has the pulse
     ``pulses[start:]``, of shape (energies, phases, `samples`): sample j of phase p is at
     time ``(j - margin + p / phases) * dt_ns``, and the last one is ``final`` in all
-    phases.  ``half_ns`` is the time of half height; inside a cell it bends by
+    phases; ``trapped`` is what trapping took off it.  ``half_ns`` is the time of half
+    height; inside a cell it bends by
     ``bend_ns u (1 - u)`` along r and z each.
     """
 
@@ -49,6 +50,7 @@ class Library(NamedTuple):
     samples: npt.NDArray[np.int64]
     half_ns: FloatArray
     final: Float32Array
+    trapped: FloatArray
     cell: npt.NDArray[np.int64]
     number: npt.NDArray[np.int64]
     bend_ns: Float32Array
@@ -81,8 +83,8 @@ def add_pulse(
     delay: int,
     out: Float32Array,
     steps: FloatArray,
-) -> None:
-    """Add `weight` times the pulse of a hit that `covers` accepts.
+) -> float:
+    """Add `weight` times the pulse of a hit that `covers` accepts; give what is trapped.
 
     Parameters
     ----------
@@ -121,13 +123,16 @@ def add_pulse(
     bend = library.bend_ns[library.number[int(p), int(q)]]
     half = _smooth_half(library, cos4, first, parts, bend, u * (1 - u), v * (1 - v))
     per_ns = library.phases / library.dt_ns
+    trapped = 0.0
     for corner in range(8):
         node = first[corner & 3] + k + (corner >> 2)
         part = weight * parts[corner & 3] * (w if corner >> 2 else 1.0 - w)
+        trapped += part * library.trapped[node]
         shift = (library.half_ns[node] - half) * per_ns + delay
         for row in range(len(library.energies_kev)):
             share = _energy_weight(library.energies_kev, row, hit[3])
             _add_shifted(library, node, row, part * share, shift, out, steps)
+    return trapped
 
 
 @kernel

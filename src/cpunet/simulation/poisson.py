@@ -34,14 +34,15 @@ class Potentials:
     """What the electrodes and the charges add to the potential; arrays (nr, nz).
 
     ``point_contact`` is the potential with 1 on the point contact and 0 elsewhere (the
-    weighting potential), ``bias`` that with 1 on the lithium, ``impurities`` and
-    ``surface`` those of the impurities and of a charge on z = 0 in V with all
-    electrodes at 0, and ``capacitance_pF`` the point contact's own.
+    weighting potential), ``bias`` that with 1 on the lithium, ``impurities``, ``tilt`` and
+    ``surface`` those of the impurities, of a unit of their tilt and of a charge on z = 0
+    in V with all electrodes at 0, and ``capacitance_pF`` the point contact's own.
     """
 
     point_contact: FloatArray
     bias: FloatArray
     impurities: FloatArray
+    tilt: FloatArray
     surface: FloatArray
     capacitance_pF: float
 
@@ -61,7 +62,9 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     nothing = np.zeros(free.shape)
     point_contact = solved((grid.region == POINT_CONTACT).astype(float), nothing)
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
-    impurities = solved(nothing, charges(detector, grid))
+    impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
+    impurities = solved(nothing, charges(detector, grid, impurity))
+    tilt = solved(nothing, charges(detector, grid, detector.per_tilt_cm(grid.z_mm)))
     surface = nothing
     if detector.surface_charge_1e10_per_cm2:
         surface = solved(nothing, surface_charges(detector, grid))
@@ -69,7 +72,7 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
     energy += (to_ground * point_contact[:, 0] ** 2).sum()
     capacitance = float(2 * np.pi * PF_PER_MM * energy)
-    return Potentials(point_contact, bias, impurities, surface, capacitance)
+    return Potentials(point_contact, bias, impurities, tilt, surface, capacitance)
 
 
 def _solver(
@@ -134,8 +137,11 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
     return r_flux, z_flux, to_ground
 
 
-def charges(detector: Detector, grid: Grid) -> FloatArray:
-    """Impurities' charge over the vacuum's permittivity in each ring, per rad, in V mm."""
+def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
+    """Charge over the vacuum's permittivity in each ring, per rad, in V mm.
+
+    `impurity` is that of the nodes, in 1e10/cm3.
+    """
     germanium = _germanium_in_cells(detector, grid)
     if detector.siggen_conventions:
         # there the ditch holds the charge that N / 16 of germanium would hold
@@ -147,7 +153,6 @@ def charges(detector: Detector, grid: Grid) -> FloatArray:
     volume = np.zeros(grid.region.shape)
     volume[:, 1:] += by_column
     volume[:, :-1] += by_column
-    impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
     return np.asarray(VOLT_PER_MM2 * impurity * volume)
 
 

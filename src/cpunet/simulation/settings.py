@@ -7,7 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.recipes.base import Config, NonNegative, Positive
+from cpunet.recipes.base import Config, Positive
+from cpunet.simulation.velocity import VelocityFactors
+
+_Factor = Annotated[float, Field(ge=0.2, le=5, allow_inf_nan=False)]
+_PerUs = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 
 
 class SimulationSettings(Config):
@@ -16,7 +20,9 @@ class SimulationSettings(Config):
     Parameters
     ----------
     step_ns
-        Time step of the drift.
+        Time step of the pulses, and of the drift.
+    stride
+        Steps that a drifted charge takes at once; its pulse is interpolated in between.
     dt_ns
         Sampling period of the pulses; each sample is the mean of the steps in it.
     length_ns
@@ -33,7 +39,16 @@ class SimulationSettings(Config):
     cloud_fwhm_mm
         Width of the charge cloud when it is set free.
     self_repulsion
-        Let the cloud grow by the repulsion of its charges, hit by hit.
+        Let the cloud grow by the repulsion of its charges, hit by hit: a factor of
+        siggen's; 0 (or false) is none of it, 1 (or true) all.
+    electron_velocity_low_factor, electron_velocity_high_factor
+        Factors of the electrons' speed below 250 V/cm and above 1000 V/cm; in between
+        it goes smoothly with the logarithm of the field.
+    hole_velocity_low_factor, hole_velocity_high_factor
+        The same of the holes.
+    electron_trapping_per_us, hole_trapping_per_us
+        Rate at which charges are trapped for good, 1 over their lifetime in us; a
+        trapped charge induces no more, and lowers the energy collected.
     library_grid_mm, library_halvings
         Spacing in r and z of the coarsest pre-computed pulses, and how often a cell of
         them is halved where it is not good enough.
@@ -48,12 +63,19 @@ class SimulationSettings(Config):
     """
 
     step_ns: Positive = 1.0
+    stride: Annotated[int, Field(ge=1, le=16)] = 1
     dt_ns: Positive = 16.0
     length_ns: Positive = 3600.0
     diffusion: bool = True
     diffusion_constant: Positive | Literal["temperature", "siggen"] = 0.12
-    cloud_fwhm_mm: NonNegative = 0.1
-    self_repulsion: bool = False
+    cloud_fwhm_mm: Annotated[float, Field(ge=0, le=20)] = 0.1
+    self_repulsion: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    electron_velocity_low_factor: _Factor = 1.0
+    electron_velocity_high_factor: _Factor = 1.0
+    hole_velocity_low_factor: _Factor = 1.0
+    hole_velocity_high_factor: _Factor = 1.0
+    electron_trapping_per_us: _PerUs = 0.0
+    hole_trapping_per_us: _PerUs = 0.0
     library_grid_mm: Positive = 2.0
     library_halvings: Annotated[int, Field(ge=0, le=6)] = 4
     library_angles: Annotated[int, Field(ge=2)] = 6
@@ -74,6 +96,19 @@ class SimulationSettings(Config):
     def steps_per_sample(self) -> int:
         """Steps of the drift in one sample."""
         return round(self.dt_ns / self.step_ns)
+
+    @property
+    def velocity_factors(self) -> VelocityFactors:
+        """Factors of the speed at low and at high fields, of electrons and of holes."""
+        return (
+            (self.electron_velocity_low_factor, self.electron_velocity_high_factor),
+            (self.hole_velocity_low_factor, self.hole_velocity_high_factor),
+        )
+
+    @property
+    def trapping_per_ns(self) -> tuple[float, float]:
+        """Rates of trapping of electrons and of holes."""
+        return self.electron_trapping_per_us / 1000, self.hole_trapping_per_us / 1000
 
     @field_validator("diffusion_constant", mode="before")
     @classmethod

@@ -42,6 +42,8 @@ class Signals:
         Time at which the last carrier arrived, or the record ended; NaN if not valid.
     cloud_fwhm_ns
         Duration (FWHM) by which the charge cloud smears the pulse; NaN if not valid.
+    trapped
+        What trapping takes off the end of the pulse; NaN if not valid.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -50,6 +52,7 @@ class Signals:
     collected: npt.NDArray[np.bool_]
     collection_time_ns: FloatArray
     cloud_fwhm_ns: FloatArray
+    trapped: FloatArray
 
 
 def hit_signals(
@@ -88,7 +91,7 @@ def hit_signals(
     n = len(hits)
     waveforms = np.zeros((n, settings.n_samples), np.float32)
     facts = np.full((n, 4), np.nan)
-    maps = drift_maps(fields)
+    maps = drift_maps(fields, settings)
     _all_signals(
         maps, hits, cloud_numbers(fields, settings), time_numbers(settings), waveforms, facts
     )
@@ -100,6 +103,7 @@ def hit_signals(
         collected=facts[:, 1] == 1.0,
         collection_time_ns=facts[:, 0] * settings.step_ns,
         cloud_fwhm_ns=facts[:, 2] * settings.step_ns,
+        trapped=facts[:, 3],
     )
 
 
@@ -118,9 +122,9 @@ def hit_table(
     return table
 
 
-def time_numbers(settings: SimulationSettings) -> tuple[float, int]:
-    """Step in ns and steps per sample, as the compiled loops want them."""
-    return settings.step_ns, settings.steps_per_sample
+def time_numbers(settings: SimulationSettings) -> tuple[float, int, int]:
+    """Step in ns, steps per sample and at once, as the compiled loops want them."""
+    return settings.step_ns, settings.steps_per_sample, settings.stride
 
 
 def cloud_numbers(
@@ -129,10 +133,11 @@ def cloud_numbers(
     """First width (mm), diffusion constant, repulsion per keV, siggen's rounding."""
     siggen = settings.diffusion_constant == "siggen"
     constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
+    growing = settings.diffusion or settings.self_repulsion > 0
     return (
-        starting_fwhm_mm(settings.cloud_fwhm_mm, settings.diffusion or settings.self_repulsion),
+        starting_fwhm_mm(settings.cloud_fwhm_mm, growing),
         constant if settings.diffusion else 0.0,
-        repulsion_constant(1.0) if settings.self_repulsion else 0.0,
+        repulsion_constant(1.0) * settings.self_repulsion,
         siggen,
     )
 
@@ -143,22 +148,33 @@ def point_signal(
     hit: FloatArray,
     cloud: tuple[float, float, float, bool],
     step_ns: float,
+    stride: int,
     signal: FloatArray,
-) -> tuple[int, bool, float]:
+) -> tuple[int, bool, float, float]:
     """Fill `signal` with the pulse of a point charge; give last step, whether all is
-    collected, and the FWHM in steps by which the cloud smears it.
+    collected, the FWHM in steps by which the cloud smears it, and the share trapped.
     """
-    signal[:] = 0.0
+    record = signal if stride == 1 else np.empty(len(signal) // stride + 2)
+    record[:] = 0.0
+    long_ns = stride * step_ns
     start = (hit[0], hit[1], hit[2])
     nowhere = np.empty((0, 3))
     point = (0.0, 0.0, 0.0)
     growing = (cloud[0], cloud[1], cloud[2] * hit[3])
-    steps_e, arrived_e, _, _ = drift(maps, ELECTRON, start, step_ns, point, signal, nowhere)
-    steps_h, arrived_h, size, speed = drift(
-        maps, HOLE, start, step_ns, growing, signal, nowhere
+    steps_e, arrived_e, _, _, trapped_e = drift(
+        maps, ELECTRON, start, long_ns, point, record, nowhere
+    )
+    steps_h, arrived_h, size, speed, trapped_h = drift(
+        maps, HOLE, start, long_ns, growing, record, nowhere
     )
     fwhm = cloud_steps(size, speed, step_ns, cloud[3])
-    return max(steps_e, steps_h), arrived_e and arrived_h, fwhm
+    if stride > 1:
+        for i in range(len(signal)):
+            k = i // stride
+            part = (i - k * stride) / stride
+            signal[i] = record[k] + part * (record[k + 1] - record[k])
+    last = stride * max(steps_e, steps_h)
+    return last, arrived_e and arrived_h, fwhm, trapped_e + trapped_h
 
 
 @kernel
@@ -178,7 +194,7 @@ def _all_signals(
     maps: DriftMaps,
     hits: FloatArray,
     cloud: tuple[float, float, float, bool],
-    times: tuple[float, int],
+    times: tuple[float, int, int],
     waveforms: npt.NDArray[np.float32],
     facts: FloatArray,
 ) -> None:
@@ -188,7 +204,10 @@ def _all_signals(
             continue
         signal = np.empty(n_steps)
         out = np.zeros(waveforms.shape[1])
-        last, arrived, fwhm = point_signal(maps, hits[i], cloud, times[0], signal)
+        last, arrived, fwhm, trapped = point_signal(
+            maps, hits[i], cloud, times[0], times[2], signal
+        )
         smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, 1.0, out)
         waveforms[i] = out
-        facts[i, 0], facts[i, 1], facts[i, 2] = last, 1.0 if arrived else 0.0, fwhm
+        facts[i, 0], facts[i, 1] = last, 1.0 if arrived else 0.0
+        facts[i, 2], facts[i, 3] = fwhm, trapped

@@ -1,10 +1,11 @@
 """One solution of a detector for every bias and every scale of its impurities.
 
 With space charge everywhere the potential is linear in its causes,
-``V = bias w + scale u + q`` (`w`: 1 on the lithium contact; `u`: of the impurities as
-given; `q`: of a charge on the surface), so that neither bias nor scale needs another
-solution.  Where a part of the detector is not depleted this does not hold: such a
-potential has a pocket (see `cpunet.simulation.depletion`), and is refused.
+``V = bias w + scale u + tilt t + q`` (`w`: 1 on the lithium contact; `u`: of the impurities
+as given; `t`: of a unit of their tilt; `q`: of a charge on the surface), so that none of
+bias, scale and tilt needs another solution.  Where a part of the detector is not depleted
+this does not hold: such a potential has a pocket (see `cpunet.simulation.depletion`), and is
+refused.
 """
 
 from __future__ import annotations
@@ -25,7 +26,14 @@ from cpunet.simulation.poisson import Potentials, solve_potentials
 Progress = Callable[[str], None]
 
 # none of them matters to the parts of the potential
-NOT_IN_PARTS = ("name", "temperature_K", "bias_V", "impurity_scale", "measured_depletion_V")
+NOT_IN_PARTS = (
+    "name",
+    "temperature_K",
+    "bias_V",
+    "impurity_scale",
+    "impurity_tilt_1e10_per_cm4",
+    "measured_depletion_V",
+)
 
 _SCALE_RESOLUTION = 1e-5
 _LARGEST_SCALE = 1000.0
@@ -38,7 +46,8 @@ class Superposition:
     Parameters
     ----------
     detector
-        As solved for; its bias and its ``impurity_scale`` do not enter.
+        As solved for; its bias does not enter, and its impurities are neither scaled nor
+        tilted.
     grid, potentials
         The nodes, and the parts of the potential on them.
     unit_depletion_V
@@ -50,29 +59,33 @@ class Superposition:
     potentials: Potentials
     unit_depletion_V: float
 
-    def potential_V(self, bias_V: float, impurity_scale: float = 1.0) -> FloatArray:
-        """Potential (nr, nz) at a bias, with all impurities scaled.
+    def potential_V(
+        self, bias_V: float, impurity_scale: float = 1.0, impurity_tilt: float = 0.0
+    ) -> FloatArray:
+        """Potential (nr, nz) at a bias, with all impurities scaled, and tilted (1e10/cm4).
 
         Raises
         ------
         CpunetError
             If the detector is not depleted: nothing can be superposed there.
         """
-        potential = self._sum(bias_V, impurity_scale)
+        potential = self._sum(bias_V, impurity_scale, impurity_tilt)
         if has_pocket(potential, self.grid.region):
-            self._refuse(bias_V, impurity_scale)
+            self._refuse(bias_V, impurity_scale, impurity_tilt)
         return potential
 
-    def depletion_V(self, impurity_scale: float = 1.0) -> float:
+    def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
         """Smallest bias that depletes the detector; infinite if there is none."""
-        if not self.detector.surface_charge_1e10_per_cm2:
+        if not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0:
             # without another charge all of V scales together
             return impurity_scale * self.unit_depletion_V
         return depletion_voltage(
-            self.potentials.bias, self._sum(0.0, impurity_scale), self.grid.region
+            self.potentials.bias,
+            self._sum(0.0, impurity_scale, impurity_tilt),
+            self.grid.region,
         )
 
-    def scale_of_depletion(self, depletion_V: float) -> float:
+    def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
         """Scale of the impurities with which the detector just depletes at `depletion_V`.
 
         Raises
@@ -82,33 +95,35 @@ class Superposition:
         """
         low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
         what = f"detector {self.detector.name}: {depletion_V:g} V"
-        if self._pocket(depletion_V, low):
+        if self._pocket(depletion_V, low, impurity_tilt):
             raise CpunetError(
                 f"{what} do not deplete it even with {low:g} of its impurities; correct "
                 "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
             )
-        if not self._pocket(depletion_V, high):
+        if not self._pocket(depletion_V, high, impurity_tilt):
             raise CpunetError(
                 f"{what} deplete it even with {high:g} times its impurities; correct "
                 "measured_depletion_V or impurity_z0_1e10_per_cm3"
             )
         while high / low > 1 + _SCALE_RESOLUTION:
             middle = math.sqrt(low * high)
-            if self._pocket(depletion_V, middle):
+            if self._pocket(depletion_V, middle, impurity_tilt):
                 high = middle
             else:
                 low = middle
         return low
 
-    def _sum(self, bias_V: float, impurity_scale: float) -> FloatArray:
+    def _sum(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
         parts = self.potentials
-        return bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
+        total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
+        return total + impurity_tilt * parts.tilt if impurity_tilt else total
 
-    def _pocket(self, bias_V: float, impurity_scale: float) -> bool:
-        return has_pocket(self._sum(bias_V, impurity_scale), self.grid.region)
+    def _pocket(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> bool:
+        return has_pocket(self._sum(bias_V, impurity_scale, impurity_tilt), self.grid.region)
 
-    def _refuse(self, bias_V: float, impurity_scale: float) -> None:
-        depletion, name = self.depletion_V(impurity_scale), self.detector.name
+    def _refuse(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> None:
+        depletion = self.depletion_V(impurity_scale, impurity_tilt)
+        name = self.detector.name
         if depletion == float("inf"):
             raise CpunetError(
                 f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
@@ -132,7 +147,7 @@ def solve(
     cache
         Keep the parts on disk (in ``$CPUNET_CACHE``, or the user's cache folder) and
         take them from there if the same detector was solved before, at any bias and with
-        any scale of its impurities.
+        any scale and tilt of its impurities.
     progress
         Called with a few words as each part starts.
 
@@ -142,7 +157,9 @@ def solve(
         If the grid is too fine.
     """
     key = detector.fingerprint(exclude=NOT_IN_PARTS)
-    unit = detector.model_copy(update={"impurity_scale": 1.0})
+    unit = detector.model_copy(
+        update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
+    )
     if cache and (kept := field_cache.load(key, detector.grid_mm)) is not None:
         return Superposition(unit, *kept)
     say = progress or (lambda _: None)

@@ -32,6 +32,12 @@ _MOBILITY = (5.66e7, 1.63e9)
 _POWER = (-1.680, -2.398)
 _SPEED = (1.3e7, 1.2e7)
 _THETA_K = 200.0
+# V/cm: below the first the low factor of the speed holds, above the second the high one
+_LOW_FIELD, _HIGH_FIELD = 250.0, 1000.0
+
+# Factors of the speed at low and at high fields, of electrons and of holes.
+VelocityFactors = tuple[tuple[float, float], tuple[float, float]]
+AS_MEASURED: VelocityFactors = ((1.0, 1.0), (1.0, 1.0))
 
 
 class VelocityTable(NamedTuple):
@@ -52,13 +58,17 @@ def measured_table() -> FloatArray:
     return np.array(rows[1:], dtype=np.float64)
 
 
-def velocity_table(temperature_K: float) -> VelocityTable:
+def velocity_table(
+    temperature_K: float, factors: VelocityFactors = AS_MEASURED
+) -> VelocityTable:
     """Anisotropy coefficients at a crystal temperature.
 
     Parameters
     ----------
     temperature_K
         Limited to 40-120 K, the range of the temperature model.
+    factors
+        Of the speeds along all axes, see `velocity_factor`.
 
     Examples
     --------
@@ -74,6 +84,7 @@ def velocity_table(temperature_K: float) -> VelocityTable:
     tables = []
     for carrier in (ELECTRON, HOLE):
         factor = _temperature_factor(carrier, field, temperature_K)
+        factor = factor * velocity_factor(field, *factors[carrier])
         v100, v110, v111 = (measured[:, 1 + 3 * carrier : 4 + 3 * carrier] * factor[:, None]).T
         a = v100 / 2 - 4 * v110 + 4.5 * v111
         b = -2.5 * v100 + 16 * v110 - 13.5 * v111
@@ -91,6 +102,21 @@ def drift_velocity(table: VelocityTable, field: npt.ArrayLike, carrier: int) -> 
     vectors = np.ascontiguousarray(field, dtype=np.float64)
     velocity: FloatArray = _velocities(table, vectors, carrier)
     return velocity
+
+
+def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> FloatArray:
+    """Factor of the speed: `low` up to 250 V/cm, `high` from 1000 V/cm on.
+
+    In between it goes smoothly with the logarithm of the field.
+
+    Examples
+    --------
+    >>> velocity_factor([100, 500, 2000], 0.9, 1.1).round(3)
+    array([0.9, 1. , 1.1])
+    """
+    field = np.clip(np.asarray(field_V_per_cm, np.float64), _LOW_FIELD, _HIGH_FIELD)
+    x = np.log(field / _LOW_FIELD) / math.log(_HIGH_FIELD / _LOW_FIELD)
+    return np.asarray(low + (high - low) * x * x * (3 - 2 * x), np.float64)
 
 
 def _temperature_factor(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:

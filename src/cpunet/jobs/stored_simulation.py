@@ -1,0 +1,88 @@
+"""What a file of simulated pulses keeps of how they were made: enough to make them again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from pydantic import ValidationError
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+
+_PULSES = "geds/sim"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSimulation:
+    """Physics and hits of the pulses in a file of ``cpunet simulate`` or ``cpunet stand``.
+
+    Parameters
+    ----------
+    detector, settings
+        As simulated; the period is that of the file's pulses.
+    hits
+        One event per pulse, in the order of the pulses; merged already.
+    """
+
+    detector: Detector
+    settings: SimulationSettings
+    hits: Hits
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a file.
+
+        Hits of events that have no pulse in the file are left out.
+
+        Raises
+        ------
+        CpunetError
+            If the file cannot be read, does not tell how it was made, or lacks the hits of
+            a pulse.
+        """
+        file = Path(path)
+        made, numbers = _record(file)
+        try:
+            detector = Detector.model_validate(made["detector"])
+            settings = SimulationSettings.model_validate(made["settings"])
+        except (KeyError, TypeError, ValidationError) as error:
+            raise CpunetError(
+                f"{file}: what {_PULSES} tells of its simulation cannot be used by this "
+                "version; simulate it again"
+            ) from error
+        if len(np.unique(numbers)) < len(numbers):
+            raise CpunetError(
+                f"{file}: several pulses have the same event_number; simulate them again"
+            )
+        hits = read_hits(file).hits.of_events(numbers)
+        missing = np.diff(hits.offsets) == 0
+        if missing.any():
+            raise CpunetError(
+                f"{file}: {HIT_TABLE} has no hit of event {numbers[np.argmax(missing)]}; "
+                "simulate it again"
+            )
+        return cls(detector, settings, hits)
+
+
+def _record(path: Path) -> tuple[dict[str, Any], Any]:
+    """How the pulses were made, and the numbers of their events."""
+    try:
+        with h5py.File(path, "r") as file:
+            text = file[_PULSES].attrs.get("simulation") if _PULSES in file else None
+            if text is None or HIT_TABLE not in file:
+                raise CpunetError(
+                    f"{path}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
+                    "an output of cpunet simulate or cpunet stand"
+                )
+            return json.loads(text), np.asarray(file[f"{_PULSES}/event_number"], np.int64)
+    except (OSError, KeyError, ValueError) as error:
+        raise CpunetError(f"{path}: not a readable HDF5 file; is it truncated?") from error

@@ -1,0 +1,101 @@
+"""The same hits again, with other physics: what a calibration of a detector is made of."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.fields import superposed_fields
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
+
+# Of quick pulses; merging by 0.2 mm misses differences of the largest current by 10 %.
+_QUICK_MERGING_MM, _QUICK_STRIDE = 0.1, 4
+# Detectors of other shapes, as with another lithium layer, whose potentials are kept.
+_MOST_SHAPES = 4
+
+
+class SameHits:
+    """Hits of some events, to be simulated again and again with other physics.
+
+    Another temperature, bias, scale or tilt of the impurities, velocity, cloud or trapping
+    takes no new solution of the fields.  Another shape of the active germanium, such as
+    another ``li_thickness``, takes one (seconds, then cached) and merges the hits anew.
+
+    Parameters
+    ----------
+    hits
+        Events, in the crystal's frame; merged or not.
+    cluster_mm
+        Hits nearer than this are merged, see `cpunet.simulation.clustering.merge_hits`;
+        0 for hits that are merged already, as those kept beside simulated pulses.
+
+    Examples
+    --------
+    >>> from cpunet.simulation.geometry_readers import read_detector
+    >>> hits = Hits.of([[20, 0, 40], [0, 9, 12]], [2600, 14.5], [0, 2])
+    >>> same, settings = SameHits(hits), SimulationSettings()
+    >>> cold, warm = (
+    ...     same.simulate(read_detector("ppc", [f"temperature_K={t}"]), settings).waveforms
+    ...     for t in (85, 95)
+    ... )
+    >>> bool((warm <= cold).all())
+    True
+    """
+
+    def __init__(self, hits: Hits, *, cluster_mm: float = 0.0) -> None:
+        self._hits, self._cluster_mm = hits, cluster_mm
+        self._shapes: dict[str, tuple[Superposition, Hits, Hits]] = {}
+
+    def simulate(
+        self,
+        detector: Detector,
+        settings: SimulationSettings,
+        *,
+        mode: Literal["exact", "quick", "library"] = "exact",
+    ) -> EventPulses:
+        """The events' pulses with the physics of `detector` and `settings`.
+
+        Parameters
+        ----------
+        detector, settings
+            The physics.
+        mode
+            ``"exact"`` and ``"library"`` as in `simulate_events`.  ``"quick"``: more hits
+            merged and longer steps, for differences between two physics; its errors are
+            nearly the same in both.  See docs/simulation.md for how good and how fast.
+
+        Raises
+        ------
+        CpunetError
+            If the detector is not depleted, or a hit is no finite number.
+        """
+        solution, hits, fewer = self._of(detector)
+        fields = superposed_fields(
+            solution,
+            bias_V=detector.bias_V,
+            impurity_scale=detector.impurity_scale,
+            impurity_tilt=detector.impurity_tilt_1e10_per_cm4,
+            temperature_K=detector.temperature_K,
+            depletion=False,
+        )
+        if mode == "quick":
+            longer = settings.model_copy(update={"stride": max(_QUICK_STRIDE, settings.stride)})
+            return simulate_events(fields, fewer, longer)
+        return simulate_events(fields, hits, settings, mode)
+
+    def _of(self, detector: Detector) -> tuple[Superposition, Hits, Hits]:
+        """Potentials of a detector, its hits, and its hits merged more coarsely."""
+        key = detector.fingerprint(exclude=NOT_IN_PARTS)
+        if key not in self._shapes:
+            distance = self._cluster_mm
+            fine = merge_hits(self._hits, detector, distance)
+            coarse = merge_hits(fine, detector, max(_QUICK_MERGING_MM, distance))
+            if len(self._shapes) == _MOST_SHAPES:
+                # not the first, to which all others are compared
+                del self._shapes[list(self._shapes)[1]]
+            self._shapes[key] = solve(detector), fine, coarse
+        return self._shapes[key]
