@@ -61,6 +61,10 @@ def test_it_is_replaced_with_force_only(command, made: Path):
         (("--preset", "ornl", "--events", "FEP"), "expected FEP=N"),
         (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
         (("--preset", "orln"), "legend200, ornl, ringing"),
+        (("--preset", "ornl", "--shift", "bias_V=1"), "give --kind shifted"),
+        (("--preset", "ornl", "--kind", "shifted", "--shift", "bias=1"), "no such key bias"),
+        (("--preset", "ornl", "--set", "hole_trapping_per_us=-1"), "hole_trapping_per_us"),
+        (("--preset", "ornl", "--set", "dt_ns=16"), "leave dt_ns out"),
     ],
 )
 def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], said: str):
@@ -69,3 +73,23 @@ def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], 
     assert said in done.err
     assert done.err.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_shift_detector_and_settings_are_told(command, tmp_path: Path):
+    (tmp_path / "shift.yaml").write_text("temperature_K: 1\nhole_velocity_low_factor: 0.97\n")
+    (tmp_path / "settings.yaml").write_text("cloud_fwhm_mm: 0.2\n")
+    done = command(
+        *("stand", "--preset", "ornl", "--events", "DEP=5", "--kind", "shifted"),
+        *("--shift", tmp_path / "shift.yaml", "--shift", "temperature_K=1.5"),
+        *("--set", "bias_V=3900", "--set", "self_repulsion=0.5"),
+        *("--settings", tmp_path / "settings.yaml", "--out", tmp_path / "stand"),
+    )
+    assert done.code == 0, done.err
+    made_by = json.loads((tmp_path / "stand" / "stand.json").read_text())
+    sim, data = made_by["sim"], made_by["data"]
+    assert sim["detector"]["bias_V"] == data["detector"]["bias_V"] == 3900
+    assert data["detector"]["temperature_K"] - sim["detector"]["temperature_K"] == 1.5
+    assert data["settings"]["hole_velocity_low_factor"] == 0.97
+    for side in (sim, data):
+        assert side["settings"]["self_repulsion"] == 0.5
+        assert side["settings"]["cloud_fwhm_mm"] == 0.2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,18 @@ import numpy.typing as npt
 import pytest
 
 from cpunet.electronics.presets import read_electronics
+from cpunet.errors import CpunetError
 from cpunet.jobs import stand_plan
 from cpunet.jobs.hit_sources import Window
 from cpunet.jobs.stand import make_stand
+from cpunet.jobs.stored_simulation import StoredSimulation
+from cpunet.simulation.again import SameHits
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.shifted import Shift
 
 # a small crystal: its library is built in a second
 DETECTOR = read_detector(
@@ -127,3 +131,76 @@ def test_pulses_of_a_library_are_those_drifted_one_by_one(
     assert np.all(error < 1 + 0.005 * gain * drifted["data.lh5/geds/raw/energy"])
     told = json.loads((tmp_path / "library" / "stand.json").read_text())
     assert told == json.loads((tmp_path / "drifted" / "stand.json").read_text())
+
+
+@pytest.mark.parametrize("preset", ["ornl", "legend200"])
+def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None:
+    settings = SimulationSettings(self_repulsion=0.3, hole_velocity_low_factor=0.95)
+    electronics = read_electronics(preset)
+    make_stand(electronics, DETECTOR, WINDOWS, EVENTS, tmp_path / "a", settings=settings)
+    stored = StoredSimulation.read(tmp_path / "a" / "sim.lh5")
+    assert stored.detector == DETECTOR
+    assert stored.settings == settings.model_copy(update={"dt_ns": electronics.dt_ns})
+    again = SameHits(stored.hits).simulate(stored.detector, stored.settings).pulses()
+    with h5py.File(tmp_path / "a" / "sim.lh5") as file:
+        np.testing.assert_array_equal(again.event_number, file["geds/sim/event_number"][()])
+        np.testing.assert_allclose(again.energy_kev, file["geds/sim/energy"][()], atol=1e-6)
+        values = file["geds/sim/waveform/values"][()]
+    # the record ends with whole samples of either period
+    kept = values.shape[1] - 1
+    np.testing.assert_allclose(again.waveforms[:, :kept], values[:, :kept], atol=1e-6)
+
+
+def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
+    shift = Shift(bias_V=20, hole_trapping_per_us=0.5, electron_trapping_per_us=0.5)
+    out = tmp_path / "a"
+    stand = (read_electronics("ornl"), DETECTOR, (WINDOWS[0],), (20,), out)
+    make_stand(*stand, kind="shifted", shift=shift)
+    told = json.loads((out / "stand.json").read_text())
+    assert Shift.model_validate(told["shift"]) == shift
+    assert told["data"]["detector"]["bias_V"] == DETECTOR.bias_V + 20
+    assert told["data"]["settings"]["hole_trapping_per_us"] == 0.5
+    assert told["sim"]["settings"]["hole_trapping_per_us"] == 0
+    assert told["data"]["settings"]["cloud_fwhm_mm"] == 0.1
+    # energies are calibrated: their median is the line's, though some of the charge is lost
+    with h5py.File(out / "data.lh5") as file:
+        energy = file["geds/raw/energy"][()]
+    label = np.load(out / "data_labels.npz")["label"]
+    assert np.median(energy[label == 2]) == pytest.approx(2614.5, rel=3e-3)
+    assert np.ptp(energy[label == 2]) > 10
+
+
+def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
+    stand = (read_electronics("ornl"), DETECTOR, WINDOWS, EVENTS, tmp_path / "a")
+    with pytest.raises(CpunetError, match="give --kind shifted"):
+        make_stand(*stand, shift=Shift(bias_V=1))
+    with pytest.raises(CpunetError, match="leave dt_ns out"):
+        make_stand(*stand, settings=SimulationSettings(dt_ns=16))
+    with pytest.raises(CpunetError, match="step_ns = 8 does not divide the 4 ns"):
+        make_stand(*stand, settings=SimulationSettings(step_ns=8))
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda file: file["geds/sim"].attrs.pop("simulation"), "give an output of cpunet"),
+        (lambda file: file.pop("geds/hits"), "give an output of cpunet simulate or"),
+        (lambda file: _set(file, "geds/sim/event_number", 0, -5), "no hit of event -5"),
+        (lambda file: _set(file, "geds/sim/event_number", slice(0, 2), 1), "same event_number"),
+        (lambda file: file["geds/sim"].attrs.update(simulation="{}"), "cannot be used by this"),
+        (lambda file: file["geds/sim"].attrs.update(simulation="{"), "truncated"),
+    ],
+)
+def test_a_file_that_cannot_be_made_again_says_why(
+    tmp_path: Path, damage: Callable[[Any], Any], said: str
+) -> None:
+    make_stand(read_electronics("ornl"), DETECTOR, WINDOWS[:1], (3,), tmp_path / "a")
+    with h5py.File(tmp_path / "a" / "sim.lh5", "r+") as file:
+        damage(file)
+    with pytest.raises(CpunetError) as raised:
+        StoredSimulation.read(tmp_path / "a" / "sim.lh5")
+    assert said in str(raised.value)
+
+
+def _set(file: h5py.File, name: str, rows: Any, value: int) -> None:
+    file[name][rows] = value

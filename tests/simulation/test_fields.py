@@ -208,3 +208,32 @@ def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
     values = {"measured_depletion_V": 2000.0, **pure}
     with pytest.raises(CpunetError, match=r"even with 1000 times .* correct .* impurity_z0"):
         scaled_to_depletion(detector.model_copy(update=values))
+
+
+@pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
+def test_any_tilt_of_the_impurities_from_the_same_solution(more: list[str]) -> None:
+    detector = read_detector("ppc", [*COARSE, *more])
+    solution = solve(detector)
+    scale, tilt = 1.1, 0.03
+    tilted = superposed_fields(
+        solution,
+        bias_V=3000,
+        impurity_scale=scale,
+        impurity_tilt=tilt,
+        temperature_K=80,
+    )
+    # solved for on its own, the impurities written down as they are
+    middle_cm = detector.crystal_length / 20
+    z0 = scale * detector.impurity_z0_1e10_per_cm3 - tilt * middle_cm
+    gradient = scale * detector.impurity_gradient_1e10_per_cm4 + tilt
+    written = {"impurity_z0_1e10_per_cm3": z0, "impurity_gradient_1e10_per_cm4": gradient}
+    alone = detector.model_copy(update=written | {"bias_V": 3000.0})
+    expected = compute_fields(alone, cache=False)
+    keyed = {"impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt, "bias_V": 3000.0}
+    read = compute_fields(detector.model_copy(update=keyed))
+    for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm"):
+        np.testing.assert_allclose(getattr(tilted, name), getattr(expected, name), atol=1e-6)
+        np.testing.assert_array_equal(getattr(tilted, name), getattr(read, name))
+    assert tilted.depletion_V == pytest.approx(expected.depletion_V, abs=1)
+    plain = superposed_fields(solution, bias_V=3000, impurity_scale=scale, temperature_K=80)
+    assert np.abs(plain.potential_V - tilted.potential_V).max() > 10

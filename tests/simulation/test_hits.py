@@ -57,3 +57,15 @@ def test_offsets_that_do_not_fit_are_refused(offsets: list[int]) -> None:
 def test_nothing_to_join_is_refused() -> None:
     with pytest.raises(CpunetError, match="no sets of hits"):
         Hits.concatenate([])
+
+
+def test_events_by_their_numbers() -> None:
+    hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], [1, 2, 4], [0, 2, 2, 3], [5, 9, 7])
+    chosen = hits.of_events([7, 6, 5, 7])
+    assert chosen.event_number.tolist() == [7, 6, 5, 7]
+    assert chosen.energy_kev.tolist() == [4, 0, 3, 4]
+    assert len(hits.of_events([])) == 0
+    twice = Hits.concatenate([hits, hits[[0]]])
+    assert twice.of_events([7]).energy_kev.tolist() == [4]
+    with pytest.raises(CpunetError, match="several events have the number 5"):
+        twice.of_events([7, 5])

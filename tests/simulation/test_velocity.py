@@ -14,6 +14,7 @@ from cpunet.simulation.velocity import (
     HOLE,
     drift_velocity,
     measured_table,
+    velocity_factor,
     velocity_table,
 )
 
@@ -58,3 +59,22 @@ def test_colder_crystals_are_faster_and_no_field_means_no_motion() -> None:
         warm = np.linalg.norm(drift_velocity(velocity_table(95), field, carrier), axis=1)
         assert cold[0] > warm[0] > 0
         assert cold[1] == warm[1] == 0
+
+
+def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:
+    factors = ((1.0, 1.0), (0.9, 1.2))
+    own, scaled = velocity_table(90), velocity_table(90, factors)
+    directions = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1]]) / np.sqrt([[1], [2], [3]])
+    for strength, factor in ((100.0, 0.9), (500.0, 1.05), (2000.0, 1.2)):
+        for direction in directions:
+            field = strength * direction[None]
+            ratio = drift_velocity(scaled, field, HOLE) @ direction
+            ratio = ratio / (drift_velocity(own, field, HOLE) @ direction)
+            assert ratio == pytest.approx(factor, rel=1e-9)
+            np.testing.assert_array_equal(
+                drift_velocity(scaled, field, ELECTRON), drift_velocity(own, field, ELECTRON)
+            )
+    field = np.geomspace(100, 3000, 4000)
+    slope = np.diff(velocity_factor(field, 0.9, 1.2)) / np.diff(np.log(field))
+    assert slope.min() >= 0
+    assert np.abs(np.diff(slope)).max() < 0.02 * slope.max()

@@ -31,7 +31,7 @@ Set = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="Override a value of the detector or the settings: --set bias_V=3500 "
+        help="Override a value of the detector or of the settings: --set bias_V=3500 "
         "(repeatable).",
     ),
 ]

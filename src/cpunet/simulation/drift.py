@@ -45,6 +45,7 @@ def drift(
     carrier: int,
     start: tuple[float, float, float],
     step_ns: float,
+    stride: int,
     cloud: tuple[float, float, float],
     signal: FloatArray,
     path: FloatArray,
@@ -53,6 +54,9 @@ def drift(
 
     Parameters
     ----------
+    step_ns, stride
+        Duration of one step, and how many short ones it stands for: it goes as far as they
+        would at a velocity that goes on changing as it did.
     cloud
         FWHM in mm at the start (0: a point), diffusion constant D/(v/E) and repulsion
         constant (see `cpunet.simulation.cloud`).
@@ -69,6 +73,8 @@ def drift(
         and what trapped charge would have added to the signal.
     """
     x, y, z = start
+    ahead = (stride - 1) / (2 * stride)
+    ux = uy = uz = 0.0
     sign = 1.0 if carrier == HOLE else -1.0
     size, diffusion, repulsion = cloud
     first = last = speed = induced = 0.0
@@ -114,6 +120,15 @@ def drift(
         speed = now
         if k == n - 1:
             break
+        if stride > 1:
+            wx, wy, wz = vx, vy, vz
+            if k > 0:
+                vx, vy, vz = (
+                    vx + ahead * (vx - ux),
+                    vy + ahead * (vy - uy),
+                    vz + ahead * (vz - uz),
+                )
+            ux, uy, uz = wx, wy, wz
         # no charge leaves through the passivated face: it slides along
         x, y, z = x + vx * step_ns, y + vy * step_ns, max(z + vz * step_ns, 0.0)
         k += 1
@@ -144,4 +159,6 @@ def _fill_paths(maps: DriftMaps, start: FloatArray, step_ns: float, paths: Float
         here = (start[i, 0], start[i, 1], start[i, 2])
         if in_active_volume(maps, here[0], here[1], here[2]):
             for carrier in range(2):
-                drift(maps, carrier, here, step_ns, (0.0, 0.0, 0.0), signal, paths[carrier, i])
+                drift(
+                    maps, carrier, here, step_ns, 1, (0.0, 0.0, 0.0), signal, paths[carrier, i]
+                )

@@ -162,10 +162,10 @@ def point_signal(
     point = (0.0, 0.0, 0.0)
     growing = (cloud[0], cloud[1], cloud[2] * hit[3])
     steps_e, arrived_e, _, _, trapped_e = drift(
-        maps, ELECTRON, start, long_ns, point, record, nowhere
+        maps, ELECTRON, start, long_ns, stride, point, record, nowhere
     )
     steps_h, arrived_h, size, speed, trapped_h = drift(
-        maps, HOLE, start, long_ns, growing, record, nowhere
+        maps, HOLE, start, long_ns, stride, growing, record, nowhere
     )
     fwhm = cloud_steps(size, speed, step_ns, cloud[3])
     if stride > 1:
