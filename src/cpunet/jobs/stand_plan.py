@@ -55,7 +55,7 @@ class Side:
         """Its pulses, finely sampled, their lines and their hits, block by block.
 
         The energies are calibrated, as a measurement's are: where charge is trapped, a
-        factor brings the median of the first block to what it was before.
+        factor brings the median of the first block's lines to what it was before.
         """
         with monitor.stage(f"Fields of {self.detector.name}"):
             fields = compute_fields(self.detector)
@@ -70,9 +70,9 @@ class Side:
                 pulses = events.pulses()
                 if len(pulses):
                     untrapped = pulses.energy_kev + events.trapped_kev[kept]
-                    gain = gain or float(np.median(untrapped / pulses.energy_kev))
-                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     labels = labels_of(untrapped, self.source.windows)
+                    gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
+                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
                 advance(len(hits))
 
@@ -176,6 +176,12 @@ def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) 
         inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
         labels[inside] = LABELS.get(window.name, OTHER)
     return labels
+
+
+def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
+    """The median of those in a line, or of all if none is."""
+    of_lines = labels != OTHER
+    return float(np.median(share[of_lines] if of_lines.any() else share))
 
 
 def _finely_sampled(

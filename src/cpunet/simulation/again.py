@@ -48,7 +48,7 @@ class SameHits:
 
     def __init__(self, hits: Hits, *, cluster_mm: float = 0.0) -> None:
         self._hits, self._cluster_mm = hits, cluster_mm
-        self._shapes: dict[str, tuple[Superposition, Hits, Hits]] = {}
+        self._shapes: dict[str, tuple[Superposition, Hits, Hits, float]] = {}
 
     def simulate(
         self,
@@ -73,7 +73,7 @@ class SameHits:
         CpunetError
             If the detector is not depleted, or a hit is no finite number.
         """
-        solution, hits, fewer = self._of(detector)
+        solution, hits, fewer, repelling = self._of(detector)
         fields = superposed_fields(
             solution,
             bias_V=detector.bias_V,
@@ -83,12 +83,19 @@ class SameHits:
             depletion=False,
         )
         if mode == "quick":
-            longer = settings.model_copy(update={"stride": max(_QUICK_STRIDE, settings.stride)})
-            return simulate_events(fields, fewer, longer)
+            longer = {
+                "stride": max(_QUICK_STRIDE, settings.stride),
+                "self_repulsion": repelling * settings.self_repulsion,
+            }
+            return simulate_events(fields, fewer, settings.model_copy(update=longer))
         return simulate_events(fields, hits, settings, mode)
 
-    def _of(self, detector: Detector) -> tuple[Superposition, Hits, Hits]:
-        """Potentials of a detector, its hits, and its hits merged more coarsely."""
+    def _of(self, detector: Detector) -> tuple[Superposition, Hits, Hits, float]:
+        """Potentials of a detector, its hits, and its hits merged more coarsely.
+
+        These repel themselves more: the last number is the factor that undoes it on
+        average.
+        """
         key = detector.fingerprint(exclude=NOT_IN_PARTS)
         if key not in self._shapes:
             distance = self._cluster_mm
@@ -97,5 +104,6 @@ class SameHits:
             if len(self._shapes) == _MOST_SHAPES:
                 # not the first, to which all others are compared
                 del self._shapes[list(self._shapes)[1]]
-            self._shapes[key] = solve(detector), fine, coarse
+            repelling = (fine.edep_kev**2).sum() / max((coarse.edep_kev**2).sum(), 1e-9)
+            self._shapes[key] = solve(detector), fine, coarse, float(repelling)
         return self._shapes[key]
