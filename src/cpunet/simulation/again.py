@@ -12,7 +12,7 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
 
-# Of quick pulses; merging by 0.2 mm misses differences of the largest current by 10 %.
+# Of quick pulses; merged within 0.2 mm, what self-repulsion changes is off by 15 %.
 _QUICK_MERGING_MM, _QUICK_STRIDE = 0.1, 4
 # Detectors of other shapes, as with another lithium layer, whose potentials are kept.
 _MOST_SHAPES = 4
