@@ -42,7 +42,7 @@ class SameHits:
     ...     same.simulate(read_detector("ppc", [f"temperature_K={t}"]), settings).waveforms
     ...     for t in (85, 95)
     ... )
-    >>> bool((warm <= cold).all())
+    >>> bool(warm.sum() < cold.sum())  # warm charges are slower
     True
     """
 
