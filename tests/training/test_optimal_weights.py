@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def band() -> Band:
 
 def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
     near = ResponseProblem(response((63.0, 39.0), 0.045), [band])
-    covariance = refine(near, [band], 6)
+    refine(near, [band], 6)
     covariance = refine(near, [band], 6)
     errors = np.sqrt(covariance.diagonal())
     truth = np.array([np.log(60), np.log(40), np.log(80), 0.05])
@@ -114,3 +115,5 @@ def test_functions_are_components_in_bins_of_the_amplitude(band: Band) -> None:
     expected = plain[:, first : first + TRAINING.components, np.newaxis] * weights[:, None]
     np.testing.assert_allclose(products, expected)
     assert (np.diff(functions.centres) > 0).all()
+    weighted = replace(readings, weights=np.arange(7.0))
+    np.testing.assert_allclose(functions.sum(weighted), np.arange(7.0) @ values)

@@ -20,6 +20,7 @@ FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
 # of a standard deviation along the worst-known direction.
 CONVERGED = 0.2
 DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
+UPDATES = 2  # steps with derivatives that were only updated
 
 
 class Problem(Protocol):
@@ -84,27 +85,33 @@ def levenberg_marquardt(
         problem.clip = clip
         residuals, damping = problem.residuals(vector), DAMPING
         cost = float(residuals @ residuals)
+        jacobian, updates = problem.jacobian(vector, residuals), 0
         for _ in range(max(1, most)):
-            jacobian = problem.jacobian(vector, residuals)
-            curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
-            for _ in range(TRIES):
-                scaled = curvature + damping * np.diag(curvature.diagonal())
-                move = -np.linalg.solve(scaled, gradient)
-                tried = vector + np.clip(move, -parameters.widths, parameters.widths)
-                found = problem.residuals(tried)
-                if float(found @ found) < cost:
-                    break
-                damping *= HARDER
-            else:
+            step = _step(problem, jacobian, vector, residuals, damping)
+            if step is None and updates:
+                # the derivatives may be too old
+                jacobian, updates = problem.jacobian(vector, residuals), 0
+                step = _step(problem, jacobian, vector, residuals, damping)
+            if step is None:
                 break
+            tried, found, damping = step
             fall = cost - float(found @ found)
+            if updates < UPDATES:
+                # Broyden's update: the derivatives as the step has shown them
+                way = (tried - vector) / parameters.widths
+                change = found - residuals - jacobian @ (tried - vector)
+                jacobian = jacobian + np.outer(change, way / parameters.widths) / (way @ way)
+                updates += 1
+            else:
+                jacobian, updates = problem.jacobian(tried, found), 0
             vector, residuals, cost = tried, found, cost - fall
-            damping /= EASIER
             taken += 1
             if listener is not None:
                 listener(taken, cost)
             if fall < CONVERGED * max(1.0, cost / problem.moments):
-                break
+                if not updates:
+                    break
+                jacobian, updates = problem.jacobian(vector, residuals), 0
     if not math.isfinite(cost):
         raise CpunetError(
             "the fit of the response diverged; check that the sets hold single pulses of one "
@@ -115,3 +122,20 @@ def levenberg_marquardt(
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
     return Minimum(cost, taken, covariance)
+
+
+def _step(
+    problem: Problem, jacobian: Values, vector: Values, residuals: Values, damping: float
+) -> tuple[Values, Values, float] | None:
+    """A step that lowers the cost, what is left after it, and the next damping."""
+    widths, cost = problem.parameters.widths, residuals @ residuals
+    curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
+    for _ in range(TRIES):
+        scaled = curvature + damping * np.diag(curvature.diagonal())
+        move = -np.linalg.solve(scaled, gradient)
+        tried = vector + np.clip(move, -widths, widths)
+        found = problem.residuals(tried)
+        if found @ found < cost:
+            return tried, found, damping / EASIER
+        damping *= HARDER
+    return None

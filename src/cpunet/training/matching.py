@@ -163,7 +163,7 @@ def fit_response(
     require_energies(sim.energy_kev)
     sets = _Sets(sim, data, noise, recipe, rng)
     some = sets.bands(training.search_pulses)
-    first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some)
+    first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
     if listener is not None:
         listener = _counted(listener)
     near = None if known is None else _from_known(first, known, training, listener)

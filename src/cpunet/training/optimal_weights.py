@@ -16,7 +16,7 @@ found; the parameters are those at which the means of t agree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,9 +30,11 @@ from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 LEAST_BIN = 0.006
 RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
-# A direction counts if pulses tell it this many times better than its prior; the longest step,
-# in widths of the priors; and the fall of the sum of squares with which it ends.
-LEAST_TOLD, LONGEST, CONVERGED, PASSES = 10.0, 0.3, 0.1, 6
+# A direction counts if pulses tell it this many times better than its prior.
+LEAST_TOLD = 10.0
+# Passes over all pulses at most, the fall of the sum of squares with which they end, and the
+# factor of the damping.
+PASSES, CONVERGED, HARDER = 8, 0.1, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,15 @@ class ConditionalFunctions:
         both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
         return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
 
+    def sum(self, readings: Readings) -> Values:
+        """Weighted sum of the functions over pulses, without making all of each pulse."""
+        values = self.moments.functions(readings)
+        first = len(self.moments.config.segments) - 1
+        components = values[:, first : first + self.moments.config.components]
+        bins = readings.weights[:, np.newaxis] * self.density(readings.log_amplitude)
+        both = components.T @ bins
+        return np.concatenate([readings.weights @ values, bins.sum(axis=0), both.ravel()])
+
     def density(self, log_amplitude: Values) -> Values:
         """Bins of the current amplitude, shape (pulses, bins)."""
         distance = (log_amplitude[:, np.newaxis] - self.centres) / self.widths
@@ -93,31 +104,38 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     parameters = near.parameters
     weighted = [_Weighted(band, parameters, bins) for band in bands]
     slopes = np.concatenate([w.slopes for w in weighted])
-    inverse_widths = 1 / parameters.widths
-    _, sizes, directions = np.linalg.svd(slopes / inverse_widths, full_matrices=False)
-    told = directions[sizes > LEAST_TOLD].T / inverse_widths[:, np.newaxis]
-    columns = np.concatenate([slopes, np.diag(inverse_widths)]) @ told
+    widths = parameters.widths
+    _, sizes, directions = np.linalg.svd(slopes * widths, full_matrices=False)
+    # what is told well, in units of the priors' widths
+    told = directions[sizes > LEAST_TOLD].T * widths[:, np.newaxis]
+    columns = np.concatenate([slopes, np.diag(1 / widths)]) @ told
 
     def residuals(vector: Values) -> Values:
         parameters.set(vector)
         found = [w.deviations(parameters.response) for w in weighted]
-        return np.concatenate([*found, (vector - parameters.centre) * inverse_widths])
+        return np.concatenate([*found, (vector - parameters.centre) / widths])
 
-    vector = parameters.vector()
-    left = residuals(vector)
+    parameters.set(_descend(residuals, parameters.vector(), told, columns))
+    return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(widths**-2.0)))
+
+
+def _descend(
+    residuals: Callable[[Values], Values], vector: Values, told: Values, columns: Values
+) -> Values:
+    """Levenberg's steps along the directions that are told, with the same derivatives."""
+    left, damping = residuals(vector), 0.0
     for _ in range(PASSES):
-        move = told @ np.linalg.lstsq(columns, -left)[0]
-        tried = vector + np.clip(move, -LONGEST / inverse_widths, LONGEST / inverse_widths)
+        curvature = columns.T @ columns + damping * np.eye(columns.shape[1])
+        tried = vector - told @ np.linalg.solve(curvature, columns.T @ left)
         found = residuals(tried)
-        if found @ found >= left @ left:
-            break
         fall = left @ left - found @ found
-        vector, left = tried, found
+        if fall <= 0:
+            damping = max(HARDER * damping, LEAST_TOLD**2)
+            continue
+        vector, left, damping = tried, found, damping / HARDER
         if fall < CONVERGED:
             break
-    parameters.set(vector)
-    information = slopes.T @ slopes + np.diag(inverse_widths**2)
-    return np.asarray(np.linalg.inv(information))
+    return vector
 
 
 class _Weighted:
@@ -133,17 +151,17 @@ class _Weighted:
         self.weights = np.linalg.solve(correlation, slopes / sigma[:, np.newaxis])
         self.weights /= sigma[:, np.newaxis]
         data = band.moments.data
-        of_data = np.concatenate(
-            [self.functions(data[rows]) @ self.weights for rows in _blocks(len(data))]
-        )
-        self.wanted = of_data.mean(axis=0)
+        total = sum(self.functions.sum(data[rows]) for rows in _blocks(len(data)))
+        self.wanted = total / len(data) @ self.weights
+        some = data[slice(0, FOR_WEIGHTS)]
+        of_data = self.functions(some) @ self.weights
         spread = np.cov(of_data.T).reshape(len(self.wanted), -1) / band.pairs
         self.whiten = scipy.linalg.cholesky(np.linalg.inv(spread))
         self.slopes = self.whiten @ self.weights.T @ slopes
 
     def deviations(self, response: ElectronicsResponse) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
-            return (readings.weights @ self.functions(readings),)
+            return (self.functions.sum(readings),)
 
         (total,), n = self.band.sim.sums(response, of)
         return np.asarray(self.whiten @ (total / n @ self.weights - self.wanted))
@@ -157,9 +175,7 @@ def _slopes(band: Band, functions: ConditionalFunctions, parameters: Parameters)
     """Derivatives of the functions' means with the parameters, (functions, parameters)."""
 
     def mean() -> Values:
-        (total,), n = sim.sums(
-            parameters.response, lambda r: (r.weights @ functions(r),), draws=1
-        )
+        (total,), n = sim.sums(parameters.response, lambda r: (functions.sum(r),), draws=1)
         return np.asarray(total / n)
 
     sim, vector, columns = band.sim.first(FOR_WEIGHTS), parameters.vector(), []

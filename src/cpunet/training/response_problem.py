@@ -102,12 +102,16 @@ class ResponseProblem:
         To be fitted.
     bands
         What is compared: moments of one band follow those of another.
+    draws
+        Of the noise, for each pulse; None for all that there are.
     """
 
-    def __init__(self, response: ElectronicsResponse, bands: Sequence[Band]) -> None:
-        self.parameters, self.bands = Parameters(response), tuple(bands)
+    def __init__(
+        self, response: ElectronicsResponse, bands: Sequence[Band], draws: int | None = None
+    ) -> None:
+        self.parameters, self.bands, self.draws = Parameters(response), tuple(bands), draws
         self.clip: float | None = None
-        self._comparisons = [_Comparison(band, None) for band in self.bands]
+        self._comparisons = [_Comparison(band, None, draws) for band in self.bands]
 
     @property
     def response(self) -> ElectronicsResponse:
@@ -151,13 +155,15 @@ class ResponseProblem:
         edge would then bend the response to its liking; current amplitude, top and tail
         decide instead, see `Moments.model_errors`.
         """
-        self._comparisons = [_Comparison(b, b.moments.model_errors) for b in self.bands]
+        self._comparisons = [
+            _Comparison(b, b.moments.model_errors, self.draws) for b in self.bands
+        ]
 
     def of(
         self, response: ElectronicsResponse, bands: Sequence[Band] | None = None
     ) -> ResponseProblem:
         """The comparison for another response, or other pulses, with the priors about it."""
-        return ResponseProblem(response, bands or self.bands)
+        return ResponseProblem(response, bands or self.bands, self.draws)
 
     def pulls(self, vector: Values) -> Values:
         """Deviations of the moments in standard deviations, correlated as they are."""
@@ -197,8 +203,8 @@ class ResponseProblem:
 class _Comparison:
     """One band: what its moments are to be, and how well they are known."""
 
-    def __init__(self, band: Band, model_errors: Values | None) -> None:
-        self.sim, self.moments = band.sim, band.moments
+    def __init__(self, band: Band, model_errors: Values | None, draws: int | None) -> None:
+        self.sim, self.moments, self.draws = band.sim, band.moments, draws
         values = self.moments.values
         self.wanted = values.mean(axis=0)
         covariance = np.cov(values.T) / band.pairs
@@ -215,5 +221,5 @@ class _Comparison:
             return (readings.weights @ self.moments.functions(readings, clip),)
 
         # far from the data many tails are beyond theirs, and none is to be left out
-        (total,), n = self.sim.sums(response, of, cut=clip is None)
+        (total,), n = self.sim.sums(response, of, cut=clip is None, draws=self.draws)
         return np.asarray((total / max(n, 1e-9) - self.wanted) / self.sigma)
