@@ -122,6 +122,12 @@ def held() -> ModuleType:
     return module
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the figures of reports empty: to draw them takes most of a small report's time."""
+    monkeypatch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
+
+
 @pytest.fixture(scope="session")
 def reference_data() -> Path:
     """Folder of the optional reference data; the test skips without it."""

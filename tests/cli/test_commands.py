@@ -235,7 +235,7 @@ def test_the_report_is_complete(report):
 
 
 def test_a_peak_without_pulses_is_told_and_the_others_are_scored(
-    command, trained, stand, tmp_path
+    command, trained, stand, tmp_path, undrawn
 ):
     below = stand.data_kev < 2200
     data = stand.write(
@@ -268,7 +268,7 @@ def test_info_of_files_and_runs(command, stand, trained):
 
 @pytest.mark.parametrize("what", ["train", "translate", "validate"])
 def test_existing_output_is_refused_and_with_force_replaced(
-    command, trained, stand, tiny, tmp_path, what
+    command, trained, stand, tiny, tmp_path, undrawn, what
 ):
     out = tmp_path / ("out.lh5" if what == "translate" else "out")
     words = {
@@ -329,7 +329,7 @@ def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):
         command(*words, "svg", "FEP mean pulse", "--seed", 1)
 
 
-def test_figures_of_a_report(command, trained, stand, tmp_path, unscorable):
+def test_figures_of_a_report(command, trained, stand, tmp_path, undrawn, unscorable):
     report, out = tmp_path / "report", tmp_path / "figures"
     words = ("validate", trained, *stand.inputs, "--no-rivals", "--out", report)
     assert command(*words).code == 0

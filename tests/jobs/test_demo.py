@@ -43,6 +43,8 @@ OPTIONS = {
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
+        # to draw them takes most of the time
+        patch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
         yield
 
 

@@ -86,18 +86,13 @@ def measured(records: FloatArray, noise: float = NOISE, seed: int = 5) -> FloatA
 
 
 @pytest.fixture(scope="module")
-def sim_fine() -> FloatArray:
-    return ideal(1600, seed=1)
-
-
-@pytest.fixture(scope="module")
-def sim(sim_fine: FloatArray) -> FloatArray:
-    return simulated(sim_fine)
+def sim() -> FloatArray:
+    return simulated(ideal(800, seed=1))
 
 
 @pytest.fixture(scope="module")
 def other_fine() -> FloatArray:
-    return ideal(1600, seed=2)
+    return ideal(800, seed=2)
 
 
 @pytest.mark.parametrize(("sigma_ns", "tau_ns"), [(30.0, 60.0), (20.0, 90.0)])
@@ -143,8 +138,9 @@ def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     np.testing.assert_allclose(steps[0, LEAD + 8 : 60], shifted[LEAD + 8 :], atol=0.01)
 
 
-def test_free_kernel_comes_closest_to_the_truth(sim, sim_fine, other_fine) -> None:
-    kernel = two_pole_kernel()
+def test_free_kernel_comes_closest_to_the_truth() -> None:
+    sim_fine, other_fine = ideal(1600, seed=1), ideal(1600, seed=2)
+    sim, kernel = simulated(sim_fine), two_pole_kernel()
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
     truth = finish(decayed(sampled(convolved(sim_fine, kernel)), DT_NS), CONFIG, dt_ns=DT_NS)
     pulses = Pulses.of(sim, dt_ns=DT_NS)
