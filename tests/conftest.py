@@ -14,7 +14,8 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import platformdirs
 import pytest
@@ -120,6 +121,25 @@ def held() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do in this process what others would be started for, which takes each of them seconds."""
+    from cpunet.errors import CpunetError
+    from cpunet.jobs.workers import Link, Outcome
+
+    def work_off(begin: Any, items: Any, **_options: Any) -> Iterator[Outcome]:
+        work = begin(Link(SimpleNamespace(send=lambda _message: None)))  # type: ignore[arg-type]
+        for item in items:
+            try:
+                outcome = Outcome(item, work(item))
+            except (CpunetError, OSError) as error:
+                outcome = Outcome(item, failure=str(error))
+            yield outcome
+
+    monkeypatch.setattr("cpunet.jobs.ensemble.work_off", work_off)
+    monkeypatch.setattr("cpunet.jobs.tune.work_off", work_off)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["INT", "KILL"])
 def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
-    stand, tiny, held, command, tmp_path: Path, how
+    stand, tiny, held, command, no_pool, tmp_path: Path, how
 ):
     folder = tmp_path / "ens"
     more = [word for value in held.SETTINGS for word in ("--set", value)]
@@ -49,7 +49,7 @@ def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
     assert not list(folder.glob("*.unfinished"))
 
 
-def test_a_table_and_a_figure(stand, tiny, command, tmp_path):
+def test_a_table_and_a_figure(stand, tiny, command, tmp_path, no_pool):
     folder = tmp_path / "ens"
     words = [*stand.inputs, "--out", folder, "--seeds", 1, "--truth", stand.truth, *tiny]
     done = command("ensemble", *words)

@@ -114,7 +114,7 @@ def test_the_ensemble_tells_of_its_seeds(made):
     assert row["worst"] == pytest.approx(np.quantile(scores, 0.05))
 
 
-def test_going_on_keeps_what_is_finished_and_records_what_fails(files, made, tmp_path):
+def test_going_on_keeps_what_is_finished_and_records_what_fails(files, made, tmp_path, no_pool):
     folder = Path(shutil.copytree(made.folder, tmp_path / "ens"))
     before = (folder / "seed_000" / "run.json").stat().st_mtime_ns
     shutil.rmtree(folder / "seed_001")

@@ -29,6 +29,7 @@ before = library.mallinfo2().hblkhd
 large = library.malloc(16 << 20)
 apart = library.mallinfo2().hblkhd - before
 library.free(large)
+fill = [library.malloc(64 << 10) for _ in range(1024)]  # what was free in the heap is not now
 for piece in [library.malloc(64 << 10) for _ in range(1024)]:
     library.free(piece)
 print(apart, library.mallinfo2().keepcost)

@@ -195,7 +195,7 @@ def test_a_process_is_gone_before_anyone_asks_how_it_ended():
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_search_that_was_killed_goes_on(files, held, tmp_path, monkeypatch, capsys):
+def test_a_search_that_was_killed_goes_on(files, held, tmp_path, monkeypatch, capsys, no_pool):
     pytest.importorskip("optuna")
     folder = tmp_path / "tune"
     values = [word for value in TINY for word in ("--set", value)]

@@ -142,22 +142,22 @@ def test_while_judging_only_the_norm_is_in_evaluation(tiny, batches):
 
 def test_discriminator_rates_follow_the_iterations(tiny, batches):
     recipe = tiny(
-        "training.iterations=61",
-        "training.decay_start=20",
-        "training.discriminator_interval=30",
+        "training.iterations=31",
+        "training.decay_start=10",
+        "training.discriminator_interval=15",
     )
     step = make_step(recipe)
     rates = []
-    for iteration in range(61):
+    for iteration in range(31):
         rates.append([o.param_groups[0]["lr"] for o in (step.generators, *step.discriminators)])
         step(iteration, *batches)
     start = np.array(
         [recipe.training.rate_generators, *2 * [recipe.training.rate_discriminators]]
     )
-    expected = np.minimum(1, (61 - np.arange(61)) / 41)[:, None] * start
+    expected = np.minimum(1, (31 - np.arange(31)) / 21)[:, None] * start
     np.testing.assert_allclose(rates, expected)
-    # their last update, at iteration 60, is taken at 1/41 of the first rate
-    assert rates[60][1] == pytest.approx(recipe.training.rate_discriminators / 41)
+    # their last update, at iteration 30, is taken at 1/21 of the first rate
+    assert rates[30][1] == pytest.approx(recipe.training.rate_discriminators / 21)
     assert step.discriminators[0].param_groups[0]["lr"] == 0
 
 
