@@ -27,6 +27,7 @@ from cpunet.analysis.distances import (
     null_distances,
     wasserstein,
 )
+from cpunet.analysis.resampling import both_resampled, resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 
@@ -123,7 +124,7 @@ def test_an_empty_set_has_no_score():
     assert np.isnan(iou(np.array([]), np.array([0.5]), UNIT))
     assert np.isnan(wasserstein(np.array([]), np.array([0.5])))
     assert np.isnan(kolmogorov_smirnov(np.array([np.nan]), np.array([0.5])))
-    assert np.isnan(iou_error(np.array([]), np.array([0.5]), UNIT, 5, 0))
+    assert np.isnan(iou_error(np.array([]), np.array([0.5]), UNIT, both_resampled(0, 1, 5, 0)))
 
 
 def test_two_samples_of_one_distribution_score_near_the_ceiling():
@@ -131,11 +132,11 @@ def test_two_samples_of_one_distribution_score_near_the_ceiling():
     rng = np.random.default_rng(3)
     n_data, n_sim = 800, 900
     real, ceilings, errors = [], [], []
-    for draw in range(150):
+    for draw in range(400):
         data, sim = rng.normal(size=n_data), rng.normal(size=n_sim)
         axis = data_axis(data, 49)
         real.append(iou(data, sim, axis))
-        mean, error = ceiling(data, n_sim, n_data, axis, 50, draw)
+        mean, error = ceiling(data, axis, resampled_twice(n_data, n_sim, n_data, 50, draw))
         ceilings.append(mean)
         errors.append(error)
     assert np.mean(real) == pytest.approx(np.mean(ceilings), abs=1.0)
@@ -147,7 +148,8 @@ def test_two_samples_of_one_distribution_score_near_the_ceiling():
 def test_the_ceiling_rises_with_the_number_of_events():
     data = np.random.default_rng(0).normal(size=1000)
     axis = data_axis(data, 49)
-    means = [ceiling(data, n, n, axis, 50, 1)[0] for n in (100, 1000, 100_000)]
+    sizes = (100, 1000, 100_000)
+    means = [ceiling(data, axis, resampled_twice(1000, n, n, 50, 1))[0] for n in sizes]
     assert means == sorted(means)
     assert means[-1] > 98
 
@@ -159,7 +161,7 @@ def test_iou_error_is_the_spread_over_repeated_samples():
     for draw in range(150):
         a, b = rng.normal(0, 1, 500), rng.normal(1, 1, 600)
         scores.append(iou(a, b, axis))
-        errors.append(iou_error(a, b, axis, 50, draw))
+        errors.append(iou_error(a, b, axis, both_resampled(500, 600, 50, draw)))
     assert np.std(scores) == pytest.approx(np.mean(errors), rel=0.3)
 
 
@@ -170,7 +172,7 @@ def test_iou_error_near_the_ceiling_is_a_sixth_too_large():
     for draw in range(200):
         a, b = rng.normal(size=500), rng.normal(size=600)
         scores.append(iou(a, b, axis))
-        errors.append(iou_error(a, b, axis, 50, draw))
+        errors.append(iou_error(a, b, axis, both_resampled(500, 600, 50, draw)))
     assert np.mean(errors) / np.std(scores) == pytest.approx(1.15, abs=0.2)
 
 
@@ -196,8 +198,9 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
     for _ in range(draws):
         data, sim = SHAPES[shape](rng, n_data), SHAPES[shape](rng, n_sim)
         axis = data_axis(data, 49)
-        mean, std = ceiling(data, n_sim, n_data, axis, 80, rng)
-        null = null_distances(data, n_sim, n_data, 80, rng)
+        pairs = resampled_twice(n_data, n_sim, n_data, 80, rng)
+        mean, std = ceiling(data, axis, pairs)
+        null = null_distances(data, pairs)
         apart = {
             "iou": (mean - iou(data, sim, axis), std),
             "w1": (wasserstein(data, sim) - null.wasserstein, null.wasserstein_std),
@@ -220,8 +223,14 @@ def test_errors_of_distances_are_the_scatter_of_fresh_samples():
     for draw in range(150):
         a, b = rng.normal(size=500), rng.normal(0.5, 1.2, 600)
         found.append((wasserstein(a, b), kolmogorov_smirnov(a, b)))
-        errors.append(distance_errors(a, b, 50, draw))
+        errors.append(distance_errors(a, b, both_resampled(500, 600, 50, draw)))
     assert np.mean(errors, axis=0) == pytest.approx(np.std(found, axis=0), rel=0.2)
+
+
+def on_grid(values: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Histogram of finite values as one draw."""
+    bins = distances._bins(values, upper)
+    return np.bincount(bins, minlength=len(upper)).astype(np.float32)[:, np.newaxis]
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3])
@@ -231,11 +240,11 @@ def test_distances_on_the_grid_against_scipy(shape, shift):
     rng = np.random.default_rng(8)
     a, b = SHAPES[shape](rng, 4000), SHAPES[shape](rng, 5000) + shift
     a[:2], b[0] = (1e5, -1e4), 3e5
-    null = null_distances(SHAPES[shape](rng, 4000), 4000, 5000, 20, 0)
+    null = null_distances(SHAPES[shape](rng, 4000), resampled_twice(4000, 4000, 5000, 20, 0))
     drawn = [np.random.default_rng(i).choice(v, len(v)) for i, v in enumerate((a, b))]
     upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
     assert len(upper) <= distances.NODES
-    counts = [distances._counts(v, upper) for v in drawn]
+    counts = [on_grid(v, upper) for v in drawn]
     assert [c.sum() for c in counts] == [4000, 5000]
     w1, ks = distances._distances(counts[0], counts[1], positions)
     exact = scipy.stats.wasserstein_distance(*drawn)
@@ -250,9 +259,7 @@ def test_distances_of_few_values_on_the_grid_are_exact(a, b):
     if not (a.size and b.size):
         return
     upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
-    w1, ks = distances._distances(
-        distances._counts(a, upper), distances._counts(b, upper), positions
-    )
+    w1, ks = distances._distances(on_grid(a, upper), on_grid(b, upper), positions)
     assert w1 == pytest.approx(scipy.stats.wasserstein_distance(a, b), rel=1e-9, abs=1e-9)
     assert ks == pytest.approx(kolmogorov_smirnov(a, b), abs=1e-9)
     if a.size > 1 and b.size > 1:  # of single values SciPy's p-value divides by zero
@@ -262,7 +269,7 @@ def test_distances_of_few_values_on_the_grid_are_exact(a, b):
 def test_the_null_of_a_uniform_distribution_is_known():
     """The KS distance follows Kolmogorov's law, and W1 is the area under a bridge."""
     data = np.random.default_rng(9).uniform(size=5000)
-    null = null_distances(data, 5000, 5000, 400, 1)
+    null = null_distances(data, resampled_twice(5000, 5000, 5000, 400, 1))
     law = scipy.stats.kstwobign
     scale = np.sqrt(2 / 5000)
     assert null.ks == pytest.approx(law.mean() * scale, rel=0.06)
@@ -273,36 +280,26 @@ def test_the_null_of_a_uniform_distribution_is_known():
 
 def test_null_distances_shrink_with_the_number_of_events():
     data = np.random.default_rng(10).normal(size=1000)
-    nulls = [null_distances(data, n, n, 50, 1) for n in (100, 1000, 10_000)]
+    sizes = (100, 1000, 10_000)
+    nulls = [null_distances(data, resampled_twice(1000, n, n, 50, 1)) for n in sizes]
     for values in zip(*nulls, strict=True):
         assert list(values) == sorted(values, reverse=True)
 
 
-@pytest.mark.parametrize("size", [2, 50])  # events are drawn, or the counts of bins
-def test_resampled_histograms_are_multinomial(size):
-    counts = np.array([0.0, 1, 3, 0, 6])
-    drawn = distances.resampled(counts, size, 20_000, np.random.default_rng(12))
-    assert drawn.shape == (20_000, 5)
-    assert set(drawn.sum(axis=1)) == {size}
-    p = counts / 10
-    assert drawn.mean(axis=0) == pytest.approx(size * p, rel=0.03)
-    covariance = size * (np.diag(p) - np.outer(p, p))
-    assert np.cov(drawn.T) == pytest.approx(covariance, abs=0.03 * size)
-
-
 def test_distances_without_values_have_no_error_and_no_null():
     nothing, some = np.array([np.nan]), np.array([1.0, 2.0])
-    assert np.isnan(distance_errors(nothing, some, 5, 0)).all()
-    assert np.isnan(null_distances(nothing, 5, 5, 5, 0)).all()
-    assert np.isnan(null_distances(some, 0, 5, 5, 0)).all()
+    assert np.isnan(distance_errors(nothing, some, both_resampled(1, 2, 5, 0))).all()
+    assert np.isnan(null_distances(nothing, resampled_twice(1, 5, 5, 5, 0))).all()
+    assert np.isnan(null_distances(some, resampled_twice(2, 0, 5, 5, 0))).all()
 
 
 def test_one_event_and_equal_values():
     one, same = np.array([3.0]), np.full(50, 3.0)
     for data in (one, same):
-        assert null_distances(data, 10, 10, 5, 0) == (0, 0, 0, 0)
-        assert distance_errors(data, same, 5, 0) == (0, 0)
-        assert ceiling(data, 10, 10, data_axis(data, 49), 5, 0) == (100, 0)
+        pairs = resampled_twice(len(data), 10, 10, 5, 0)
+        assert null_distances(data, pairs) == (0, 0, 0, 0)
+        assert distance_errors(data, same, both_resampled(len(data), 50, 5, 0)) == (0, 0)
+        assert ceiling(data, data_axis(data, 49), pairs) == (100, 0)
 
 
 def test_distances_against_known_shifts():

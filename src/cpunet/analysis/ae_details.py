@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.analysis.comparisons import ceiling, data_axis, iou, iou_error
+from cpunet.analysis.resampling import Resampled, resampled_twice
 from cpunet.errors import CpunetError
 
 Values = npt.NDArray[np.float64]
@@ -201,9 +202,13 @@ def _overlaps(
     data = cells["data"]
     methods = {m: values for m, values in cells.items() if m != "data"}
     n_sim = max(map(len, methods.values()), default=len(data))
-    mean, std = ceiling(data, n_sim, len(data), axis, bootstraps, rng)
+    null = resampled_twice(len(data), n_sim, len(data), bootstraps, rng)
+    mean, std = ceiling(data, axis, null)
+    errors = {
+        m: iou_error(data, v, axis, (null[1], Resampled.of(len(v), len(v), bootstraps, rng)))
+        for m, v in methods.items()
+    }
     return {
         "iou": {m: iou(data, v, axis) for m, v in methods.items()} | {"ceiling": mean},
-        "iou_std": {m: iou_error(data, v, axis, bootstraps, rng) for m, v in methods.items()}
-        | {"ceiling": std},
+        "iou_std": errors | {"ceiling": std},
     }

@@ -18,9 +18,9 @@ from cpunet.analysis.distances import (
     distance_errors,
     kolmogorov_smirnov,
     null_distances,
-    resampled,
     wasserstein,
 )
+from cpunet.analysis.resampling import Bins, Draws, Resampled, resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import ScoreConfig
 
@@ -136,44 +136,43 @@ def iou(a: Values, b: Values, axis: hist.axis.Regular) -> float:
     return float(_overlap(histogram(a, axis), histogram(b, axis)))
 
 
-def ceiling(
-    data: Values,
-    n_sim: int,
-    n_data: int,
-    axis: hist.axis.Regular,
-    bootstraps: int,
-    seed: int | np.random.Generator,
-) -> tuple[float, float]:
+def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float, float]:
     """IoU of the data with itself: what a perfect translation would score.
 
     Two sets are drawn from the data with replacement, one as large as the simulated
     set and one as large as the measured one, again and again.
 
+    Parameters
+    ----------
+    data, axis
+        As for `iou`.
+    draws
+        See `cpunet.analysis.resampling.resampled_twice`.
+
     Returns
     -------
     tuple of float
-        Mean and standard deviation of the IoU in percent over the `bootstraps` draws.
+        Mean and standard deviation of the IoU in percent over the draws.
     """
-    rng = np.random.default_rng(seed)
-    counts = histogram(data, axis)
-    scores = _overlap(*(resampled(counts, n, bootstraps, rng) for n in (n_sim, n_data)))
+    bins, n_bins = _bins(data, axis)
+    scores = _overlap(*(of_set.counts(bins, n_bins) for of_set in draws))
     return float(scores.mean()), float(scores.std())
 
 
-def iou_error(
-    a: Values,
-    b: Values,
-    axis: hist.axis.Regular,
-    bootstraps: int,
-    seed: int | np.random.Generator,
-) -> float:
+def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> float:
     """Standard deviation, in percent, of `iou` under resampling of both sets.
 
-    Near the ceiling it is a sixth larger than the scatter of fresh samples.
+    Near the ceiling it is a sixth larger than the scatter of fresh samples.  The draws are
+    those of `cpunet.analysis.resampling.both_resampled`.
     """
-    rng = np.random.default_rng(seed)
-    drawn = (resampled(histogram(v, axis), len(v), bootstraps, rng) for v in (a, b))
+    drawn = (d.counts(*_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
     return float(_overlap(*drawn).std())
+
+
+def _bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
+    """Place of each value in `histogram`, and how many places there are."""
+    places = np.asarray(axis.index(values)) + 1
+    return np.where(np.isnan(values), axis.size + 2, places), axis.size + 3
 
 
 def compare(
@@ -220,76 +219,76 @@ def compare(
     CpunetError
         If a method lacks a parameter of the data.
     """
-    # each has its own, so that neither changes the other's numbers
-    rng, distance_rng = (np.random.default_rng(s) for s in (seed, (seed, 1)))
     for method, values in methods.items():
         if absent := data.keys() - values.keys():
             raise CpunetError(f"{method}: parameter {min(absent)} is missing; compute it too")
-    return {
-        name: _compare_one(
-            values, {m: p[name] for m, p in methods.items()}, scores, rng, distance_rng
-        )
-        for name, values in data.items()
+    if not data:
+        return {}
+    # the same events of the data are drawn for all parameters and methods
+    rng, n_data = np.random.default_rng(seed), len(next(iter(data.values())))
+    sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
+    n_sim = max(sizes.values(), default=0)
+    null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
+    found = {
+        name: _of_data(values, list(methods), null, scores) for name, values in data.items()
     }
+    own = null[1]
+    del null
+    for method, values in methods.items():
+        draws = (own, Resampled.of(sizes[method], sizes[method], scores.bootstraps, rng))
+        for name in data:
+            _add_method(found[name], method, data[name], values[name], draws)
+    return found
 
 
-def _compare_one(
-    data: Values,
-    methods: Mapping[str, Values],
-    scores: ScoreConfig,
-    rng: np.random.Generator,
-    distance_rng: np.random.Generator,
-) -> Comparison:
-    draws = scores.bootstraps
-    errors = {m: distance_errors(data, v, draws, distance_rng) for m, v in methods.items()}
-    n_sim = max((int(np.isfinite(v).sum()) for v in methods.values()), default=0)
-    null = null_distances(data, n_sim, int(np.isfinite(data).sum()), draws, distance_rng)
+def _of_data(data: Values, methods: list[str], null: Draws, scores: ScoreConfig) -> Comparison:
+    """What the data say of themselves; the methods' numbers are not there yet."""
+    distances = null_distances(data, null)
     result = Comparison(
         iou=dict.fromkeys([*methods, "ceiling"]),
         iou_std=dict.fromkeys([*methods, "ceiling"]),
-        wasserstein={m: _or_none(wasserstein(data, v)) for m, v in methods.items()},
-        wasserstein_std={m: _or_none(w1) for m, (w1, _) in errors.items()},
-        wasserstein_null=_or_none(null.wasserstein),
-        wasserstein_null_std=_or_none(null.wasserstein_std),
-        ks={m: _or_none(kolmogorov_smirnov(data, v)) for m, v in methods.items()},
-        ks_std={m: _or_none(ks) for m, (_, ks) in errors.items()},
-        ks_null=_or_none(null.ks),
-        ks_null_std=_or_none(null.ks_std),
-        missing={m: int(np.isnan(v).sum()) for m, v in {"data": data, **methods}.items()},
+        wasserstein=dict.fromkeys(methods),
+        wasserstein_std=dict.fromkeys(methods),
+        wasserstein_null=_or_none(distances.wasserstein),
+        wasserstein_null_std=_or_none(distances.wasserstein_std),
+        ks=dict.fromkeys(methods),
+        ks_std=dict.fromkeys(methods),
+        ks_null=_or_none(distances.ks),
+        ks_null_std=_or_none(distances.ks_std),
+        missing={"data": int(np.isnan(data).sum())},
         axis=dict.fromkeys(("low", "high", "bins")),
     )
     if np.isfinite(data).any():
-        _add_overlap(result, data, methods, scores, rng)
+        axis = data_axis(data, scores.max_bins)
+        mean, std = ceiling(data, axis, null)
+        result["iou"]["ceiling"], result["iou_std"]["ceiling"] = _or_none(mean), _or_none(std)
+        low, high = axis.edges[[0, -1]].tolist()
+        result["axis"] = {"low": low, "high": high, "bins": axis.size}
     return result
 
 
-def _add_overlap(
-    result: Comparison,
-    data: Values,
-    methods: Mapping[str, Values],
-    scores: ScoreConfig,
-    rng: np.random.Generator,
+def _add_method(
+    result: Comparison, method: str, data: Values, values: Values, draws: Draws
 ) -> None:
-    """Fill in what depends on the binning."""
-    axis = data_axis(data, scores.max_bins)
-    for method, values in methods.items():
+    """Fill in the numbers of one method."""
+    w1_error, ks_error = distance_errors(data, values, draws)
+    result["wasserstein"][method] = _or_none(wasserstein(data, values))
+    result["wasserstein_std"][method] = _or_none(w1_error)
+    result["ks"][method] = _or_none(kolmogorov_smirnov(data, values))
+    result["ks_std"][method] = _or_none(ks_error)
+    result["missing"][method] = int(np.isnan(values).sum())
+    binning = result["axis"]
+    if binning["bins"]:
+        axis = hist.axis.Regular(int(binning["bins"]), binning["low"], binning["high"])
         result["iou"][method] = _or_none(iou(data, values, axis))
-        result["iou_std"][method] = _or_none(
-            iou_error(data, values, axis, scores.bootstraps, rng)
-        )
-    n_sim = max(map(len, methods.values()), default=0)
-    mean, std = ceiling(data, n_sim, len(data), axis, scores.bootstraps, rng)
-    result["iou"]["ceiling"], result["iou_std"]["ceiling"] = _or_none(mean), _or_none(std)
-    low, high = axis.edges[[0, -1]].tolist()
-    result["axis"] = {"low": low, "high": high, "bins": axis.size}
+        result["iou_std"][method] = _or_none(iou_error(data, values, axis, draws))
 
 
-def _overlap(a: Values, b: Values) -> Values:
-    """IoU in percent of histograms along the last axis; NaN where one is empty."""
-    sums = [h.sum(axis=-1, keepdims=True) for h in (a, b)]
+def _overlap(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> Values:
+    """IoU in percent of histograms along the first axis; NaN where one is empty."""
     with np.errstate(invalid="ignore"):
-        a, b = a / sums[0], b / sums[1]
-    return np.asarray(100 * np.minimum(a, b).sum(axis=-1) / np.maximum(a, b).sum(axis=-1))
+        a, b = (h / h.sum(axis=0, dtype=float) for h in (a, b))
+        return np.asarray(100 * np.minimum(a, b).sum(axis=0) / np.maximum(a, b).sum(axis=0))
 
 
 def _or_none(value: float) -> float | None:

@@ -6,9 +6,9 @@ samples that are drawn from the data themselves.
 
 Distances between the sets themselves are exact.  Those of their bootstraps are computed all at
 once on a common grid: the pooled values' quantiles, with each of the outermost values in
-a bin of its own.  The events of a bin stand at its mean, and a bootstrap's counts are
-multinomial.  With 256 bins and thousands of events, W1 is right within a twentieth of
-its null and KS within 0.004; sets of fewer values than bins are treated exactly.
+a bin of its own.  The events of a bin stand at its mean.  With 256 bins and thousands of
+events, W1 is right within a twentieth of its null and KS within 0.004; sets of fewer values
+than bins are treated exactly.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from cpunet.analysis.resampling import Draws
 
 Values = npt.NDArray[np.float64]
 
@@ -59,43 +61,48 @@ def kolmogorov_smirnov(a: Values, b: Values) -> float:
     return float(np.abs(below[0] - below[1]).max())
 
 
-def distance_errors(
-    a: Values, b: Values, bootstraps: int, seed: int | np.random.Generator
-) -> tuple[float, float]:
-    """Standard deviations of W1 and KS under resampling of the finite values of both sets.
+def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
+    """Standard deviations of W1 and KS under resampling of both sets.
 
     Well above the null they are the scatter of fresh samples, within a tenth.  Near it
     they are a fifth too large, as a bootstrap adds its own scatter to the samples', and
     `null_distances` has the scale.
+
+    Parameters
+    ----------
+    a, b
+        Values of both sets; those that are not finite are resampled, and ignored.
+    draws
+        Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
 
     Returns
     -------
     tuple of float
         In the parameter's unit, and of the KS distance; NaN if a set has no finite values.
     """
-    a, b = _finite(a), _finite(b)
-    if not (a.size and b.size):
+    finite = np.concatenate([_finite(a), _finite(b)])
+    if not (np.isfinite(a).any() and np.isfinite(b).any()):
         return float("nan"), float("nan")
-    rng = np.random.default_rng(seed)
-    upper, positions = _grid(np.concatenate([a, b]), NODES)
-    drawn = [resampled(_counts(v, upper), v.size, bootstraps, rng) for v in (a, b)]
+    upper, positions = _grid(finite, NODES)
+    drawn = [d.counts(_bins(v, upper), len(upper)) for v, d in zip((a, b), draws, strict=True)]
     w1, ks = _distances(drawn[0], drawn[1], positions)
     return float(w1.std()), float(ks.std())
 
 
-def null_distances(
-    data: Values,
-    n_sim: int,
-    n_data: int,
-    bootstraps: int,
-    seed: int | np.random.Generator,
-) -> NullDistances:
+def null_distances(data: Values, draws: Draws) -> NullDistances:
     """W1 and KS of the data with themselves: what a perfect translation would have.
 
-    Two sets are drawn from the data's finite values with replacement, one as large as
-    the simulated set and one as large as the measured one, again and again.  Both
-    distances scatter with a tail upwards: of two samples of one distribution, 4 … 7 % are
-    further apart than two standard deviations above the mean.
+    Two sets are drawn from the data with replacement, one as large as the simulated set
+    and one as large as the measured one, again and again.  Both distances scatter with a
+    tail upwards: of two samples of one distribution, 4 … 7 % are further apart than two
+    standard deviations above the mean.
+
+    Parameters
+    ----------
+    data
+        Measured values; those that are not finite are drawn, and ignored.
+    draws
+        Bootstraps of the data, see `cpunet.analysis.resampling.resampled_twice`.
 
     Returns
     -------
@@ -103,42 +110,12 @@ def null_distances(
         NaN if the data have no finite values or a set is empty.
     """
     finite = _finite(data)
-    if not (finite.size and n_sim and n_data):
+    if not (finite.size and all(d.size for d in draws)):
         return NullDistances(*[float("nan")] * 4)
-    rng = np.random.default_rng(seed)
     upper, positions = _grid(finite, NULL_NODES)
-    counts = _counts(finite, upper)
-    drawn = [resampled(counts, n, bootstraps, rng) for n in (n_sim, n_data)]
-    w1, ks = _distances(drawn[0], drawn[1], positions)
+    bins = _bins(data, upper)
+    w1, ks = _distances(*(d.counts(bins, len(upper)) for d in draws), positions)
     return NullDistances(*(float(x) for x in (w1.mean(), w1.std(), ks.mean(), ks.std())))
-
-
-def resampled(counts: Values, size: int, draws: int, rng: np.random.Generator) -> Values:
-    """Histograms of `draws` bootstrap samples: a bootstrap's counts are multinomial.
-
-    Parameters
-    ----------
-    counts
-        Events by bin of the set that is resampled.
-    size
-        Events of each bootstrap sample.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(draws, bins)``; all 0 if the set is empty.
-    """
-    bins, total = len(counts), int(counts.sum())
-    if not total:
-        return np.zeros((draws, bins))
-    if size > 2 * bins:
-        return rng.multinomial(size, counts / total, size=draws).astype(float)
-    # with few events a bin, drawing events is faster than drawing the bins' counts
-    bin_of_event = np.repeat(np.arange(bins), counts.astype(int))
-    drawn = bin_of_event[rng.integers(total, size=(draws, size))]
-    drawn += bins * np.arange(draws)[:, np.newaxis]
-    drawn_counts = np.bincount(drawn.ravel(), minlength=draws * bins)
-    return drawn_counts.reshape(draws, bins).astype(float)
 
 
 def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
@@ -159,15 +136,26 @@ def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
     return upper, np.add.reduceat(pooled, starts) / np.diff(np.r_[starts, n])
 
 
-def _counts(values: Values, upper: Values) -> Values:
-    return np.bincount(np.searchsorted(upper, values), minlength=len(upper)).astype(float)
+def _bins(values: Values, upper: Values) -> npt.NDArray[np.intp]:
+    """Bin of each value, one beyond the last for values that are not finite."""
+    return np.where(np.isfinite(values), np.searchsorted(upper, values), len(upper))
 
 
-def _distances(a: Values, b: Values, positions: Values) -> tuple[Values, Values]:
-    """W1 and KS of histograms along the last axis whose events stand at `positions`."""
-    sums = [h.sum(axis=-1, keepdims=True) for h in (a, b)]
-    apart = np.abs(np.cumsum(a / sums[0] - b / sums[1], axis=-1))
-    return np.asarray(apart[..., :-1] @ np.diff(positions)), np.asarray(apart.max(axis=-1))
+def _distances(
+    a: npt.NDArray[np.float32], b: npt.NDArray[np.float32], positions: Values
+) -> tuple[Values, Values]:
+    """W1 and KS of histograms along the first axis whose events stand at `positions`.
+
+    Of the draws that have an event in both.
+    """
+    # whole numbers, and sums of them, are exact below 2^24
+    below = [np.cumsum(h, axis=0) for h in (a, b)]
+    drawn = (below[0][-1] > 0) & (below[1][-1] > 0)
+    if not drawn.any():
+        return np.full(1, np.nan), np.full(1, np.nan)
+    one, other = (c[:, drawn] / c[-1, drawn].astype(float) for c in below)
+    apart = np.abs(np.subtract(one, other, out=one), out=one)
+    return np.diff(positions) @ apart[:-1], apart.max(axis=0)
 
 
 def _finite(values: Values) -> Values:

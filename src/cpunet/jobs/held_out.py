@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from cpunet.analysis.distances import null_distances, wasserstein
+from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.matching import Sides, match
@@ -84,11 +85,9 @@ class HeldOut:
             parts.append((pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]))
         (fit_sim, held_sim), (fit_data, held_data) = parts
         values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
-        bootstraps = recipe.scores.bootstraps
-        nulls = {
-            name: null_distances(v, len(held_sim), len(v), bootstraps, seed).wasserstein
-            for name, v in values.items()
-        }
+        n_sim, n_data = len(held_sim), len(held_data)
+        draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
+        nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
         fit = Sides(fit_sim, fit_data, data_file)
         return cls(fit, held_sim, held_data, values, nulls, seed)
 
