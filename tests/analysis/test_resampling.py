@@ -5,6 +5,7 @@ from __future__ import annotations
 import hist
 import numpy as np
 import pytest
+import scipy.stats
 
 from cpunet.analysis import resampling
 from cpunet.analysis.comparisons import ceiling, data_axis, iou, iou_error
@@ -14,7 +15,12 @@ from cpunet.analysis.distances import (
     null_distances,
     wasserstein,
 )
-from cpunet.analysis.resampling import Resampled, both_resampled, resampled_twice
+from cpunet.analysis.resampling import (
+    Resampled,
+    both_resampled,
+    resampled_quantiles,
+    resampled_twice,
+)
 
 DRAWS = 400
 WAYS = {"events": resampling.MOST_EVENTS, "bins": 0}  # what is drawn
@@ -103,3 +109,15 @@ def test_what_lies_outside_an_axis_is_counted_at_its_rims():
     axis = hist.axis.Regular(2, 0, 1)
     assert ceiling(values, axis, resampled_twice(7, 70_000, 70_000, 2, 0))[0] > 98
     assert iou_error(values, values[:1], axis, both_resampled(7, 1, 400, 0)) > 0
+
+
+@pytest.mark.parametrize(("n", "quantile"), [(20, 0.1), (37, 0.1), (300, 0.5), (25, 0.01)])
+def test_quantiles_of_samples_are_those_of_the_direct_bootstrap(n, quantile):
+    rng = np.random.default_rng(8)
+    values = np.sort(np.r_[rng.exponential(size=n - 3), 7, 7, 7])
+    drawn = rng.choice(values, (20_000, n))
+    direct = np.quantile(drawn, quantile, axis=1, method="weibull")
+    found = resampled_quantiles(values, quantile, 20_000, rng)
+    assert found.std() == pytest.approx(direct.std(), rel=0.05)
+    # equal but for rounding, where one lies between two of few values
+    assert scipy.stats.ks_2samp(found.round(9), direct.round(9)).statistic < 0.02

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.analysis.resampling import resampled_quantiles
 from cpunet.errors import CpunetError
 
 Values = npt.NDArray[np.float64]
@@ -114,7 +115,7 @@ def ae_survival(
         )
     rng = np.random.default_rng(seed)
     cut = _cut(dep, acceptance)
-    cuts = np.array([_cut(rng.choice(dep, dep.size), acceptance) for _ in range(bootstraps)])
+    cuts = resampled_quantiles(dep, 1 - acceptance, bootstraps, rng)
     return Survival(
         cut=cut,
         cut_std=float(cuts.std(ddof=1)),

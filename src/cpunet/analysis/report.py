@@ -19,6 +19,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cpunet.analysis.nested_tables import nested_html
@@ -41,6 +42,7 @@ REPORT = FolderKind(
     r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
 )
 DPI = 150
+COMPRESSION = 1  # of PNG, 0 … 9: a tenth larger than with the usual 6, in half of the time
 WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
 MANY = 4  # figures, from which on they are folded away
 
@@ -206,8 +208,12 @@ def _figure_html(name: str, figure: Figure, png: bytes) -> str:
 
 def _png(figure: Figure) -> bytes:
     stream = io.BytesIO()
+    figure.set_dpi(DPI)
+    # ``Figure.savefig`` goes through every figure twice, once without drawing;
     # without the program's name and version the same figure gives the same file
-    figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(
+        stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
+    )
     return stream.getvalue()
 
 

@@ -93,3 +93,23 @@ def resampled_twice(
     """Pairs of samples of one set, as large as the simulated and as the measured one."""
     rng = np.random.default_rng(seed)
     return Resampled.of(events, n_sim, draws, rng), Resampled.of(events, n_data, draws, rng)
+
+
+def resampled_quantiles(
+    values: npt.NDArray[np.float64], quantile: float, draws: int, rng: np.random.Generator
+) -> npt.NDArray[np.float64]:
+    """Quantiles (NumPy's ``"weibull"``) of bootstrap samples that are not drawn themselves.
+
+    The k-th smallest of a sample is the value at the rank of the k-th smallest of as many
+    uniform numbers, which is a beta variate, as is the smallest of those above it.
+    """
+    ordered, n = np.sort(values), len(values)
+    rank = quantile * (n + 1)  # from 1; mostly between two values
+    below = int(np.clip(np.floor(rank), 1, n))
+    first = rng.beta(below, n + 1 - below, draws)
+    lower = ordered[np.minimum((n * first).astype(int), n - 1)]
+    if below == n or rank <= below:
+        return lower
+    second = first + (1 - first) * rng.beta(1, n - below, draws)
+    upper = ordered[np.minimum((n * second).astype(int), n - 1)]
+    return np.asarray(lower + (rank - below) * (upper - lower))

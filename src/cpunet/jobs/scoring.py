@@ -9,7 +9,7 @@ import numpy as np
 
 from cpunet.analysis.baseline_spectra import baseline_spectra
 from cpunet.analysis.comparisons import compare
-from cpunet.analysis.paired import paired_scores
+from cpunet.analysis.paired import all_paired_scores
 from cpunet.analysis.style import NO_NOISE
 from cpunet.jobs.peak_sets import PeakSets
 from cpunet.jobs.pulse_tests import told_apart
@@ -74,7 +74,7 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         dt_ns,
     )
     if peak.truth is not None:
-        scores["paired"] = _paired(peak, recipe.scores.edge_samples)
+        scores["paired"] = all_paired_scores(peak.clean, peak.truth, recipe.scores.edge_samples)
     return values, scores
 
 
@@ -83,14 +83,3 @@ def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Any]:
         method: of_method for method, of_method in values.items() if method != "data"
     }
     return dict(compare(values["data"], methods, recipe.scores, seed))
-
-
-def _paired(peak: PeakSets, edge_samples: int) -> dict[str, Any]:
-    assert peak.truth is not None
-    known = np.isfinite(peak.truth).all(axis=1)
-    for windows in peak.clean.values():
-        known &= np.isfinite(windows).all(axis=1)
-    return {
-        method: paired_scores(waveforms[known], peak.truth[known], edge_samples)
-        for method, waveforms in peak.clean.items()
-    }
