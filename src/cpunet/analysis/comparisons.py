@@ -171,7 +171,7 @@ def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> fl
 
 def _bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
     """Place of each value in `histogram`, and how many places there are."""
-    places = np.asarray(axis.index(values)) + 1
+    places = np.asarray(axis.index(values)) + 1  # type: ignore[arg-type]  # arrays, too
     return np.where(np.isnan(values), axis.size + 2, places), axis.size + 3
 
 
@@ -229,19 +229,24 @@ def compare(
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
     null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
+    known = {name: values for name, values in data.items() if np.isfinite(values).any()}
+    axes = {name: data_axis(values, scores.max_bins) for name, values in known.items()}
     found = {
-        name: _of_data(values, list(methods), null, scores) for name, values in data.items()
+        name: _of_data(values, list(methods), null, axes.get(name))
+        for name, values in data.items()
     }
     own = null[1]
     del null
     for method, values in methods.items():
         draws = (own, Resampled.of(sizes[method], sizes[method], scores.bootstraps, rng))
         for name in data:
-            _add_method(found[name], method, data[name], values[name], draws)
+            _add_method(found[name], method, data[name], values[name], axes.get(name), draws)
     return found
 
 
-def _of_data(data: Values, methods: list[str], null: Draws, scores: ScoreConfig) -> Comparison:
+def _of_data(
+    data: Values, methods: list[str], null: Draws, axis: hist.axis.Regular | None
+) -> Comparison:
     """What the data say of themselves; the methods' numbers are not there yet."""
     distances = null_distances(data, null)
     result = Comparison(
@@ -258,8 +263,7 @@ def _of_data(data: Values, methods: list[str], null: Draws, scores: ScoreConfig)
         missing={"data": int(np.isnan(data).sum())},
         axis=dict.fromkeys(("low", "high", "bins")),
     )
-    if np.isfinite(data).any():
-        axis = data_axis(data, scores.max_bins)
+    if axis is not None:
         mean, std = ceiling(data, axis, null)
         result["iou"]["ceiling"], result["iou_std"]["ceiling"] = _or_none(mean), _or_none(std)
         low, high = axis.edges[[0, -1]].tolist()
@@ -268,7 +272,12 @@ def _of_data(data: Values, methods: list[str], null: Draws, scores: ScoreConfig)
 
 
 def _add_method(
-    result: Comparison, method: str, data: Values, values: Values, draws: Draws
+    result: Comparison,
+    method: str,
+    data: Values,
+    values: Values,
+    axis: hist.axis.Regular | None,
+    draws: Draws,
 ) -> None:
     """Fill in the numbers of one method."""
     w1_error, ks_error = distance_errors(data, values, draws)
@@ -277,9 +286,7 @@ def _add_method(
     result["ks"][method] = _or_none(kolmogorov_smirnov(data, values))
     result["ks_std"][method] = _or_none(ks_error)
     result["missing"][method] = int(np.isnan(values).sum())
-    binning = result["axis"]
-    if binning["bins"]:
-        axis = hist.axis.Regular(int(binning["bins"]), binning["low"], binning["high"])
+    if axis is not None:
         result["iou"][method] = _or_none(iou(data, values, axis))
         result["iou_std"][method] = _or_none(iou_error(data, values, axis, draws))
 

@@ -114,7 +114,8 @@ def null_distances(data: Values, draws: Draws) -> NullDistances:
         return NullDistances(*[float("nan")] * 4)
     upper, positions = _grid(finite, NULL_NODES)
     bins = _bins(data, upper)
-    w1, ks = _distances(*(d.counts(bins, len(upper)) for d in draws), positions)
+    sim, measured = (d.counts(bins, len(upper)) for d in draws)
+    w1, ks = _distances(sim, measured, positions)
     return NullDistances(*(float(x) for x in (w1.mean(), w1.std(), ks.mean(), ks.std())))
 
 

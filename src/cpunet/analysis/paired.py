@@ -101,26 +101,26 @@ def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) 
     CpunetError
         If the two sets have not equally many pulses, or not such a shape.
     """
-    every = np.ones(len(truth), bool)
-    return all_paired_scores({"": translated}, truth, every, edge_samples)[""]
+    return scores_of_squares(pair_squares({"": translated}, truth, edge_samples)[""])
 
 
-def all_paired_scores(
-    methods: Mapping[str, FloatArray],
-    truth: FloatArray,
-    chosen: npt.NDArray[np.bool_],
-    edge_samples: int,
-) -> dict[str, PairedScores]:
-    """`paired_scores` of several methods for some of the events, the same for all methods.
+def pair_squares(
+    methods: Mapping[str, FloatArray], truth: FloatArray, edge_samples: int
+) -> dict[str, Values]:
+    """Squared differences from the truth, pulse by pulse: what `paired_scores` sums.
 
     Parameters
     ----------
     methods
         Translated pulses by method, as for `paired_scores`.
-    chosen
-        Which events are compared, shape ``(n,)``.
     truth, edge_samples
         As for `paired_scores`.
+
+    Returns
+    -------
+    dict
+        By method, shape ``(n, 4)``: sum of the squares and number of samples, over the
+        whole record and over the edge's window; all 0 where a pulse cannot be aligned.
     """
     _check_shape(truth)
     for translated in methods.values():
@@ -130,9 +130,9 @@ def all_paired_scores(
                 f"{len(translated)} translated pulses cannot be paired with {len(truth)} true "
                 "ones; give the same events in the same order"
             )
-    sums = {method: np.zeros(5) for method in methods}
+    found = {method: np.zeros((len(truth), 4)) for method in methods}
     for first in range(0, len(truth), BLOCK):
-        rows = first + np.flatnonzero(chosen[first : first + BLOCK])
+        rows = slice(first, first + BLOCK)
         aligned: dict[int, Values] = {}  # the truth's, by half-width
         for method, translated in methods.items():
             half = max(truth.shape[1], translated.shape[1])
@@ -141,18 +141,18 @@ def all_paired_scores(
             difference = _aligned(translated[rows], half, half)
             difference -= aligned[half]
             edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
-            sums[method] += [
-                *_squares(difference),
-                *_squares(difference[:, edge]),
-                np.isnan(difference).all(axis=1).sum(),
-            ]
+            found[method][rows, :2] = _squares(difference)
+            found[method][rows, 2:] = _squares(difference[:, edge])
+    return found
+
+
+def scores_of_squares(squares: Values) -> PairedScores:
+    """`paired_scores` of the pulses whose `pair_squares` are given."""
+    total = squares.sum(axis=0)
     return {
-        method: {
-            "rmse": _root_mean(found[:2]),
-            "edge_rmse": _root_mean(found[2:4]),
-            "unaligned": int(found[4]),
-        }
-        for method, found in sums.items()
+        "rmse": _root_mean(total[:2]),
+        "edge_rmse": _root_mean(total[2:]),
+        "unaligned": int((squares[:, 1] == 0).sum()),
     }
 
 
@@ -229,9 +229,10 @@ def _cubic_weights(fraction: Values) -> Values:
 
 
 def _squares(difference: Values) -> Values:
-    """Sum of the squares of what is not NaN, and how many those are."""
-    known = difference[np.isfinite(difference)]
-    return np.array([known @ known, known.size])
+    """Sum of the squares of what is not NaN, and how many those are, row by row."""
+    known = np.isfinite(difference)
+    values = np.where(known, difference, 0)
+    return np.stack([np.einsum("ij,ij->i", values, values), known.sum(axis=1)], axis=1)
 
 
 def _root_mean(sum_and_count: Values) -> float:

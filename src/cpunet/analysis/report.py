@@ -211,7 +211,7 @@ def _png(figure: Figure) -> bytes:
     figure.set_dpi(DPI)
     # ``Figure.savefig`` goes through every figure twice, once without drawing;
     # without the program's name and version the same figure gives the same file
-    FigureCanvasAgg(figure).print_png(
+    FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
         stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
     )
     return stream.getvalue()

@@ -109,7 +109,7 @@ def resampled_quantiles(
     first = rng.beta(below, n + 1 - below, draws)
     lower = ordered[np.minimum((n * first).astype(int), n - 1)]
     if below == n or rank <= below:
-        return lower
+        return np.asarray(lower)
     second = first + (1 - first) * rng.beta(1, n - below, draws)
     upper = ordered[np.minimum((n * second).astype(int), n - 1)]
     return np.asarray(lower + (rank - below) * (upper - lower))

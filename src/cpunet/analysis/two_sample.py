@@ -289,9 +289,12 @@ def _ridge(features: Values, labels: Values) -> Values:
     shrink = 1 / (np.maximum(eigenvalues, 0)[:, np.newaxis] + PENALTIES * n)
     leverage = rotated**2 @ shrink + 1 / n
     projected = rotated.T @ targets
+    # only to choose among penalties that are factors of three apart
+    few_digits, wanted = rotated.astype(np.float32), targets.astype(np.float32)
     errors = []
     for shrunk, h in zip(shrink.T[..., np.newaxis], leverage.T[..., np.newaxis], strict=True):
-        left_out = (targets - rotated @ (shrunk * projected)) / (1 - h)
-        errors.append((left_out**2).sum(axis=0))
+        left_out = wanted - few_digits @ (shrunk * projected).astype(np.float32)
+        left_out /= (1 - h).astype(np.float32)
+        errors.append(np.einsum("ij,ij->j", left_out, left_out, dtype=float))
     best = np.argmin(errors, axis=0)
     return np.asarray(vectors @ (shrink[:, best] * projected))

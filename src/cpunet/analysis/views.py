@@ -175,7 +175,7 @@ def pulse_views(
         if not len(usable):
             peaks[peak] = {"missing": "no event that every method can translate"}
             continue
-        rows = usable[np.linspace(0, len(usable) - 1, min(events, len(usable))).astype(int)]
+        rows = spread(usable, events)
         shown = {m: align_half_maximum(w[rows], *window) for m, w in clean.items()}
         found = {"rows": rows.tolist(), "usable": len(usable), "n": max(sizes.values())}
         if measured is not None and len(measured.get(peak, ())):
@@ -183,6 +183,12 @@ def pulse_views(
         found["methods"] = {method: packed(aligned) for method, aligned in shown.items()}
         peaks[peak] = found
     return {"dt_ns": float(dt_ns), "before": n_before, "peaks": peaks}
+
+
+def spread(rows: npt.NDArray[np.int64], events: int = EVENTS) -> npt.NDArray[np.int64]:
+    """So many of the rows, or all if they are fewer, evenly spread."""
+    places = np.linspace(0, len(rows) - 1, min(events, len(rows))).astype(int)
+    return np.asarray(rows[places])
 
 
 def scatter_views(

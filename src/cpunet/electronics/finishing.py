@@ -80,6 +80,33 @@ def finish_with_codes(
     seed: int | np.random.Generator = 0,
 ) -> tuple[FloatArray, Codes]:
     """As `finish`, with a `cpunet.pulses.preparation.Rejection` for each record."""
+    clean, noisy, codes = _finished(records, config, dt_ns, noise, energy_kev, seed)
+    return clean if noise is None else noisy, codes
+
+
+def finish_both(
+    records: FloatArray,
+    config: PreparationConfig,
+    *,
+    dt_ns: float,
+    noise: BaselineNoise,
+    energy_kev: npt.NDArray[np.float64],
+    seed: int | np.random.Generator = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """`finish` without noise and with it, in the time of the latter."""
+    clean, noisy, _ = _finished(records, config, dt_ns, noise, energy_kev, seed)
+    return clean, noisy
+
+
+def _finished(
+    records: FloatArray,
+    config: PreparationConfig,
+    dt_ns: float,
+    noise: BaselineNoise | None,
+    energy_kev: npt.NDArray[np.float64] | None,
+    seed: int | np.random.Generator,
+) -> tuple[FloatArray, FloatArray, Codes]:
+    """Windows without noise, with it (none if there is none), and the codes of the last."""
     if records.ndim != 2:
         raise CpunetError(
             f"translated waveforms have shape {records.shape}; expected (pulses, samples)"
@@ -88,23 +115,25 @@ def finish_with_codes(
         _check_noise(noise, dt_ns, energy_kev, len(records))
     # A record without noise may well have equal samples at its top; none is clipped.
     config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
-    rng = np.random.default_rng(seed)
-    windows = np.full((len(records), config.length), np.nan, np.float32)
-    codes = np.zeros(len(records), np.uint8)
-    for rows in blocks(len(records)):
-        block, kept = records[rows], np.arange(len(records))[rows]
+    rng, n = np.random.default_rng(seed), len(records)
+    windows = np.full((n, config.length), np.nan, np.float32)
+    noisy = np.full((0 if noise is None else n, config.length), np.nan, np.float32)
+    codes = np.zeros(n, np.uint8)
+    for rows in blocks(n):
+        block = records[rows]
+        clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
+        codes[rows] = clean.codes
+        kept = np.arange(n)[rows][clean.index]
+        windows[kept] = clean.pulses.waveforms
         if noise is not None and energy_kev is not None:
-            clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
-            codes[kept] = clean.codes
-            kept = kept[clean.index]
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
-            block = np.asarray(level + drawn, np.float32)
-        prepared = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
-        codes[kept] = prepared.codes
-        windows[kept[prepared.index]] = prepared.pulses.waveforms
-    return windows, codes
+            raw = Pulses.of(np.asarray(level + drawn, np.float32), dt_ns=dt_ns)
+            prepared = prepare(raw, config, "measured")
+            codes[kept] = prepared.codes
+            noisy[kept[prepared.index]] = prepared.pulses.waveforms
+    return windows, noisy, codes
 
 
 def _check_noise(

@@ -9,8 +9,7 @@ import numpy as np
 
 from cpunet.analysis.range_survival import survival_by_range
 from cpunet.jobs.inputs import InputSet
-from cpunet.jobs.rivals import RivalWindows
-from cpunet.pulses.container import FloatArray
+from cpunet.jobs.translations import Translations
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
@@ -33,8 +32,7 @@ def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelectio
 def range_survivals(
     sim: InputSet,
     data: InputSet,
-    ren: FloatArray,
-    rivals: RivalWindows,
+    made: Translations,
     ae_survival: Mapping[str, Any],
     recipe: Recipe,
 ) -> dict[str, Any]:
@@ -44,8 +42,8 @@ def range_survivals(
     ----------
     sim, data
         Prepared pulses of all energies of `validation_selection`.
-    ren, rivals
-        What the methods make of the simulated ones, row by row, with noise.
+    made
+        What the methods make of the simulated ones.
     ae_survival
         Cuts by method, see `cpunet.jobs.pulse_tests.survivals`.
     recipe
@@ -60,7 +58,7 @@ def range_survivals(
     if not cuts:
         reason = ae_survival.get("missing", f"there are no events of the {CUT_PEAK}")
         return {"missing": f"there is no A/E cut: {reason}"}
-    windows = {"raw": sim.prepared.pulses.waveforms, **rivals.noisy, "ren": ren}
+    windows = {"raw": sim.prepared.pulses.waveforms, **made.noisy}
     windows["data"] = data.prepared.pulses.waveforms
     methods = [method for method in windows if method in cuts]
     amplitudes: dict[str, Values] = {m: current_amplitude(windows[m]) for m in methods}

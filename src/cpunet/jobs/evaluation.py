@@ -25,10 +25,10 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.peak_details import PeakDetails, peak_details
 from cpunet.jobs.peak_sets import PeakSets, peak_sets
 from cpunet.jobs.pulse_tests import survivals
-from cpunet.jobs.rivals import rival_windows
+from cpunet.jobs.rivals import fit_rivals
 from cpunet.jobs.scoring import ByMethod, score_peak
+from cpunet.jobs.translations import translate_all
 from cpunet.jobs.truth import read_response
-from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import parse_selection
 from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
@@ -92,19 +92,19 @@ def evaluate(
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
     sim_set, data_set = _load_both(ren, sim, data, names, monitor)
-    others = rival_windows(
+    others = fit_rivals(
         sim_set,
         data_set,
         data,
         parse_selection(str(info["peak"]), recipe.peaks),
         recipe,
         fitted=rivals,
-        response=None if truth is None else read_response(truth, sim_set),
-        seed=seed,
         monitor=monitor,
     )
-    noisy, clean = _translate(ren, sim_set, seed, monitor)
-    sets = [peak_sets(name, recipe, sim_set, data_set, noisy, clean, others) for name in names]
+    response = None if truth is None else read_response(truth, sim_set)
+    made = translate_all(ren, others, sim_set, response, seed, monitor)
+    del response
+    sets = [peak_sets(name, recipe, sim_set, data_set, made) for name in names]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}
     with monitor.stage("Scoring", len(sets)) as advance:
@@ -129,9 +129,7 @@ def evaluate(
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
-            "survival by energy range": range_survivals(
-                sim_set, data_set, noisy, others, kept, recipe
-            ),
+            "survival by energy range": range_survivals(sim_set, data_set, made, kept, recipe),
             "A/E and drift time together": {
                 name: of_peak.plane_scores() for name, of_peak in details.items()
             },
@@ -141,8 +139,11 @@ def evaluate(
         },
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
-        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.raw)), seed),
-        "rivals": {"fits": others.fits, "missing": others.missing},
+        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
+        "rivals": {
+            "fits": {name: rival.describe() for name, rival in others.methods.items()},
+            "missing": others.missing,
+        },
         "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
         | {"peak": info["peak"]},
         "rejections": {
@@ -169,21 +170,6 @@ def _load_both(
             f"{ren.dt_ns:g} ns; resample the pulses"
         )
     return sim_set, data_set
-
-
-def _translate(
-    ren: REN, sim: InputSet, seed: int, monitor: Monitor
-) -> tuple[FloatArray, FloatArray]:
-    """All simulated pulses with noise and without."""
-    windows = sim.prepared.pulses.waveforms
-    with monitor.stage("Translating", 2 * len(windows)) as advance:
-        noisy = ren.apply(
-            windows,
-            energy_kev=sim.prepared.pulses.energy_kev,
-            generator=ren.seeded(seed),
-            progress=advance,
-        )
-        return noisy, ren.apply(windows, noise=False, progress=advance)
 
 
 def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     made = {SPECTRUM: Drawing("spectrum", {"energy_kev": energies, "peaks": peaks})}
     scored = [peak for peak in found.sets if found.values[peak.name]]
-    fullest = max(scored, key=lambda s: min(len(s.raw), len(s.data)))
+    fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
     forward, backward = CYCLES
     made[f"{fullest.name} {forward}"] = _forward(fullest, found.ren, found.iren)
     made[f"{fullest.name} {backward}"] = _backward(fullest, found.ren, found.iren)
@@ -143,33 +143,30 @@ def _histograms(
 def _mean_pulse(peak: PeakSets) -> Drawing:
     pulses = {m: p.waveforms for m, p in peak.by_method().items() if m in DRAWN}
     means = {m: MeanPulse.of(w)._asdict() for m, w in pulses.items() if len(w)}
-    return Drawing("mean pulse", {"sets": means, "dt_ns": peak.raw.dt_ns, "peak": peak.name})
+    return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
 
 
 def _drawable(peak: PeakSets) -> int | None:
     """The first simulated event that every method has, with an edge."""
-    known = np.ones(len(peak.raw), bool)
-    sets = dict(peak.clean) | ({} if peak.truth is None else {"truth": peak.truth})
-    for windows in sets.values():
-        known &= np.isfinite(windows).all(axis=1)
-    for row in np.flatnonzero(known):
-        edges = (align_half_maximum(w[row : row + 1], 100, 150) for w in sets.values())
+    for row in peak.known_to_all():
+        windows = peak.without_noise(np.array([row])).values()
+        edges = (align_half_maximum(w, 100, 150) for w in windows)
         if all(np.isfinite(edge).any() for edge in edges):
             return int(row)
     return None
 
 
 def _single_pulse(peak: PeakSets, row: int, found: Evaluation) -> Drawing:
-    sets = dict(peak.clean) | ({} if peak.truth is None else {"truth": peak.truth})
-    pulses = {method: sets[method][row] for method in SINGLE if method in sets}
+    sets = peak.without_noise(np.array([row]))
+    pulses = {method: sets[method][0] for method in SINGLE if method in sets}
     before = found.ren.recipe.preparation.samples_before
-    beside = DataPulse.beside(pulses, peak.data.waveforms, peak.raw.dt_ns, before)
+    beside = DataPulse.beside(pulses, peak.data.waveforms, peak.dt_ns, before)
     return Drawing(
         "single pulse",
         {
             "pulses": pulses,
             "data": beside._asdict(),
-            "dt_ns": peak.raw.dt_ns,
+            "dt_ns": peak.dt_ns,
             "samples_before": before,
             "title": f"{peak.name}, simulated pulse {row}",
         },
@@ -179,7 +176,7 @@ def _single_pulse(peak: PeakSets, row: int, found: Evaluation) -> Drawing:
 def _superpulses(details: PeakDetails, peak: PeakSets) -> Drawing:
     shown = ("data", "superpulse", "ren")
     sets = {m: asdict(s) for m, s in details.slices.items() if m in shown}
-    return Drawing("superpulses", {"sets": sets, "dt_ns": peak.raw.dt_ns, "peak": peak.name})
+    return Drawing("superpulses", {"sets": sets, "dt_ns": peak.dt_ns, "peak": peak.name})
 
 
 def _ae(details: PeakDetails, name: str) -> Drawing:

@@ -83,4 +83,4 @@ def _slices(peak: PeakSets, values: ByMethod) -> tuple[dict[str, Slices], dict[s
         method: superpulses(windows[method].waveforms, time, edges, BEFORE, AFTER)
         for method, time in times.items()
     }
-    return slices, slice_table(slices, peak.raw.dt_ns)
+    return slices, slice_table(slices, peak.dt_ns)

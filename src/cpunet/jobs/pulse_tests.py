@@ -7,10 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 from cpunet.analysis.a_over_e import survival_table
-from cpunet.analysis.style import NO_NOISE
 from cpunet.analysis.two_sample import classifier_auc
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values
 
 TESTED = 1000  # pulses a side: resolves an AUC to 0.013
@@ -18,15 +17,13 @@ TESTED = 1000  # pulses a side: resolves an AUC to 0.013
 ByMethod = Mapping[str, Mapping[str, Values]]
 
 
-def told_apart(
-    windows: Mapping[str, FloatArray], values: ByMethod, seed: int
-) -> dict[str, Any]:
+def told_apart(pulses: Mapping[str, Pulses], values: ByMethod, seed: int) -> dict[str, Any]:
     """Classifier test of each method's pulses against the data's, of one peak.
 
     Parameters
     ----------
-    windows
-        Prepared pulses by method, those of the ``"data"`` among them.
+    pulses
+        Prepared pulses with noise by method, those of the ``"data"`` among them.
     values
         Their pulse-shape parameters.
     seed
@@ -36,16 +33,17 @@ def told_apart(
     -------
     dict
         The fields of `cpunet.analysis.two_sample.TwoSample` by method, or ``missing`` and
-        the reason.  Methods without noise are left out: the noise alone tells them.
+        the reason.
     """
     tested: dict[str, Any] = {}
-    for method, others in windows.items():
-        if method == "data" or method.endswith(NO_NOISE):
+    data = pulses["data"].waveforms
+    for method, others in pulses.items():
+        if method == "data":
             continue
         try:
             result = classifier_auc(
-                windows["data"],
-                others,
+                data,
+                others.waveforms,
                 seed=seed,
                 features=(values["data"], values[method]),
                 largest=TESTED,

@@ -1,21 +1,18 @@
-"""The rival methods of a validation: fitted to the training's peak, applied to every pulse."""
+"""The rival methods of a validation: fitted to the training's peak."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from cpunet.analysis.style import NO_NOISE
-from cpunet.electronics.finishing import finish
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.rivals.base import Rival
 from cpunet.electronics.rivals.registry import RIVALS
-from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import noise_of_traces
-from cpunet.pulses.container import FloatArray
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
 
@@ -23,45 +20,35 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class RivalWindows:
-    """What the rivals, and the truth if it is known, make of the simulated pulses.
+class FittedRivals:
+    """The rivals, and the noise that is added to what they and the truth say.
 
     Parameters
     ----------
-    noisy
-        Windows (n, length) by method, with noise drawn from the data's baselines; rows
-        that cannot be prepared are NaN. Empty if there is no noise to draw from.
-    clean
-        The same without noise.
-    fits
-        Fitted numbers by method.
+    methods
+        Fitted rivals by name.
+    noise
+        Drawn from the data's baselines; None if there are none to draw from.
     missing
         Why a method, or the noise, is not there.
     """
 
-    noisy: dict[str, FloatArray] = field(default_factory=dict)
-    clean: dict[str, FloatArray] = field(default_factory=dict)
-    fits: dict[str, Mapping[str, float]] = field(default_factory=dict)
+    methods: dict[str, Rival] = field(default_factory=dict)
+    noise: BaselineNoise | None = None
     missing: dict[str, str] = field(default_factory=dict)
 
-    def methods(self) -> dict[str, FloatArray]:
-        """All of them by the names of ``metrics.json``."""
-        return self.noisy | {f"{name}{NO_NOISE}": w for name, w in self.clean.items()}
 
-
-def rival_windows(
+def fit_rivals(
     sim: InputSet,
     data: InputSet,
     data_file: InputFile,
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
-    fitted: bool = True,
-    response: FloatArray | None,
-    seed: int,
+    fitted: bool,
     monitor: Monitor,
-) -> RivalWindows:
-    """Fit every rival to unpaired pulses and translate all simulated ones.
+) -> FittedRivals:
+    """Fit every rival to unpaired pulses.
 
     Parameters
     ----------
@@ -74,53 +61,34 @@ def rival_windows(
     recipe
         The run's settings.
     fitted
-        Whether there are to be any; the truth is finished in any case.
-    response
-        True noise-free records of the simulated pulses, if known.
-    seed
-        Of the noise.
+        Whether there are to be any; there is noise in any case, for the truth.
     monitor
         Told of the progress.
 
     Returns
     -------
-    RivalWindows
+    FittedRivals
         A rival that cannot be fitted is missing, with its reason.
     """
-    config, result = recipe.preparation, RivalWindows()
-    simulated = sim.prepared.pulses
+    config, result = recipe.preparation, FittedRivals()
     # all rivals here; the untranslated simulation stands in the scores anyway
     kinds = {name: kind for name, kind in RIVALS.items() if fitted and name != "raw"}
-    noise = _or_reason(result.missing, "noise", lambda: noise_of_traces(data_file, config))
+    result.noise = _or_reason(
+        result.missing, "noise", lambda: noise_of_traces(data_file, config)
+    )
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
-    with monitor.stage("Fitting rivals", len(kinds) + (response is not None)) as advance:
+    with monitor.stage("Fitting rivals", len(kinds)) as advance:
         for name, kind in kinds.items():
 
-            def translated(name: str = name, kind: type[Rival] = kind) -> None:
-                rival = kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
-                result.clean[name] = translate_like_data(rival, simulated, config).waveforms
-                result.fits[name] = rival.describe()
-                if noise is not None:
-                    result.noisy[name] = translate_like_data(
-                        rival, simulated, config, noise=noise, seed=seed
-                    ).waveforms
+            def fit(kind: type[Rival] = kind) -> Rival:
+                return kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
 
-            _or_reason(result.missing, name, translated)
-            advance(1)
-        if response is not None:
-            result.clean["truth"] = finish(response, config, dt_ns=sim.dt_ns)
-            if noise is not None:
-                result.noisy["truth"] = finish(
-                    response,
-                    config,
-                    dt_ns=sim.dt_ns,
-                    noise=noise,
-                    energy_kev=simulated.energy_kev,
-                    seed=seed,
-                )
+            rival = _or_reason(result.missing, name, fit)
+            if rival is not None:
+                result.methods[name] = rival
             advance(1)
     for name, reason in result.missing.items():
         monitor.note(f"{name} is left out: {reason}")

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from cpunet.analysis.baseline_spectra import baseline_spectra
 from cpunet.analysis.comparisons import compare
-from cpunet.analysis.paired import all_paired_scores
 from cpunet.analysis.style import NO_NOISE
 from cpunet.jobs.peak_sets import PeakSets
 from cpunet.jobs.pulse_tests import told_apart
-from cpunet.pulses.parameters import PARAMETERS, Values, pulse_parameters
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 
@@ -41,8 +38,8 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         The peak's entry in ``metrics.json``, ready for JSON.
     """
     scores: dict[str, Any] = {
-        "n_sim": len(peak.raw),
-        "n_data": len(peak.data),
+        "n_sim": len(peak.sim_rows),
+        "n_data": len(peak.data_rows),
         "not_prepared": peak.not_prepared(),
     }
     missing = peak.missing()
@@ -50,14 +47,11 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         return {}, scores | {"parameters": {}, "missing": missing}
     pulses = peak.by_method()
     values = {
-        method: (pulse_parameters if method.endswith(NO_NOISE) else all_parameters)(
-            of_method, recipe.preparation, recipe.scores
-        )
+        method: all_parameters(of_method, recipe.preparation, recipe.scores)
         for method, of_method in pulses.items()
-    }
-    windows = {method: of_method.waveforms for method, of_method in pulses.items()}
+    } | peak.noise_free_parameters()
     chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
-    scores["two_sample"] = told_apart(windows, chief, seed)
+    scores["two_sample"] = told_apart(pulses, chief, seed)
     scores["parameters"] = _compared(chief, recipe, seed)
     further = {
         method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
@@ -65,16 +59,19 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         if not method.endswith(NO_NOISE)
     }
     scores["further"] = _compared(further, recipe, seed)
-    noisy = {method: w for method, w in windows.items() if not method.endswith(NO_NOISE)}
-    align, dt_ns = recipe.preparation.samples_before, peak.raw.dt_ns
+    align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
     scores["noise"] = baseline_spectra(
-        noisy,
-        {method: align + values[method]["t01"] / dt_ns for method in noisy},
+        {
+            method: of_method.waveforms[:, : recipe.preparation.baseline_samples].copy()
+            for method, of_method in pulses.items()
+        },
+        {method: align + values[method]["t01"] / dt_ns for method in pulses},
         recipe.preparation.baseline_samples,
         dt_ns,
     )
-    if peak.truth is not None:
-        scores["paired"] = all_paired_scores(peak.clean, peak.truth, recipe.scores.edge_samples)
+    paired = peak.paired_scores()
+    if paired is not None:
+        scores["paired"] = paired
     return values, scores
 
 

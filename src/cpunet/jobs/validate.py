@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
 
 from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.evaluation import evaluate
 from cpunet.jobs.figure_store import STORE, made_of, write_drawings
-from cpunet.jobs.figures import drawings
+from cpunet.jobs.figures import Drawing, drawings
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.views import report_views
+from cpunet.jobs.when_asked import WhenAsked
 
 QUIET = Monitor()
 
@@ -80,13 +84,17 @@ def validate_run(
         made = made_of(run, sim, data, truth, rivals, seed)
         write_drawings(folder / STORE, to_draw, made)
         with monitor.stage("Drawing", len(to_draw)) as advance:
-            figures = {}
-            for name, drawing in to_draw.items():
-                figures[name] = drawing.draw()
-                advance(1)
             notes = _notes(found.info, truth)
-            write_report(folder, found.metrics, figures, notes, report_views(found))
+            figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
+            write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
     return found.metrics
+
+
+def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
+    """Draw a figure, and tell of it."""
+    figure = drawing.draw()
+    advance(1)
+    return figure
 
 
 def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:

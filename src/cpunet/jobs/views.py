@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,12 @@ from cpunet.analysis.views import (
     method_looks,
     pulse_views,
     scatter_views,
+    spread,
     superpulse_views,
 )
 from cpunet.jobs.evaluation import Evaluation
 from cpunet.jobs.peak_details import BEFORE
+from cpunet.jobs.peak_sets import PeakSets
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 
@@ -51,17 +53,25 @@ def report_views(found: Evaluation) -> dict[str, Any]:
             dt_ns,
             BEFORE,
         ),
-        "pulses": pulse_views(
-            {
-                peak.name: dict(peak.clean)
-                | ({} if peak.truth is None else {"truth": peak.truth})
-                for peak in scored
-            },
-            dt_ns,
-            {peak.name: peak.data.waveforms for peak in scored},
-        ),
+        "pulses": _pulses(scored, dt_ns),
         "scatter": scatter_views(values, SHAPE_PARAMETERS),
     }
+
+
+def _pulses(scored: Sequence[PeakSets], dt_ns: float) -> dict[str, Any]:
+    """Events by every method; only those that are shown are translated again."""
+    chosen = {peak.name: spread(peak.known_to_all()) for peak in scored}
+    views = pulse_views(
+        {peak.name: peak.without_noise(chosen[peak.name]) for peak in scored},
+        dt_ns,
+        {peak.name: peak.data.waveforms for peak in scored},
+    )
+    for peak in scored:
+        found = views["peaks"][peak.name]
+        if "missing" not in found:
+            found["rows"] = chosen[peak.name][found["rows"]].tolist()
+            found["usable"], found["n"] = len(peak.known_to_all()), len(peak.sim_rows)
+    return views
 
 
 def _packed(slices: Mapping[str, Slices]) -> dict[str, dict[str, Any]]:

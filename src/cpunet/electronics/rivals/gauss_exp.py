@@ -66,20 +66,25 @@ class GaussExp:
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
         measured = currents(steps)
-        wanted = _mean_currents(measured, slices(measured))
-        spectra = np.asarray(scipy.fft.rfft(currents(sim[:MOST]), axis=1))
         length = record_length(sim.shape[1])
-
-        def response(parameters: Values) -> Values:
-            transfer = _transfer(length, 1.0, parameters[0], parameters[1])
-            return np.asarray(scipy.fft.irfft(spectra * transfer, length, axis=1), float)
+        of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
+        wanted = _mean_currents(of_data, slices(measured), length)
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:MOST]), axis=1), complex)
 
         best = np.array([START, START])
         for _ in range(ROUNDS):
-            groups = slices(response(best))
+            transfer = _transfer(length, 1.0, best[0], best[1])
+            groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
+            # what is in no slice has no part in the fit
+            sliced = spectra[np.concatenate(groups)]
+            ends = np.cumsum([len(group) for group in groups])
+            places = np.split(np.arange(ends[-1]), ends[:-1])
 
-            def residual(parameters: Values, groups: Groups = groups) -> Values:
-                return (_mean_currents(response(parameters), groups) - wanted).ravel()
+            def residual(
+                parameters: Values, sliced: Spectrum = sliced, places: Groups = places
+            ) -> Values:
+                response = sliced * _transfer(length, 1.0, parameters[0], parameters[1])
+                return (_mean_currents(response, places, length) - wanted).ravel()
 
             best = scipy.optimize.least_squares(
                 residual, best, bounds=(0.0, LONGEST), diff_step=1e-3, xtol=1e-4
@@ -110,11 +115,10 @@ def _transfer(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spec
     return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
 
 
-def _mean_currents(current: Values, groups: Groups) -> Values:
-    """Superpulses around the half height, shape ``(slices, 2 * EDGE)``."""
-    length = current.shape[1]
-    half = crossing(np.cumsum(current, axis=1), 0.5)
-    means = superpulses(scipy.fft.rfft(current, axis=1), half, groups, length)
+def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
+    """Superpulses of currents around the half height, shape ``(slices, 2 * EDGE)``."""
+    steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
+    means = superpulses(spectra, crossing(steps, 0.5), groups, length)
     return np.asarray(
         np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)[:, : 2 * EDGE],
         float,
