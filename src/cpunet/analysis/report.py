@@ -19,6 +19,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -214,6 +215,7 @@ def _png(figure: Figure) -> bytes:
     FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
         stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
     )
+    FigureCanvasBase(figure)  # lets go of the pixels, which the figure would keep
     return stream.getvalue()
 
 

@@ -29,6 +29,7 @@ Parameters = Mapping[str, Values]
 
 FEWEST = 40  # pulses a side: 8 in each fold's test
 LARGEST = 2000  # pulses a side: resolves an AUC to 0.01
+BLOCK = 256  # pulses at a time, where more would only take memory
 FOLDS = 5
 SHUFFLES = 40  # give the spread of the null to a ninth of itself
 
@@ -232,14 +233,19 @@ def _components(windows: Values) -> tuple[Values, Values]:
     # a few spoiled pulses must not choose the directions in which all are looked at
     limit = 3 * np.median(norms)
     weighted = centred * (limit / np.maximum(norms, limit) if limit > 0 else 1)
-    length = windows.shape[1]
+    squares, length = weighted.T @ weighted, windows.shape[1]
+    del weighted
     first = max(0, length - COMPONENTS)
-    _, vectors = eigh(weighted.T @ weighted, subset_by_index=[first, length - 1])
+    _, vectors = eigh(squares, subset_by_index=[first, length - 1])
     vectors = vectors[:, ::-1]
     components = centred @ vectors
-    rest = centred - components @ vectors.T
-    sizes = [np.sqrt(np.mean(r**2, axis=1)) for r in (rest, np.diff(rest, axis=1))]
-    return components, np.log(np.maximum(np.column_stack(sizes), SMALLEST))
+    sizes = np.empty((len(windows), 2))
+    for first in range(0, len(windows), BLOCK):
+        rows = slice(first, first + BLOCK)
+        rest = centred[rows] - components[rows] @ vectors.T
+        for column, values in enumerate((rest, np.diff(rest, axis=1))):
+            sizes[rows, column] = np.sqrt(np.mean(values**2, axis=1))
+    return components, np.log(np.maximum(sizes, SMALLEST))
 
 
 def _standard(values: Values, smallest: float = 0.0) -> Values:

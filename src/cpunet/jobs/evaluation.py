@@ -28,7 +28,7 @@ from cpunet.jobs.pulse_tests import survivals
 from cpunet.jobs.rivals import fit_rivals
 from cpunet.jobs.scoring import ByMethod, score_peak
 from cpunet.jobs.translations import translate_all
-from cpunet.jobs.truth import read_response
+from cpunet.jobs.truth import Responses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
@@ -92,6 +92,7 @@ def evaluate(
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
     sim_set, data_set = _load_both(ren, sim, data, names, monitor)
+    responses = None if truth is None else Responses(truth, sim_set)
     others = fit_rivals(
         sim_set,
         data_set,
@@ -101,9 +102,7 @@ def evaluate(
         fitted=rivals,
         monitor=monitor,
     )
-    response = None if truth is None else read_response(truth, sim_set)
-    made = translate_all(ren, others, sim_set, response, seed, monitor)
-    del response
+    made = translate_all(ren, others, sim_set, responses, seed, monitor)
     sets = [peak_sets(name, recipe, sim_set, data_set, made) for name in names]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}

@@ -141,9 +141,15 @@ def _histograms(
 
 
 def _mean_pulse(peak: PeakSets) -> Drawing:
-    pulses = {m: p.waveforms for m, p in peak.by_method().items() if m in DRAWN}
-    means = {m: MeanPulse.of(w)._asdict() for m, w in pulses.items() if len(w)}
+    pulses = peak.by_method()
+    # one set of pulses at a time
+    sets = ((method, pulses[method].waveforms) for method in pulses if method in DRAWN)
+    means = {method: MeanPulse.of(one)._asdict() for method, one in sets if len(one)}
     return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
+
+
+def _windows(pulses: Mapping[str, Pulses], method: str) -> FloatArray:
+    return pulses[method].waveforms
 
 
 def _drawable(peak: PeakSets) -> int | None:

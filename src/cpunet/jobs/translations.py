@@ -18,6 +18,7 @@ from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.jobs.inputs import InputSet
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.rivals import FittedRivals
+from cpunet.jobs.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
@@ -84,7 +85,7 @@ def translate_all(
     ren: REN,
     rivals: FittedRivals,
     sim: InputSet,
-    response: FloatArray | None,
+    responses: Responses | None,
     seed: int,
     monitor: Monitor,
 ) -> Translations:
@@ -96,7 +97,7 @@ def translate_all(
         The methods.
     sim
         Prepared pulses.
-    response
+    responses
         True noise-free records of these, if known.
     seed
         Of the noise, the same for all methods.
@@ -104,14 +105,15 @@ def translate_all(
         Told of the progress.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
-    others = [*rivals.methods, *(["truth"] if response is not None else [])]
+    others = [*rivals.methods, *(["truth"] if responses is not None else [])]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
         for name in (*rivals.methods, "ren", "truth")  # from the simplest to the answer
         if name == "ren" or (name in others and rivals.noise is not None)
     }
-    truth = None if response is None else np.empty(shape, np.float32)
+    truth = None if responses is None else np.empty(shape, np.float32)
+    true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
@@ -121,8 +123,8 @@ def translate_all(
             clean = {"raw": block.waveforms}
             for name in others:
                 records = (
-                    response[rows]
-                    if name == "truth" and response is not None
+                    next(true_records)
+                    if name == "truth"
                     else rivals.methods[name].translate(block.waveforms)
                 )
                 clean[name], drawn = _finished(records, block, rivals, recipe, rngs[name])
