@@ -148,10 +148,6 @@ def _mean_pulse(peak: PeakSets) -> Drawing:
     return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
 
 
-def _windows(pulses: Mapping[str, Pulses], method: str) -> FloatArray:
-    return pulses[method].waveforms
-
-
 def _drawable(peak: PeakSets) -> int | None:
     """The first simulated event that every method has, with an edge."""
     for row in peak.known_to_all():
