@@ -199,6 +199,17 @@ def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> 
     assert f"chi-square is {fit['chi_square'] / fit['moments']:.1f} per moment" in said[0]
 
 
+def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> None:
+    energies = np.where(np.arange(N) < 50, 1100.0, KEV)
+    sim = InputFile(tmp_path / "sim.lh5")
+    more = Pulses.of(sampled(charge(N, seed=1)), dt_ns=DT_NS, energy_kev=energies)
+    write_pulses(tmp_path / "sim.lh5", more)
+    with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of 1000-1200 can be used, sim"):
+        train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,1000-1200", device="cpu")
+    with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
+        train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,300-400", device="cpu")
+
+
 def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
     few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1)))
     with pytest.raises(

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks, parse_selection
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PeakConfig
 
 LINES = {
@@ -90,3 +91,18 @@ def test_what_is_neither_line_nor_range_is_refused(text):
 def test_empty_ranges_are_refused():
     with pytest.raises(CpunetError, match="'3000-300' is empty; give the lower end first"):
         parse_selection("3000-300", LINES)
+
+
+def test_lines_in_ranges_are_those_not_chosen_by_name() -> None:
+    peaks = load_recipe("fast").peaks
+    assert parse_selection("300-", peaks).lines_in_ranges == ["FEP", "SEP", "DEP"]
+    assert parse_selection("FEP,1000-1580,1620-2080", peaks).lines_in_ranges == []
+    assert parse_selection("FEP,DEP,1500-2700", peaks).lines_in_ranges == ["SEP"]
+
+
+def test_parts_of_a_selection_make_it_up() -> None:
+    selection = parse_selection("FEP,1000-1580,2700-", load_recipe("fast").peaks)
+    assert [part.name for part in selection.parts] == ["FEP", "1000-1580", "2700-inf"]
+    energies = [2614.5, 1200.0, 1600.0, 3000.0]
+    together = np.any([part.select(energies) for part in selection.parts], axis=0)
+    np.testing.assert_array_equal(together, selection.select(energies))

@@ -114,6 +114,11 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         counts = [
             int(part.select(side.prepared.pulses.energy_kev).sum()) for side in (sim, data)
         ]
+        if max(counts) == 0:
+            raise CpunetError(
+                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be "
+                "used; leave it out of --peak"
+            )
         if min(counts) == 0:
             missing, there = (sim, data) if counts[0] == 0 else (data, sim)
             raise CpunetError(
