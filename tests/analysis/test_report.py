@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 from html.parser import HTMLParser
@@ -10,10 +11,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
 from cpunet.analysis.comparisons import compare
 from cpunet.analysis.nested_tables import nested_html
-from cpunet.analysis.report import write_report
+from cpunet.analysis.report import DPI, _png, write_report
 from cpunet.analysis.views import distributions, method_looks
 from cpunet.recipes import load_recipe
 
@@ -248,3 +250,19 @@ def test_any_nesting_becomes_tables():
     checker = Checker()
     checker.feed(html)
     assert checker.open == []
+
+
+def test_a_figure_has_the_pixels_that_it_would_be_saved_with():
+    def made() -> Figure:
+        drawn = Figure(figsize=(4, 3), layout="constrained")
+        left, right = drawn.subplots(1, 2)
+        left.plot([1, 1000], [1, 1000], label="a line")
+        left.set(xscale="log", xlabel="Energy [keV]", title="two panels")
+        drawn.colorbar(right.imshow([[0, 1], [2, 3]]))
+        drawn.legend(loc="outside upper left")
+        return drawn
+
+    saved = io.BytesIO()
+    made().savefig(saved, format="png", dpi=DPI)
+    drawn, wanted = (Image.open(png) for png in (io.BytesIO(_png(made())), saved))
+    np.testing.assert_array_equal(drawn, wanted)

@@ -8,7 +8,7 @@ import scipy.fft
 import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.finishing import finish
+from cpunet.electronics.finishing import finish, finish_both
 from cpunet.electronics.noise import coloured_noise, noise_power
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
@@ -95,6 +95,16 @@ def test_finished_pulses_have_the_noise_of_the_data(noise) -> None:
         records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
     )
     np.testing.assert_array_equal(windows, again)
+
+
+def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
+    records = shape(600, 1200).astype(np.float32)
+    records[3] = 0  # cannot be prepared
+    given = {"dt_ns": DT_NS, "noise": noise, "energy_kev": np.full(600, 1592.5), "seed": 3}
+    clean, noisy = finish_both(records, CONFIG, **given)
+    np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS))
+    np.testing.assert_array_equal(noisy, finish(records, CONFIG, **given))
+    assert np.isnan(noisy[3]).all()
 
 
 def test_bad_input_is_named(noise) -> None:

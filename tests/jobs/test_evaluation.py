@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cpunet.analysis.drift_slices import slice_edges
+from cpunet.analysis.paired import paired_scores
 from cpunet.errors import CpunetError
 from cpunet.jobs.energy_ranges import validation_selection
 from cpunet.jobs.evaluation import Evaluation, evaluate
@@ -19,6 +20,7 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train import train_run
 from cpunet.jobs.validate import validate_run
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
@@ -178,3 +180,56 @@ def test_nothing_to_score_is_an_error(run, files, tmp_path) -> None:
     other = write(tmp_path / "other.lh5", {2030.0: 40}, 4, measured=True)
     with pytest.raises(CpunetError, match="no peak has pulses on both sides"):
         evaluated(run, files["sim"], other)
+
+
+@pytest.fixture(scope="module")
+def found(run, files, tmp_path_factory):
+    path = tmp_path_factory.mktemp("truth") / "truth.npz"
+    n = files["sim"].open().n_pulses
+    np.savez(path, response=records(n, np.random.default_rng(1), 4000.0).astype(np.float32))
+    return evaluate(
+        run,
+        files["sim"],
+        files["data"],
+        truth=path,
+        rivals=True,
+        seed=0,
+        device="cpu",
+        monitor=Monitor(),
+    )
+
+
+def test_numbers_without_noise_are_those_of_the_windows(found):
+    peak = max(found.sets, key=lambda peak: len(peak.sim_rows))
+    every = np.arange(len(peak.sim_rows))
+    windows = peak.without_noise(every)
+    recipe = found.ren.recipe
+    assert set(windows) == {"raw", "rc", "gauss_exp", "superpulse", "ren", "truth"}
+    assert peak.known_to_all().tolist() == every.tolist()
+    kept = peak.noise_free_parameters()
+    assert set(kept) == {f"{m}_no_noise" for m in windows if m not in ("raw", "ren")}
+    for method, values in kept.items():
+        pulses = Pulses.of(windows[method.removesuffix("_no_noise")], dt_ns=peak.dt_ns)
+        wanted = pulse_parameters(pulses, recipe.preparation, recipe.scores)
+        for name, expected in wanted.items():
+            np.testing.assert_allclose(values[name], expected, rtol=1e-4)
+    scores = peak.paired_scores()
+    for method, score in scores.items():
+        wanted = paired_scores(windows[method], windows["truth"], recipe.scores.edge_samples)
+        assert score == pytest.approx(wanted, rel=1e-4)
+    assert scores["ren"]["edge_rmse"] < scores["raw"]["edge_rmse"]
+
+
+def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
+    peak = found.sets[0]
+    pulses = peak.by_method()
+    # the others have no noise: these baselines are too short for its spectrum
+    assert list(pulses) == ["data", "raw", "ren"]
+    assert set(found.metrics["rivals"]["missing"]) == {"noise"}
+    assert all(len(p) == len(peak.sim_rows) for m, p in pulses.items() if m != "data")
+    again = found.ren.apply(
+        found.sim.prepared.pulses.waveforms,
+        energy_kev=found.sim.prepared.pulses.energy_kev,
+        generator=found.ren.seeded(0),
+    )
+    np.testing.assert_array_equal(pulses["ren"].waveforms, again[peak.sim_rows])

@@ -1,0 +1,42 @@
+"""The truth's traces, read block by block."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.truth import Responses
+
+
+def prepared(index, n_read):
+    return SimpleNamespace(
+        prepared=SimpleNamespace(index=index, n_read=n_read), path="sim.lh5", dt_ns=16.0
+    )
+
+
+@pytest.mark.parametrize("size", [1, 3, 7, 100])
+@pytest.mark.parametrize("dtype", [np.float16, np.float64])
+def test_responses_are_those_of_the_pulses_in_use_whatever_the_block(tmp_path, size, dtype):
+    response = np.arange(40.0).reshape(20, 2).astype(dtype)
+    np.savez_compressed(tmp_path / "truth.npz", other=np.zeros(3), response=response)
+    used = np.array([0, 1, 2, 9, 10, 17, 19])
+    blocks = list(Responses(tmp_path / "truth.npz", prepared(used, 20)).blocks(size))
+    assert [len(block) for block in blocks[:-1]] == [size] * (len(blocks) - 1)
+    assert all(block.dtype == np.float32 for block in blocks)
+    np.testing.assert_array_equal(np.concatenate(blocks), response[used])
+
+
+def test_responses_that_cannot_be_read(tmp_path):
+    path = tmp_path / "truth.npz"
+    np.savez(path, response=np.asfortranarray(np.ones((20, 3))))
+    with pytest.raises(CpunetError, match="stored column by column"):
+        Responses(path, prepared(np.arange(20), 20))
+    np.savez(path, response=np.ones((20, 300)))
+    whole = path.read_bytes()
+    responses = Responses(path, prepared(np.arange(20), 20))
+    path.write_bytes(whole[:5000] + b"\1" * 100 + whole[5100:])
+    with pytest.raises(CpunetError, match=r"cannot be read as \.npz"):
+        list(responses.blocks())
