@@ -15,7 +15,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
@@ -98,13 +98,7 @@ def _check(sim: FloatArray, energy_kev: Values) -> None:
             f"the inverse of {len(sim)} pulses needs {len(sim)} energies; "
             f"energy_kev has shape {energy_kev.shape}"
         )
-    usable = np.isfinite(energy_kev) & (energy_kev > 0)
-    if not usable.all():
-        row = int(np.argmin(usable))
-        raise CpunetError(
-            f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
-            "1/energy, so give the energies"
-        )
+    require_energies(energy_kev)
 
 
 @torch.no_grad()
