@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: install install-dev demo test test-slow ci lint clean
+.PHONY: install install-dev demo test test-slow lint clean
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
@@ -31,10 +31,6 @@ test: install-dev
 # with CPUNET_SLOW_MINUTES=15 none is begun after so long
 test-slow: install-dev
 	$(PYTEST) -m slow
-
-# what a change has to pass: half an hour on two cores, on slow ones with fewer slow tests
-ci: lint test
-	CPUNET_SLOW_MINUTES=15 $(MAKE) test-slow
 
 lint: install-dev
 	$(BIN)/ruff check .
