@@ -129,6 +129,7 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
     assert set(fit) >= {"chi_square", "moments", "steps", "errors", "pulls", "noise"}
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert len(fit["pulls"]) == fit["moments"]
+    assert fit["in_no_band"] == {"sim": 0, "data": 0}
     assert set(fit["errors"]) == {"log_poles_ns.1", "log_decay_us.1"}
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.02)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
@@ -208,6 +209,12 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
         train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,1000-1200", device="cpu")
     with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
         train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,300-400", device="cpu")
+    # a range that both sides have, but not all of it: what cannot be compared is counted
+    monitor = Listening()
+    info = train_run(
+        sim, files.data, tmp_path / "r", RECIPE, peak="1000-", device="cpu", monitor=monitor
+    )
+    assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
 
 
 def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:

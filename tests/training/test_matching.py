@@ -208,7 +208,8 @@ def test_edges_are_those_of_the_true_chain(near: Told) -> None:
 def test_what_a_fit_tells(near: Told) -> None:
     steps, chi_square = zip(*near.steps, strict=True)
     assert steps == tuple(range(1, near.fit.steps + 1))
-    assert min(chi_square) < near.fit.moments < chi_square[0]
+    assert chi_square[-1] == pytest.approx(near.fit.chi_square)
+    assert chi_square[-1] < near.fit.moments < chi_square[0]
     assert near.fit.steps <= RECIPE.training.iterations
     assert len(near.fit.pulls) == near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}

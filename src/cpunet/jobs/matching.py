@@ -120,6 +120,15 @@ def match(
     )
     compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
     monitor.note(f"compared (simulated/measured pulses): {compared}")
+    beside = (
+        len(sides.sim) - sum(n for n, _ in fit.bands.values()),
+        len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+    )
+    if any(beside):
+        monitor.note(
+            f"in no band, since one side has too few of their energies: {beside[0]} simulated "
+            f"and {beside[1]} measured pulses"
+        )
     monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
     recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
@@ -148,6 +157,7 @@ def match(
         "parameters": response.describe(),
         **asdict(fit),
         "verdict": fit.verdict,
+        "in_no_band": {"sim": beside[0], "data": beside[1]},
         "noise": {
             "baselines": noise.n_baselines,
             "rms": noise.rms,
