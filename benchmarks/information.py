@@ -61,7 +61,8 @@ def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
     moments = Moments.of_data(data.waveforms, TRAINING, RECIPE.preparation)
     length = record_length(sim.waveforms.shape[1])
     drawn = Noise.draw(noise, sim.energy_kev, length, TRAINING.noise_sets, rng)
-    return Band("FEP", Translated(sim.waveforms, drawn, moments, np.ones(len(sim))))
+    rows = np.arange(len(sim))
+    return Band("FEP", Translated(sim.waveforms, drawn, moments, np.ones(len(sim))), rows)
 
 
 def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:

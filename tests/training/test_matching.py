@@ -280,7 +280,7 @@ def asked(problem: Problem) -> ResponseProblem:
     length = record_length(few.waveforms.shape[1])
     drawn = Noise.draw(problem.noise, few.energy_kev, length, 2, np.random.default_rng(0))
     moments = Moments.of_data(problem.data.waveforms, training, recipe.preparation)
-    band = Band("all", Translated(few.waveforms, drawn, moments, np.ones(64)))
+    band = Band("all", Translated(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
     return ResponseProblem(ElectronicsResponse(generator, DT_NS), [band])
 
 

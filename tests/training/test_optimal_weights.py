@@ -64,7 +64,7 @@ def band() -> Band:
     )
     moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
     noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
-    return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)))
+    return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)), np.arange(N))
 
 
 def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 import cpunet
+from cpunet.cli.calibrate import calibrate
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.ensemble import ensemble
@@ -69,6 +70,7 @@ for command in (
     fields,
     stand,
     train,
+    calibrate,
     ensemble,
     tune,
     translate,

@@ -44,7 +44,7 @@ def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
     return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=own)})
 
 
-def _known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
+def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
     """The response of a run, to start from.
 
     Raises
@@ -69,7 +69,7 @@ def match(
     seed: int,
     listen: Callable[[list[Record]], None],
     monitor: Monitor,
-    init: Path | None = None,
+    known: ElectronicsResponse | None = None,
 ) -> tuple[nn.Module, dict[str, Any], Recipe]:
     """Measure the noise, fit the response, and invert it.
 
@@ -85,8 +85,8 @@ def match(
         Given a record for each step of the fit.
     monitor
         Told of what is to be noted.
-    init
-        Folder of a run to start from.
+    known
+        A response to start from.
 
     Returns
     -------
@@ -106,7 +106,6 @@ def match(
     def tell(step: int, chi_square: float) -> None:
         listen([{"iteration": step, "rate": 0.0, "losses": {"chi_square": chi_square}}])
 
-    known = None if init is None else _known_response(init, sides.sim.dt_ns)
     if known is not None:
         recipe = _with_config(recipe, known.config)
     response, fit = fit_response(

@@ -27,10 +27,11 @@ from cpunet.jobs.inputs import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.matching import Sides, match
+from cpunet.jobs.matching import Sides, known_response, match
 from cpunet.jobs.memory import keep_freed_memory
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train_team import team_for
+from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
@@ -130,7 +131,7 @@ def train_run(
             if init is not None:
                 _require_sampling(init, data_set)
             sides = sim_set, data_set, data
-            job = _Job(recipe, peak, seed, device, team, init, *sides, folder, told)
+            job = TrainingJob(recipe, peak, seed, device, team, init, *sides, folder, told)
             with enough_memory(recipe, team.size):
                 if isinstance(recipe.training, MatchingConfig):
                     model, info, recipe = job.match(tensorboard)
@@ -174,7 +175,7 @@ def _require_sampling(init: Path, data: InputSet) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class TrainingJob:
     """What is to be trained, on what and where."""
 
     recipe: Recipe
@@ -189,10 +190,20 @@ class _Job:
     folder: Path
     monitor: Monitor
 
-    def match(self, tensorboard: bool) -> tuple[nn.Module, dict[str, Any], Recipe]:
-        """Match a response; return it, the content of ``run.json``, and its recipe."""
+    def match(
+        self, tensorboard: bool, known: ElectronicsResponse | None = None
+    ) -> tuple[nn.Module, dict[str, Any], Recipe]:
+        """Match a response, from a known one or that of `init` if there is one.
+
+        Returns
+        -------
+        tuple
+            It, the content of ``run.json``, and its recipe.
+        """
         started, clock = datetime.now(UTC), time.perf_counter()
         sides = Sides(self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file)
+        if self.init is not None:
+            known = known_response(self.init, self.data.dt_ns)
         with (
             _losses_shown(self.folder, wanted=tensorboard) as show,
             self.monitor.stage("Matching") as advance,
@@ -204,7 +215,7 @@ class _Job:
                 advance(len(records))
 
             model, more, recipe = match(
-                sides, self.recipe, self.seed, listen, self.monitor, self.init
+                sides, self.recipe, self.seed, listen, self.monitor, known
             )
         seconds = time.perf_counter() - clock
         info = self._info(started.isoformat(timespec="seconds"), seconds)

@@ -10,7 +10,6 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.training.moments import Values
-from cpunet.training.response_problem import Parameters
 
 Listener = Callable[[int, float], None]
 
@@ -23,13 +22,23 @@ DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
 UPDATES = 2  # steps with derivatives that were only updated
 
 
+class Unknowns(Protocol):
+    """What is to be found, as a vector, and how far each may go in a step."""
+
+    widths: Values
+
+    def vector(self) -> Values: ...
+
+    def set(self, vector: Values) -> None: ...
+
+
 class Problem(Protocol):
     """Residuals whose squares are to be as small as possible in all."""
 
     clip: float | None
 
     @property
-    def parameters(self) -> Parameters: ...
+    def parameters(self) -> Unknowns: ...
 
     @property
     def moments(self) -> int: ...

@@ -18,20 +18,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands
 from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
 from cpunet.training.misfit import amplitude_shift
-from cpunet.training.moments import Moments, Values
+from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
-from cpunet.training.translated import Noise, Translated
 
 # Chi-square per moment, with as many pulses as valleys are searched with, at which a fit has
 # found its own.  The data's own outliers and the ridge keep it from 1.
@@ -46,8 +45,6 @@ RINGS, PROMISES = 0.7, 0.9
 ONSET, OFF = -15, 4.0
 # Pulses of each side with which a poor fit is looked at.
 CHECKED = 4096
-# Of a band at the least, where a set is thinned out.
-FEWEST_OF_BAND = 400
 # Rounds of optimal weights: those of the second are of where the first has led.
 ROUNDS = 2
 
@@ -160,8 +157,7 @@ def fit_response(
     """
     config, training = recipe.matching
     rng = np.random.default_rng(seed)
-    require_energies(sim.energy_kev)
-    sets = _Sets(sim, data, noise, recipe, rng)
+    sets = PulseSets(sim, data, noise, recipe, rng)
     some = sets.bands(training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
     if listener is not None:
@@ -175,56 +171,10 @@ def fit_response(
             return problem.response, fit
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
     if _poor(problem, found):
-        problem, found = _ringing_if_better(problem, found, config, training, listener)
+        problem, found = ringing_if_better(problem, found, config, training, listener)
     if _poor(problem, found) and _onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     return problem.response, _refined(problem, found, everything, training, listener)
-
-
-class _Sets:
-    """Both sides in bands of energy, and parts of them that are enough for a question."""
-
-    def __init__(
-        self,
-        sim: Pulses,
-        data: Pulses,
-        noise: BaselineNoise,
-        recipe: Recipe,
-        rng: np.random.Generator,
-    ) -> None:
-        self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
-        parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
-        # in an order of which any beginning is a fair part
-        self.parted = [
-            (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
-            for band in parted
-        ]
-
-    def bands(self, most: int | None = None) -> list[Band]:
-        """All pulses, or as many of each side as `most`, in shares as they are."""
-        n_sim, n_data = (
-            sum(len(order) for order in orders)
-            for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
-        )
-        some = []
-        for band, sim_order, data_order in self.parted:
-            chosen = []
-            for order, n in ((sim_order, n_sim), (data_order, n_data)):
-                share = 1.0 if most is None else min(1.0, most / n)
-                kept = max(math.ceil(share * len(order)), min(FEWEST_OF_BAND, len(order)))
-                chosen.append(np.sort(order[:kept]))
-            some.append(self._band(band, *chosen))
-        return some
-
-    def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
-        _, training = self.recipe.matching
-        measured = self.data.waveforms[band.data[data]]
-        moments = Moments.of_data(measured, training, self.recipe.preparation)
-        rows = band.sim[sim]
-        pulses, energy_kev = self.sim.waveforms[rows], self.sim.energy_kev[rows]
-        length, draws = record_length(pulses.shape[1]), training.noise_sets
-        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng)
-        return Band(band.name, Translated(pulses, drawn, moments, band.weights[sim]))
 
 
 def _refined(
@@ -315,7 +265,7 @@ def _from_known(
 ) -> tuple[ResponseProblem, Minimum] | None:
     """Fit from a response that is known, first as if the data were near; None if it is poor."""
     start = copy.deepcopy(known)
-    _set_decay(start, first.slope)
+    set_decay(start, first.slope)
     problem, steps = first.of(start), 0
     for coarse in (False, True):
         found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
@@ -335,7 +285,7 @@ def _best_start(
     best: tuple[ResponseProblem, Minimum] | None = None
     dt_ns = float(first.response.dt_ns)
     for factor in training.start_factors:
-        problem = first.of(_start(config, dt_ns, factor, first.slope))
+        problem = first.of(start_response(config, dt_ns, factor, first.slope))
         found = levenberg_marquardt(problem, training.steps, listener)
         if best is None or found.cost < best[1].cost:
             best = problem, found
@@ -345,7 +295,7 @@ def _best_start(
     return best
 
 
-def _ringing_if_better(
+def ringing_if_better(
     problem: ResponseProblem,
     found: Minimum,
     config: ResponseConfig,
@@ -377,17 +327,17 @@ def _counted(listener: Listener) -> Listener:
     return lambda _, chi_square: listener(next(steps), chi_square)
 
 
-def _start(
+def start_response(
     config: ResponseConfig, dt_ns: float, factor: float, slope: float
 ) -> ElectronicsResponse:
     """A response with the recipe's poles times a factor, and the data's own decay."""
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
-    _set_decay(response, slope)
+    set_decay(response, slope)
     return response
 
 
-def _set_decay(response: ElectronicsResponse, slope: float) -> None:
+def set_decay(response: ElectronicsResponse, slope: float) -> None:
     """Take the data's own decay, if it has one."""
     if slope < 0:
         response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 import torch
 
@@ -75,10 +76,13 @@ class Band:
         Energies, as the user knows them.
     sim
         Simulated pulses, and the moments of the measured ones.
+    rows
+        Of the simulated pulses, in the set that they were taken from.
     """
 
     name: str
     sim: Translated
+    rows: npt.NDArray[np.intp]
 
     @property
     def moments(self) -> Moments:

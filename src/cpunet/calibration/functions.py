@@ -1,0 +1,110 @@
+"""What tells physics from electronics: functions of a pulse in slices of drift time.
+
+The first principal component of pulses laid over each other at half of their height is how
+early their charge begins to move: their drift time.  Its density, above all where it ends, is
+what velocities and impurities change.  The other components and the current amplitude, each
+in slices of it, tell what depends on drift time, such as the growth of the charge cloud, from
+what does not: the readout.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cpunet.training.moments import Moments, Readings, Values
+
+# Points of the density of the drift time; slices of it; components and points of the current
+# amplitude taken in each.  Of few pulses, half as many.
+DENSITY, SLICES, COMPONENTS, AMPLITUDES = 24, 8, 6, 8
+FEW = 700
+# Widths in units of the distances, and the least: twice what noise does.
+NARROW, WIDE = 1.0, 0.8
+LEAST_DENSITY, LEAST_SLICE, LEAST_AMPLITUDE = 0.02, 0.05, 0.008
+
+
+class SlicedFunctions:
+    """The functions of `Moments`, and those in slices of drift time.
+
+    Parameters
+    ----------
+    moments
+        Drawn up from the data.
+    """
+
+    def __init__(self, moments: Moments) -> None:
+        self.moments = moments
+        self._first = len(moments.config.segments) - 1
+        drift, amplitude = moments.data.linear[:, self._first], moments.data.log_amplitude
+        parts = 2 if len(moments.data) < FEW else 1
+        self._components = min(COMPONENTS, moments.config.components - 1)
+        # towards the longest drift times the density ends sharply
+        self._density = _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, LEAST_DENSITY)
+        self._slices = _points(drift, SLICES // parts, (0.03, 0.97), WIDE, LEAST_SLICE)
+        self._amplitudes = _points(
+            amplitude, AMPLITUDES // parts, (0.05, 0.98), NARROW, LEAST_AMPLITUDE
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the functions."""
+        slices = range(1, len(self._slices[0]) + 1)
+        return (
+            *self.moments.names,
+            *(f"drift time, bin {i + 1}" for i in range(len(self._density[0]))),
+            *(f"component {c + 2}, slice {s}" for c in range(self._components) for s in slices),
+            *(
+                f"current amplitude, bin {a + 1}, slice {s}"
+                for a in range(len(self._amplitudes[0]))
+                for s in slices
+            ),
+        )
+
+    def __call__(self, readings: Readings, clip: float | None = None) -> Values:
+        """Functions of each pulse, shape (pulses, functions).
+
+        Parameters
+        ----------
+        readings
+            Of pulses.
+        clip
+            In place of the recipe's; far from the data wider, and all bins with it.
+        """
+        values = self.moments.functions(readings, clip)
+        wider = 1.0 if clip is None else max(1.0, clip / self.moments.config.clip)
+        drift = values[:, self._first]
+        slices = _bins(drift, self._slices, wider)
+        begin = self._first + 1
+        components = values[:, begin : begin + self._components]
+        amplitudes = _bins(readings.log_amplitude, self._amplitudes, wider)
+        return np.concatenate(
+            [
+                values,
+                _bins(drift, self._density, wider),
+                _products(components, slices),
+                _products(amplitudes, slices),
+            ],
+            axis=1,
+        )
+
+
+def _points(
+    values: Values, n: int, range_: tuple[float, float], factor: float, least: float
+) -> tuple[Values, Values]:
+    """Equally populated points, and a width for each."""
+    centres = np.quantile(values, np.linspace(*range_, n))
+    gaps = np.diff(centres)
+    between = np.concatenate([gaps[:1], np.minimum(gaps[1:], gaps[:-1]), gaps[-1:]])
+    return centres, np.maximum(factor * between, least)
+
+
+def _bins(values: Values, points: tuple[Values, Values], wider: float) -> Values:
+    centres, widths = points
+    return np.asarray(
+        np.exp(-0.5 * ((values[:, np.newaxis] - centres) / (wider * widths)) ** 2)
+    )
+
+
+def _products(values: Values, slices: Values) -> Values:
+    return np.asarray(
+        (values[:, :, np.newaxis] * slices[:, np.newaxis, :]).reshape(len(values), -1)
+    )

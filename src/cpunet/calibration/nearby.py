@@ -1,0 +1,161 @@
+"""Pulses of the same hits at physics near those that were simulated.
+
+A fit asks for pulses at many physics, and to simulate them takes seconds each time.  So they
+are simulated once to either side of a point, and between these a pulse changes in proportion.
+Other drift velocities move the end of a pulse by more than its edge is wide; in proportion
+change only shapes, laid over each other where they pass half of their height.  Nothing is lost
+by that: when a pulse begins, no measured set tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.calibration._shape_kernels import half_maxima, move
+from cpunet.calibration.nuisances import Physics, Values
+from cpunet.simulation.again import SameHits
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+
+FloatArray = npt.NDArray[np.float32]
+# Simulated pulses are moved at a period shorter by the first of these that steps allow.
+FINER = (4, 5, 3, 2, 1)
+
+
+class Simulator:
+    """Simulates events at coordinates of the physics.
+
+    Parameters
+    ----------
+    hits
+        Of the events, merged already; in an order of which any beginning is a fair part.
+    physics
+        Which parameters the coordinates are.
+    simulated
+        Called after each simulation.
+    """
+
+    def __init__(
+        self, hits: Hits, physics: Physics, simulated: Callable[[], None] = lambda: None
+    ) -> None:
+        self.physics, self._simulated = physics, simulated
+        self._hits = hits
+        self._parts: dict[int | None, SameHits] = {None: SameHits(hits)}
+        self._finer = _finer(physics.settings)
+
+    def exact(self, coordinates: Values) -> FloatArray:
+        """Pulses as `cpunet simulate` makes them, shape (events, samples)."""
+        detector, settings = self.physics.at(coordinates)
+        events = self._parts[None].simulate(detector, settings)
+        self._simulated()
+        return events.waveforms
+
+    def quick(self, coordinates: Values, most: int | None = None) -> FloatArray:
+        """Pulses for differences, finely sampled; of the first so many events."""
+        if most not in self._parts:
+            self._parts[most] = SameHits(self._hits[:most])
+        detector, settings = self.physics.at(coordinates)
+        fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
+        events = self._parts[most].simulate(detector, fine, mode="quick")
+        self._simulated()
+        return events.waveforms
+
+    def coarse(self, pulses: FloatArray) -> FloatArray:
+        """Means over the period of fine samples."""
+        whole = pulses.shape[1] // self._finer * self._finer
+        blocks = pulses[:, :whole].reshape(len(pulses), -1, self._finer)
+        return np.asarray(blocks.mean(axis=2, dtype=np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """Pulses about a point of the physics.
+
+    Parameters
+    ----------
+    simulator
+        Of the events.
+    centre
+        Coordinates of the point.
+    base
+        Pulses there, shape (events, samples).
+    slopes
+        Of the pulses, by position of the coordinate.
+    simulated_at
+        The point that the slopes are of, not far from here.
+    """
+
+    simulator: Simulator
+    centre: Values
+    base: FloatArray
+    slopes: Mapping[int, FloatArray]
+    simulated_at: Values
+
+    @classmethod
+    def about(cls, simulator: Simulator, centre: Values, of: Sequence[int]) -> Nearby:
+        """Simulate pulses about a point, and their slopes with some coordinates."""
+        base = simulator.exact(centre)
+        return cls(simulator, centre, base, _slopes(simulator, centre, of), centre)
+
+    def moved(self, centre: Values) -> Nearby:
+        """Pulses about another point, with these slopes."""
+        return replace(self, centre=centre, base=self.simulator.exact(centre))
+
+    def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
+        """The same point, with some slopes simulated here; of the first so many events."""
+        slopes = {**self.slopes, **_slopes(self.simulator, self.centre, of, most)}
+        renewed = set(self.slopes) <= set(of)
+        return replace(
+            self, slopes=slopes, simulated_at=self.centre if renewed else self.simulated_at
+        )
+
+    def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
+        """Pulses at some coordinates, shape (events, samples); of the first so many events."""
+        pulses = self.base[:most]
+        for i, change in enumerate(coordinates - self.centre):
+            if change and i in self.slopes:
+                pulses = pulses + np.float32(change) * self.slopes[i][:most]
+        return pulses
+
+
+def _slopes(
+    simulator: Simulator, centre: Values, wanted: Sequence[int], most: int | None = None
+) -> dict[int, FloatArray]:
+    """Changes of shape with each coordinate, from two simulations each."""
+    physics = simulator.physics
+    here = simulator.quick(centre, most)
+    half = np.zeros(len(here))
+    half_maxima(here, half)
+    slopes = {}
+    for i in wanted:
+        nuisance = physics.nuisances[i]
+        low, high = nuisance.bounds(physics.nominal(nuisance))
+        ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
+        if ends[0] < low:  # none below; from here on
+            ends = [low, max(low, centre[i]) + 2 * nuisance.step]
+        ends[1] = min(ends[1], high)
+        shapes = []
+        for end in ends:
+            there = centre.copy()
+            there[i] = end
+            pulses = simulator.quick(there, most)
+            at = half.copy()
+            half_maxima(pulses, at)
+            moved = np.empty_like(pulses)
+            move(pulses, at - half, moved)
+            shapes.append(simulator.coarse(moved))
+        slopes[i] = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
+    return slopes
+
+
+def _finer(settings: SimulationSettings) -> int:
+    """How many samples a period is parted into."""
+    for parts in FINER:
+        steps = settings.dt_ns / parts / settings.step_ns
+        if steps > 1 - 1e-9 and abs(steps - round(steps)) < 1e-9:
+            return parts
+    return 1

@@ -1,0 +1,273 @@
+"""What of a detector's physics is not known well: its names, priors, and why these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.settings import SimulationSettings
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """A parameter of the physics, and how far it may be from where it was simulated.
+
+    A fit knows it by a coordinate that is 0 where it was simulated: its change, the logarithm
+    of a factor, or the change of its square.
+
+    Parameters
+    ----------
+    name
+        As outputs have it, with its unit.
+    short
+        As it may be called on the command line.
+    field
+        Of `Detector` or `SimulationSettings`.
+    kind
+        What the coordinate is.
+    prior
+        Standard deviation of the coordinate, before any data.
+    step
+        Of the coordinate: half of what pulses are simulated apart for a derivative.
+    reach
+        Change of the coordinate up to which that derivative is trusted.
+    lowest, highest
+        Values allowed.
+    source
+        Of the prior.
+    first
+        Whether it is looked at before the others.
+    """
+
+    name: str
+    short: str
+    field: str
+    kind: Literal["added", "factor", "square"]
+    prior: float
+    step: float
+    reach: float
+    lowest: float
+    highest: float
+    source: str
+    first: bool = False
+
+    def value(self, nominal: float, coordinate: float) -> float:
+        """The parameter at a coordinate, within what is allowed."""
+        if self.kind == "factor":
+            value = nominal * math.exp(coordinate)
+        elif self.kind == "square":
+            value = math.sqrt(max(0.0, nominal**2 + coordinate))
+        else:
+            value = nominal + coordinate
+        return min(max(value, self.lowest), self.highest)
+
+    def coordinate(self, nominal: float, value: float) -> float:
+        """The coordinate of a value."""
+        if self.kind == "factor":
+            return math.log(value / nominal)
+        return value**2 - nominal**2 if self.kind == "square" else value - nominal
+
+    def slope(self, nominal: float, value: float) -> float:
+        """Change of the parameter with its coordinate: of an error of the one, the other's."""
+        if self.kind == "square":
+            # near 0, by how much a step of the coordinate raises it
+            return 0.5 / max(value, math.sqrt(self.step))
+        return value if self.kind == "factor" else 1.0
+
+    def bounds(self, nominal: float) -> tuple[float, float]:
+        """Coordinates of the least and the largest value."""
+        low = max(self.lowest, 1e-9) if self.kind == "factor" else self.lowest
+        return self.coordinate(nominal, low), self.coordinate(nominal, self.highest)
+
+
+_MOBILITIES = (
+    "published mobilities differ by 10 to 20 % (Reggiani et al. 1977, Bruyneel et al. 2016)"
+)
+
+# Those first that differ for any detector and are looked at first; the others only if these do
+# not explain the data.
+NUISANCES = (
+    Nuisance(
+        "temperature_K", "temperature", "temperature_K", "added",
+        3.0, 0.5, 1.5, 40, 120, "sensors sit beside crystals, not in them", first=True,
+    ),
+    Nuisance(
+        "impurity_factor", "impurity", "impurity_scale", "factor",
+        0.1, 0.01, 0.03, 1e-3, 1e3, "what a depletion voltage tells of it (Hall probes: 30 %)",
+        first=True,
+    ),
+    Nuisance(
+        "self_repulsion", "self_repulsion", "self_repulsion", "added",
+        1.0, 0.3, 0.9, 0, 10, "none or all of what a model of the cloud gives", first=True,
+    ),
+    Nuisance(
+        "diffusion_constant", "diffusion", "diffusion_constant", "added",
+        0.03, 0.01, 0.03, 1e-3, 1, "0.066 to 0.12 V mm/cm: kT/e, and what was measured",
+        first=True,
+    ),
+    Nuisance(
+        "cloud_fwhm_mm", "cloud", "cloud_fwhm_mm", "square",
+        0.1, 0.03, 0.1, 0, 5, "0.1 to 0.6 mm: ranges of electrons", first=True,
+    ),
+    Nuisance(
+        "impurity_tilt_1e10_per_cm4", "tilt", "impurity_tilt_1e10_per_cm4", "added",
+        0.03, 0.005, 0.02, -10, 10, "30 % of a gradient of 1e9 per cm4",
+    ),
+    Nuisance(
+        "hole_velocity_low_factor", "hole_velocity_low", "hole_velocity_low_factor", "factor",
+        0.1, 0.01, 0.03, 0.25, 4, _MOBILITIES,
+    ),
+    Nuisance(
+        "hole_velocity_high_factor", "hole_velocity_high", "hole_velocity_high_factor",
+        "factor", 0.1, 0.02, 0.05, 0.25, 4, _MOBILITIES,
+    ),
+    Nuisance(
+        "electron_velocity_low_factor", "electron_velocity_low", "electron_velocity_low_factor",
+        "factor", 0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
+    ),
+    Nuisance(
+        "electron_velocity_high_factor", "electron_velocity_high",
+        "electron_velocity_high_factor", "factor", 0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
+    ),
+    Nuisance(
+        "hole_trapping_per_us", "hole_trapping", "hole_trapping_per_us", "added",
+        0.01, 0.005, 0.03, 0, 10, "0 to 1 % per us",
+    ),
+    Nuisance(
+        "electron_trapping_per_us", "electron_trapping", "electron_trapping_per_us", "added",
+        0.01, 0.005, 0.03, 0, 10, "0 to 1 % per us",
+    ),
+    Nuisance(
+        "bias_V", "bias", "bias_V", "added",
+        5.0, 20.0, 60.0, 10, 2e4, "what high-voltage modules are calibrated to",
+    ),
+    Nuisance(
+        "li_thickness_mm", "li_thickness", "li_thickness", "added",
+        0.2, 0.1, 0.3, 0.01, 5, "what a full-charge collection depth is measured to",
+    ),
+)  # fmt: skip
+
+
+def named(text: str) -> Nuisance:
+    """The nuisance of a name, long or short.
+
+    Raises
+    ------
+    CpunetError
+        If there is none.
+
+    Examples
+    --------
+    >>> named("temperature").name
+    'temperature_K'
+    """
+    for nuisance in NUISANCES:
+        if text.strip() in (nuisance.name, nuisance.short):
+            return nuisance
+    known = ", ".join(nuisance.short for nuisance in NUISANCES)
+    raise CpunetError(f"{text.strip()!r}: no such parameter of the physics; there are {known}")
+
+
+@dataclass(frozen=True)
+class Physics:
+    """A detector and its clouds as functions of some coordinates, all 0 as simulated.
+
+    Parameters
+    ----------
+    detector, settings
+        As simulated.
+    nuisances
+        That may change, in the order of the coordinates.
+    """
+
+    detector: Detector
+    settings: SimulationSettings
+    nuisances: tuple[Nuisance, ...]
+
+    def nominal(self, nuisance: Nuisance) -> float:
+        """The value as simulated; of a factor that is none of the settings', 1."""
+        if nuisance.name == "impurity_factor":
+            return 1.0
+        of_detector = nuisance.field in Detector.model_fields
+        value = getattr(self.detector if of_detector else self.settings, nuisance.field)
+        if value == "siggen":
+            return 0.12
+        if value == "temperature":
+            return 8.617333e-4 * self.detector.temperature_K
+        return float(value)
+
+    def values(self, coordinates: Values) -> dict[str, float]:
+        """Values by name."""
+        return {
+            n.name: n.value(self.nominal(n), float(x))
+            for n, x in zip(self.nuisances, coordinates, strict=True)
+        }
+
+    def at(self, coordinates: Values) -> tuple[Detector, SimulationSettings]:
+        """Detector and settings; what is at 0 stays as it is, in every bit.
+
+        Raises
+        ------
+        CpunetError
+            If there can be no such detector.
+        """
+        of_detector, of_settings = self.detector.model_dump(), self.settings.model_dump()
+        values = self.values(coordinates)
+        for nuisance, coordinate in zip(self.nuisances, coordinates, strict=True):
+            if coordinate == 0:
+                continue
+            value = values[nuisance.name]
+            if nuisance.name == "impurity_factor":
+                of_detector["impurity_scale"] *= value
+            elif nuisance.field in of_detector:
+                of_detector[nuisance.field] = value
+            else:
+                of_settings[nuisance.field] = value
+        try:
+            return (
+                Detector.model_validate(of_detector),
+                SimulationSettings.model_validate(of_settings),
+            )
+        except ValidationError as error:
+            told = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+            why = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise CpunetError(
+                f"detector {self.detector.name}: with {told} there can be none ({why}); "
+                "narrow a --prior, or --fix one of them"
+            ) from error
+
+    def of(self, nuisances: Sequence[Nuisance]) -> Physics:
+        """The same detector with others free."""
+        return Physics(self.detector, self.settings, tuple(nuisances))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a coordinate before any data: centre and standard deviation."""
+
+    centre: float
+    width: float
+
+
+def priors(physics: Physics, given: Mapping[str, tuple[float, float]]) -> list[Prior]:
+    """Of the free nuisances: as given (value and error by name), or the default about 0."""
+    found = []
+    for nuisance in physics.nuisances:
+        nominal = physics.nominal(nuisance)
+        if nuisance.name not in given:
+            found.append(Prior(0.0, nuisance.prior))
+            continue
+        value, error = given[nuisance.name]
+        width = error / nuisance.slope(nominal, value)
+        found.append(Prior(nuisance.coordinate(nominal, value), width))
+    return found

@@ -1,0 +1,171 @@
+"""What a calibration has found, as plain numbers to be stored and drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cpunet.calibration.identifiability import Direction
+from cpunet.calibration.joint_problem import JointProblem
+from cpunet.calibration.nuisances import Nuisance, Values, priors
+from cpunet.calibration.search import Calibrated
+from cpunet.training.matching import GOOD_FIT
+
+# Offsets of a profile in errors.
+OFFSETS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+# Errors of its prior from which on a parameter is far from what was thought possible, and part
+# of them in which it is at a bound.
+FAR, AT_BOUND = 3.0, 1e-6
+# Chi-square per moment of data that these physics do not describe at all.
+HOPELESS = 50.0
+# Fall of chi-square with one parameter more that is told.
+WORTH_TELLING = 9.0
+
+
+def described(calibrated: Calibrated) -> dict[str, Any]:
+    """The content of ``calibration.json``.
+
+    Returns
+    -------
+    dict
+        ``parameters``: value, error (with the parameters below as simulated), error_all (with
+        all that were looked at free), value as simulated and prior of each free one;
+        ``fixed``: those looked at that stayed as simulated, and by how much chi-square would
+        fall with them; ``chi_square``; ``directions``; ``covariance`` of chain and
+        coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
+    """
+    problem = calibrated.problem
+    parameters, physics = problem.parameters, problem.nearby.simulator.physics
+    values = physics.values(parameters.coordinates)
+    known = dict(
+        zip((n.name for n in physics.nuisances), priors(physics, parameters.given), strict=True)
+    )
+    free = {}
+    for i, error in zip(parameters.free, calibrated.errors, strict=True):
+        nuisance = physics.nuisances[i]
+        nominal, value = physics.nominal(nuisance), values[nuisance.name]
+        slope, prior = nuisance.slope(nominal, value), known[nuisance.name]
+        free[nuisance.name] = {
+            "value": value,
+            "error": float(slope * error),
+            "error_all": slope * calibrated.errors_all[nuisance.name],
+            "simulated": nominal,
+            "prior": {
+                "value": nuisance.value(nominal, prior.centre),
+                "error": nuisance.slope(nominal, value) * prior.width,
+                "source": "given" if nuisance.name in parameters.given else nuisance.source,
+            },
+        }
+    vector = parameters.vector()
+    return {
+        "parameters": free,
+        "fixed": {
+            name: {"value": values[name], "chi_square_would_fall_by": fall}
+            for name, fall in calibrated.promised.items()
+        },
+        "chi_square": {
+            "before": calibrated.chi_square_before,
+            "after": calibrated.chi_square,
+            "moments": problem.moments,
+            "degrees_of_freedom": problem.moments - len(vector),
+        },
+        "directions": [_direction(direction) for direction in calibrated.directions],
+        "covariance": {
+            "names": list(parameters.names),
+            "values": vector.tolist(),
+            "matrix": calibrated.covariance.tolist(),
+        },
+        "pulls": {
+            "names": list(problem.names),
+            "before": calibrated.pulls_before.tolist(),
+            "after": problem.pulls(vector).tolist(),
+        },
+        "profiles": _profiles(calibrated),
+        "rounds": calibrated.rounds,
+        "notes": notes(calibrated),
+    }
+
+
+def notes(calibrated: Calibrated) -> list[str]:
+    """What is to be said of where a calibration has ended."""
+    problem = calibrated.problem
+    parameters, physics = problem.parameters, problem.nearby.simulator.physics
+    values = physics.values(parameters.coordinates)
+    found = []
+    vector, n = parameters.vector(), parameters.n_chain
+    for k, i in enumerate(parameters.free):
+        nuisance = physics.nuisances[i]
+        value, name = values[nuisance.name], nuisance.name
+        if value in (nuisance.lowest, nuisance.highest):
+            found.append(f"{name} is at its bound, {value:g}: --fix it, or free another")
+        width = parameters.widths[n + k]
+        off = (vector[n + k] - parameters.centre[n + k]) / width
+        if abs(off) > FAR:
+            found.append(
+                f"{name} = {value:.4g} is {abs(off):.1f} errors of its prior from it: give a "
+                "wider --prior if that is possible, or free what else moves pulses so"
+            )
+    per = calibrated.chi_square / problem.moments
+    asked = {k: v for k, v in calibrated.promised.items() if v > WORTH_TELLING}
+    best = max(asked, key=lambda name: asked[name], default=None)
+    if per <= GOOD_FIT:
+        found.append(
+            f"chi-square is {per:.2f} per function, as by chance: no other physics are needed"
+        )
+    else:
+        rest = (
+            f"with {best} free, too, it would fall by {asked[best]:.0f}"
+            if best
+            else "none of the parameters looked at explains it"
+        )
+        found.append(f"chi-square is {per:.2f} per function, too much for chance; {rest}")
+    return found
+
+
+def hopeless(calibrated: Calibrated) -> bool:
+    """Whether these are data of plainly another detector."""
+    return calibrated.chi_square > HOPELESS * calibrated.problem.moments
+
+
+def _direction(direction: Direction) -> dict[str, Any]:
+    return {
+        "components": direction.components,
+        "error": direction.error,
+        "words": direction.words,
+    }
+
+
+def _profiles(calibrated: Calibrated) -> dict[str, Any]:
+    """Chi-square, priors and all, along the valley of each free coordinate."""
+    problem = calibrated.problem
+    parameters, physics = problem.parameters, problem.nearby.simulator.physics
+    here, n = parameters.vector(), parameters.n_chain
+    found = {}
+    for k, i in enumerate(parameters.free):
+        column = calibrated.covariance[:, n + k]
+        # to where the others go if this one is moved by one error
+        way = column / np.sqrt(column[n + k])
+        nuisance = physics.nuisances[i]
+        nominal = physics.nominal(nuisance)
+        costs = [_cost(problem, here + offset * way) for offset in OFFSETS]
+        found[nuisance.name] = {
+            "value": [
+                _unbounded(nuisance, nominal, float(here[n + k] + offset * way[n + k]))
+                for offset in OFFSETS
+            ],
+            "chi_square": costs,
+        }
+    parameters.set(here)
+    return found
+
+
+def _unbounded(nuisance: Nuisance, nominal: float, coordinate: float) -> float:
+    if nuisance.kind == "added":
+        return nominal + coordinate
+    return nuisance.value(nominal, coordinate)
+
+
+def _cost(problem: JointProblem, vector: Values) -> float:
+    residuals = problem.residuals(vector)
+    return float(residuals @ residuals)

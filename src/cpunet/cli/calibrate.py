@@ -1,0 +1,263 @@
+"""``cpunet calibrate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cpunet.cli import options
+from cpunet.cli.messages import monitor, out
+from cpunet.cli.values import parse_numbers
+from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
+
+if TYPE_CHECKING:
+    from cpunet.jobs.calibration_inputs import Start
+
+PHYSICS, HITS = "What is free", "Simulation"
+
+Out = Annotated[
+    Path | None, typer.Option("--out", help="Run folder to make; may be left out with --plan.")
+]
+SimFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--sim", help="Output of cpunet simulate or stand, with its hits.", rich_help_panel=HITS
+    ),
+]
+DetectorFile = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata; that of "
+        "--sim by default.",
+        rich_help_panel=HITS,
+    ),
+]
+HitFileName = Annotated[
+    Path | None,
+    typer.Option(
+        "--hits",
+        help="Hits to simulate, as for cpunet simulate, instead of --sim.",
+        rich_help_panel=HITS,
+    ),
+]
+HitTable = Annotated[
+    str | None,
+    typer.Option(
+        "--hits-detector", help="Which of the file's detectors.", rich_help_panel=HITS
+    ),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        help="X,Y,Z in mm: the point contact's centre in the file's frame.",
+        rich_help_panel=HITS,
+    ),
+]
+FlipZ = Annotated[
+    bool,
+    typer.Option("--flip-z", help="The file's point contact is on top.", rich_help_panel=HITS),
+]
+LengthUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+EnergyUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+SettingsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--settings",
+        help="YAML file of the simulation's settings; those of --sim by default.",
+        rich_help_panel=HITS,
+    ),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        help="Override a value of the detector or of the settings (repeatable).",
+        rich_help_panel=HITS,
+    ),
+]
+Free = Annotated[
+    str,
+    typer.Option(
+        help="Parameters, as temperature,impurity; auto: those that the data tell.",
+        rich_help_panel=PHYSICS,
+    ),
+]
+Fix = Annotated[
+    str,
+    typer.Option(help="Parameters that stay as simulated.", rich_help_panel=PHYSICS),
+]
+PriorText = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--prior",
+        help="NAME=VALUE±ERROR (or +-) of a parameter or of depletion_voltage (repeatable).",
+        rich_help_panel=PHYSICS,
+    ),
+]
+Plan = Annotated[
+    bool,
+    typer.Option(
+        "--plan", help="Only tell what these pulses know of the physics, before any fit."
+    ),
+]
+Peak = Annotated[
+    str, typer.Option(help="Energies to calibrate on: FEP, SEP, DEP or ranges in keV.")
+]
+RecipeName = Annotated[
+    str, typer.Option("--recipe", help="fast, best, or a YAML file of your own.")
+]
+Events = Annotated[
+    int,
+    typer.Option(min=200, help="Simulated events, at most, that are drifted again and again."),
+]
+
+
+def calibrate(
+    data: options.Data,
+    out_folder: Out = None,
+    sim: SimFile = None,
+    detector: DetectorFile = None,
+    hits: HitFileName = None,
+    hits_detector: HitTable = None,
+    origin: Origin = None,
+    flip_z: FlipZ = False,
+    length_unit: LengthUnit = None,
+    energy_unit: EnergyUnit = None,
+    settings_file: SettingsFile = None,
+    set_values: Set = None,
+    crystal: options.Crystal = None,
+    free: Free = "auto",
+    fix: Fix = "",
+    prior: PriorText = None,
+    plan: Plan = False,
+    peak: Peak = "FEP",
+    recipe: RecipeName = "fast",
+    events: Events = 3000,
+    seed: options.Seed = 0,
+    data_table: options.DataTable = None,
+    data_energy: options.DataEnergy = None,
+    kev_per_adc: options.KevPerAdc = None,
+    dt: options.Dt = None,
+    insist: options.Insist = False,
+    force: options.Force = False,
+) -> None:
+    """Calibrate the detector and its electronics together: temperature, impurities, readout.
+
+    Example: cpunet calibrate --sim sim.lh5 --data raw.lh5 --out run
+
+    Example: cpunet calibrate --detector V01.yaml --hits stp.lh5 --data raw.lh5 --out run \
+--free temperature,impurity --prior depletion_voltage=2100±50
+
+    Example: cpunet calibrate --sim sim.lh5 --data raw.lh5 --plan
+    """
+    from cpunet.jobs.calibrate import Calibration
+    from cpunet.jobs.calibration_inputs import Freedom
+    from cpunet.jobs.inputs import InputFile
+    from cpunet.recipes import load_recipe
+
+    if out_folder is None and not plan:
+        raise CpunetError("give --out, the run folder to make, or --plan")
+    if out_folder is not None:
+        refuse_inputs(out_folder, recipe, detector, settings_file)
+    start = _start(
+        sim, detector, hits, settings_file, set_values or [], crystal, hits_detector,
+        origin, flip_z, length_unit, energy_unit, insist,
+    )  # fmt: skip
+    measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
+    job = Calibration(
+        start,
+        measured,
+        load_recipe(recipe),
+        Freedom.of(free, fix, prior or []),
+        peak=peak,
+        events=events,
+        seed=seed,
+    )
+    if plan:
+        for line in plan_lines(job.plan(out_folder, force=force, monitor=monitor())):
+            out.print(line, markup=False, highlight=False, soft_wrap=True)
+        return
+    assert out_folder is not None
+    content = job.run(out_folder, force=force, monitor=monitor())
+    for line in result_lines(content):
+        out.print(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _start(
+    sim: Path | None,
+    detector: str | None,
+    hits: Path | None,
+    settings_file: Path | None,
+    overrides: list[str],
+    crystal: Path | None,
+    hits_detector: str | None,
+    origin: str | None,
+    flip_z: bool,
+    length_unit: str | None,
+    energy_unit: str | None,
+    insist: bool,
+) -> Start:
+    from cpunet.jobs.calibration_inputs import Start
+    from cpunet.jobs.hit_sources import HitFile
+    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.simulation_settings import load_settings, split_overrides
+    from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.hit_readers import Transform
+
+    of_detector, of_settings = split_overrides(overrides)
+    if of_detector and detector is None:
+        raise CpunetError(f"--set {of_detector[0]}: give the --detector that it is of")
+    source = None
+    if hits is not None:
+        x, y, z = parse_numbers(origin or "0,0,0", 3, "--origin")
+        source = HitFile(
+            hits, hits_detector, Transform((x, y, z), flip_z), length_unit, energy_unit
+        )
+    given = settings_file is not None or of_settings
+    return Start(
+        None if sim is None else InputFile(sim, insist=insist),
+        source,
+        None if detector is None else read_detector(detector, of_detector, crystal),
+        load_settings(settings_file, of_settings) if given else None,
+    )
+
+
+def result_lines(content: dict[str, Any]) -> list[str]:
+    """What a calibration has found, a line each."""
+    chi = content["chi_square"]
+    before, after = chi["before"] / chi["moments"], chi["after"] / chi["moments"]
+    lines = [
+        f"{name} {told['value']:.5g} ± {told['error']:.2g} (simulated with "
+        f"{told['simulated']:.5g}; ± {told['error_all']:.2g} if all physics were free)"
+        for name, told in content["parameters"].items()
+    ]
+    return [
+        *(lines or ["the data tell none of the physics better than they are known"]),
+        f"chi-square per function {before:.2f} before, {after:.2f} after; see calibration.html",
+    ]
+
+
+def plan_lines(content: dict[str, Any]) -> list[str]:
+    """A plan as a table: errors alone and with all free, by number of pulses."""
+    pulses = [str(n) for n in content["pulses"]]
+    width = max(map(len, content["errors"])) if content["errors"] else 0
+    head = "".join(f"{'N=' + n:>12}" for n in pulses)
+    lines = [f"{'error of one alone':<{width}}{'prior':>10}{head}"]
+    for kind in ("alone", "all_free"):
+        if kind == "all_free":
+            lines.append(f"{'with all free':<{width}}{'prior':>10}{head}")
+        for name, told in content["errors"].items():
+            cells = "".join(f"{told[kind][n]:>12.3g}" for n in pulses)
+            lines.append(f"{name:<{width}}{told['prior']:>10.3g}{cells}")
+    middle = pulses[len(pulses) // 2]
+    lines.append(f"directions with {middle} pulses of each side, error in units of the prior:")
+    lines += [f"{d['error']:8.3f}  {d['words']}" for d in content["directions"][middle]]
+    return lines

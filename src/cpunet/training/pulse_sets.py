@@ -1,0 +1,84 @@
+"""Two sets of pulses, made ready to be compared."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.networks.response import record_length
+from cpunet.pulses.container import Pulses
+from cpunet.recipes.schema import Recipe
+from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands
+from cpunet.training.moments import Moments
+from cpunet.training.response_problem import Band
+from cpunet.training.translated import Noise, Translated
+
+# Of a band at the least, where a set is thinned out.
+FEWEST_OF_BAND = 400
+
+
+class PulseSets:
+    """Both sides in bands of energy, and parts of them that are enough for a question.
+
+    Parameters
+    ----------
+    sim, data
+        Prepared pulses with their energies.
+    noise
+        Of the data's baselines.
+    recipe
+        With a response to be matched.
+    rng
+        Chooses the parts, and draws the noise.
+
+    Raises
+    ------
+    CpunetError
+        If there are too few pulses, or an energy is not known.
+    """
+
+    def __init__(
+        self,
+        sim: Pulses,
+        data: Pulses,
+        noise: BaselineNoise,
+        recipe: Recipe,
+        rng: np.random.Generator,
+    ) -> None:
+        self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
+        require_energies(sim.energy_kev)
+        parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
+        # in an order of which any beginning is a fair part
+        self.parted = [
+            (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
+            for band in parted
+        ]
+
+    def bands(self, most: int | None = None) -> list[Band]:
+        """All pulses, or as many of each side as `most`, in shares as they are."""
+        n_sim, n_data = (
+            sum(len(order) for order in orders)
+            for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
+        )
+        some = []
+        for band, sim_order, data_order in self.parted:
+            chosen = []
+            for order, n in ((sim_order, n_sim), (data_order, n_data)):
+                share = 1.0 if most is None else min(1.0, most / n)
+                kept = max(math.ceil(share * len(order)), min(FEWEST_OF_BAND, len(order)))
+                chosen.append(np.sort(order[:kept]))
+            some.append(self._band(band, *chosen))
+        return some
+
+    def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
+        _, training = self.recipe.matching
+        measured = self.data.waveforms[band.data[data]]
+        moments = Moments.of_data(measured, training, self.recipe.preparation)
+        rows = band.sim[sim]
+        pulses, energy_kev = self.sim.waveforms[rows], self.sim.energy_kev[rows]
+        length, draws = record_length(pulses.shape[1]), training.noise_sets
+        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng)
+        translated = Translated(pulses, drawn, moments, band.weights[sim])
+        return Band(band.name, translated, rows)
