@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.kernels import KernelFiles
+from cpunet.kernels import KernelFiles, kernel
 
 CALLED = """
 from cpunet.kernels import kernel
@@ -51,6 +51,16 @@ def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
         )
         told.append(done.stdout.strip())
     assert told == ["20 0", "20 1", "30 0"]
+
+
+def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() -> None:
+    """Else a process that compiles has other last bits than those that load its code."""
+
+    def total(values):
+        return values.sum()
+
+    assert kernel(fastmath={"reassoc"})(total).targetoptions["forceinline"]
+    assert not kernel(total).targetoptions.get("forceinline")
 
 
 @pytest.fixture

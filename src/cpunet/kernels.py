@@ -38,6 +38,11 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a loop by numba's ``njit``, without the interpreter's lock, and keep its code."""
     if function is None:
         return functools.partial(kernel, **options)
+    if options.get("fastmath"):
+        # The compiler chooses the order of its sums.  Where it is compiled, what calls it would
+        # use its own code; where that is loaded, a copy compiled with the caller, whose last
+        # bits differ.  As a part of the caller there is but one.
+        options.setdefault("forceinline", True)
     compiled = numba.njit(nogil=True, **options)(function)
     compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
     return compiled
