@@ -27,7 +27,6 @@ SETTINGS = [
     "training.log_interval=1",
     "training.losses.gradient_penalty=0",
     "training.iterations=3",
-    "discriminator.samples_per_step=80",
 ]
 
 
@@ -151,6 +150,8 @@ def test_a_matching_recipe_needs_no_team(stand, pair, tmp_path):
 @pytest.mark.slow
 def test_torchrun(words, held, tmp_path):
     """As above, through torchrun, which passes on a signal."""
+    # a held training ends with the iteration after the one that it is held at
+    words = [*words, "--set", f"training.iterations={held.AFTER + 2}"]
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     command = [*launcher, "--nproc-per-node", "2", "--no-python"]
     plain = [sys.executable, "-c", "from cpunet.cli.main import main; main()"]
@@ -175,7 +176,8 @@ def test_torchrun(words, held, tmp_path):
     told = job.communicate()[1].splitlines()
     assert job.returncode != 0
     assert sum(line.startswith("error: ") for line in told) == 1
-    assert any(line.startswith("error: stopped after ") for line in told)
+    stopped = f"error: stopped after {held.AFTER + 1} of {held.AFTER + 2} iterations"
+    assert any(line.startswith(stopped) for line in told)
     job = begin(plain)
     assert "Traceback" not in job.communicate()[1]
     assert job.returncode == 0
