@@ -20,11 +20,13 @@ TINY = (
     "generator.width=2",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
+    "discriminator.samples_per_step=80",
     "training.iterations=2",
     "training.decay_start=1",
     "training.batch_size=2",
     "training.statistics_batches=1",
     "training.log_interval=1",
+    "scores.bootstraps=20",
 )
 RECIPE = load_recipe("small", TINY)
 EVENTS = {"FEP": 240, "SEP": 60, "DEP": 60}
