@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["TERM", "KILL"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param(signal.SIGTERM, id="TERM"),
+        # tests/cli/test_resume.py kills by force at each moment that there is
+        pytest.param(signal.SIGKILL, id="KILL", marks=pytest.mark.slow),
+    ],
+)
 def test_a_training_that_was_ended_goes_on(
     stand, tiny, trained, held, command, tmp_path: Path, how
 ):

@@ -38,7 +38,7 @@ TINY = [
     "generator.width=2",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
-    "discriminator.samples_per_step=16",
+    "discriminator.samples_per_step=80",
     "training.iterations=8",
     "training.batch_size=4",
     "training.statistics_batches=1",
@@ -198,19 +198,21 @@ def test_a_process_is_gone_before_anyone_asks_how_it_ended():
 def test_a_search_that_was_killed_goes_on(files, held, tmp_path, monkeypatch, capsys, no_pool):
     pytest.importorskip("optuna")
     folder = tmp_path / "tune"
-    values = [word for value in TINY for word in ("--set", value)]
+    short = [*TINY, "training.iterations=4"]
+    values = [word for value in short for word in ("--set", value)]
     inputs = ["--sim", files.sim.path, "--data", files.data.path, "--out", folder]
     words = ["tune", *inputs, "--recipe", "small", *values, "--trials", 2, "--jobs", 1]
     words = [*map(str, words), "--threads", "1"]
-    job, journal = subprocess.Popen([*held.PROGRAM, *words]), folder / "journal.log"
+    given = {"words": words, "errors": str(tmp_path / "errors")}
+    job, journal = held.forked(held.__file__, {"GIVEN": given}), folder / "journal.log"
     try:
         while not (journal.exists() and '"worker"' in journal.read_text()):
-            assert job.poll() is None, "no trial was begun"
+            assert job.is_alive(), "no trial was begun"
             time.sleep(0.02)
         started = held.children(job.pid)
     finally:
         job.kill()
-        job.wait()
+        job.join()
     held.wait_until_gone(started)
     monkeypatch.setattr(sys, "argv", ["cpunet", *words, "--resume"])
     with pytest.raises(SystemExit) as stop:
