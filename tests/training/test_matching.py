@@ -223,7 +223,8 @@ def test_what_a_fit_tells(near: Told) -> None:
 def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     short = ("training.steps=1", "training.search_pulses=250", "training.start_factors=[1]")
     short += ("training.ringing_mhz=[]",)
-    first, again, other = (problem.fit(seed, *short) for seed in (5, 5, 6))
+    few = Problem(problem.sim[:250], problem.data[:250], problem.noise)
+    first, again, other = (few.fit(seed, *short) for seed in (5, 5, 6))
     assert first[0].describe() == again[0].describe()
     assert first[1] == again[1]
     assert first[0].describe() != other[0].describe()

@@ -69,7 +69,7 @@ def test_pulses_are_dealt_equally_often():
     assert max(abs(c - 6000 / 7) for c in counts.values()) < 4 * np.sqrt(6000 / 7)
 
 
-@pytest.mark.parametrize(("n_sim", "n_data"), [(7, 11), (11, 7), (9, 9)])
+@pytest.mark.parametrize(("n_sim", "n_data"), [(5, 7), (7, 5), (6, 6)])
 def test_in_a_training_every_pulse_meets_every_other(monkeypatch, tiny, n_sim, n_data):
     pairs: Counter[tuple[int, int]] = Counter()
 
@@ -80,8 +80,8 @@ def test_in_a_training_every_pulse_meets_every_other(monkeypatch, tiny, n_sim, n
             return dict.fromkeys(LOSS_NAMES, torch.zeros(()))
 
     monkeypatch.setattr(loop, "Step", Watched)
-    # expected 1500 / 81 = 18 or more meetings of each pair
-    recipe = tiny("training.iterations=375", "training.batch_size=4")
+    # expected 660 / 36 = 18 meetings of each pair
+    recipe = tiny("training.iterations=165", "training.batch_size=4")
     sim, data = numbered(n_sim, 64)[:, 0].numpy(), 100 + numbered(n_data, 64)[:, 0].numpy()
     train(np.ascontiguousarray(sim), np.ascontiguousarray(data), recipe, seed=3)
     assert set(pairs) == {(i, 100 + j) for i in range(n_sim) for j in range(n_data)}
