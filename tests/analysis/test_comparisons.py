@@ -189,11 +189,12 @@ SHAPES = {
 }
 
 
+@pytest.mark.parametrize("draws", [150, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
+def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape, draws):
     """Over many draws: 2.3 % of a normal law, more of skewed ones; 0.5 … 9 % here."""
     rng = np.random.default_rng(6)
-    n_data, n_sim, draws = 300, 350, 300
+    n_data, n_sim = 300, 350
     z = {"iou": [], "w1": [], "ks": []}
     for _ in range(draws):
         data, sim = SHAPES[shape](rng, n_data), SHAPES[shape](rng, n_sim)

@@ -43,7 +43,14 @@ def test_impurities_from_the_measured_depletion(command):
     assert again.out.splitlines()[4] == outcome.out.splitlines()[4]
 
 
-@pytest.mark.parametrize("name", ["icpc", "bege", "ppc"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "icpc",
+        pytest.param("bege", marks=pytest.mark.slow),
+        pytest.param("ppc", marks=pytest.mark.slow),
+    ],
+)
 def test_a_picture_of_each_detector(command, tmp_path: Path, name: str):
     out = tmp_path / "fields.png"
     assert command("fields", name, *COARSE, "--out", out).code == 0

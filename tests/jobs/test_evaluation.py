@@ -138,7 +138,8 @@ def test_every_figure_can_be_drawn(whole) -> None:
 
 
 def test_figures_are_the_same_when_they_were_stored(whole, tmp_path) -> None:
-    made = drawings(whole)
+    # those of one peak, and of none: the others' are of the same kinds
+    made = {n: d for n, d in drawings(whole).items() if not n.startswith(("SEP", "DEP"))}
     write_drawings(tmp_path / "figures.npz", made, {"seed": 1})
     found, of = read_drawings(tmp_path / "figures.npz")
     assert of == {"seed": 1}
