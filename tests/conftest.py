@@ -142,10 +142,33 @@ def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cpunet.jobs.tune.work_off", work_off)
 
 
+def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+
+    patch.setattr("cpunet.jobs.validate._drawn", lambda _drawing, _advance: Figure())
+    patch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
+
+
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures of reports empty: to draw them takes most of a small report's time."""
-    monkeypatch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
+    leave_undrawn(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def all_undrawn() -> Iterator[None]:
+    """As above, for fixtures of a module."""
+    with pytest.MonkeyPatch.context() as patch:
+        leave_undrawn(patch)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def few_sums() -> Iterator[None]:
+    """Scores compare the translations of a few sums: two hundred take seconds each time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cpunet.jobs.evaluation.PAIRS", 20)
+        yield
 
 
 @pytest.fixture(scope="session")

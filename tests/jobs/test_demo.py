@@ -42,11 +42,9 @@ OPTIONS = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def own_cache(tmp_path_factory: pytest.TempPathFactory, all_undrawn: None) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
-        # to draw them takes most of the time
-        patch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
         yield
 
 
