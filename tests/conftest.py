@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -123,9 +123,7 @@ def held() -> ModuleType:
     return module
 
 
-@pytest.fixture
-def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do in this process what others would be started for, which takes each of them seconds."""
+def work_here(patch: pytest.MonkeyPatch) -> None:
     from cpunet.errors import CpunetError
     from cpunet.jobs.workers import Link, Outcome
 
@@ -138,8 +136,20 @@ def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
                 outcome = Outcome(item, failure=str(error))
             yield outcome
 
-    monkeypatch.setattr("cpunet.jobs.ensemble.work_off", work_off)
-    monkeypatch.setattr("cpunet.jobs.tune.work_off", work_off)
+    patch.setattr("cpunet.jobs.ensemble.work_off", work_off)
+    patch.setattr("cpunet.jobs.tune.work_off", work_off)
+
+
+@pytest.fixture
+def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do in this process what others would be started for, which takes each of them seconds."""
+    work_here(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def pool_of_none() -> Callable[[pytest.MonkeyPatch], None]:
+    """As above, as long as a patch holds."""
+    return work_here
 
 
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:

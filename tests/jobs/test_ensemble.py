@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,11 +76,27 @@ class Made(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def made(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Two seeds in a process of their own; do not change it."""
+def made(
+    files: Files, tmp_path_factory: pytest.TempPathFactory, pool_of_none: Callable[..., None]
+) -> Made:
+    """Two seeds trained in a process of their own, and scored in this; do not change it."""
     folder = tmp_path_factory.mktemp("made") / "ens"
-    told = train_ensemble(*files, folder, RECIPE, seeds=2, jobs=1, threads=1, device="cpu")
+    how = {"seeds": 2, "jobs": 1, "threads": 1, "device": "cpu"}
+    train_ensemble(*files, folder, RECIPE, validate=False, **how)
+    with pytest.MonkeyPatch.context() as patch:
+        pool_of_none(patch)
+        told = train_ensemble(*files, folder, RECIPE, resume=True, **how)
     return Made(folder, told)
+
+
+@pytest.mark.slow
+def test_processes_score_their_seeds(files, made, tmp_path):
+    out = tmp_path / "ens"
+    told = train_ensemble(*files, out, RECIPE, seeds=2, jobs=2, threads=1, device="cpu")
+    for seed in (0, 1):
+        assert weights(out / f"seed_00{seed}") == weights(made.folder / f"seed_00{seed}")
+        assert told["seeds"][str(seed)]["iou"] == made.told["seeds"][str(seed)]["iou"]
+    assert told["table"] == made.told["table"]
 
 
 def weights(run: Path) -> bytes:

@@ -191,8 +191,8 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
 def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
-    monitor = Listening()
-    info = train_run(other, files.data, tmp_path / "run", RECIPE, device="cpu", monitor=monitor)
+    monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, "training.steps=4"])
+    info = train_run(other, files.data, tmp_path / "run", recipe, device="cpu", monitor=monitor)
     fit = info["fit"]
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
     said = [note for note in monitor.warnings if "poor fit" in note]

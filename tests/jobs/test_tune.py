@@ -124,13 +124,13 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
 
 
 def test_scores_on_the_way_do_not_change_the_training(files):
-    recipe = tiny()
+    recipe = tiny("training.iterations=6")
     parts, told = held_out(files, recipe), []
     ren = parts.train(recipe, 3, "cpu", lambda *at: told.append(at))
     plain = train(parts.fit.sim.waveforms, parts.fit.data.waveforms, recipe, seed=3)
     for name, weights in plain.ren.state_dict().items():
         torch.testing.assert_close(ren.backend.network.state_dict()[name], weights)
-    assert [iteration for iteration, _ in told] == [2, 4, 6]
+    assert [iteration for iteration, _ in told] == [2, 4]
     assert np.isfinite([score for _, score in told]).all()
 
     def enough(_iteration: int, _score: float) -> None:
