@@ -166,7 +166,7 @@ def seen(chromium: str, shown: Exploration, folder: Path, width: int) -> dict[st
         "--dump-dom",
         file.as_uri(),
     ]
-    done = subprocess.run(words, capture_output=True, timeout=120, check=True)
+    done = subprocess.run(words, capture_output=True, timeout=240, check=True)
     found = re.search(r'<pre id="told">(.*?)</pre>', done.stdout.decode(), re.DOTALL)
     assert found, done.stderr.decode()[-2000:]
     return json.loads(unescape(found[1]))
