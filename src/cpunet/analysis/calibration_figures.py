@@ -79,7 +79,7 @@ def pulls_figure(content: Mapping[str, Any]) -> Figure:
     panel.set_xticks(middles, [_wrapped(name) for name in names], fontsize=8)
     panel.grid(axis="x", visible=False)
     panel.set_ylabel("deviation in standard deviations")
-    panel.legend(loc="upper right", ncols=2)
+    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
 
 
@@ -116,6 +116,8 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
 def _group(name: str) -> str:
     """What kind of function a moment is."""
     plain = name.split(": ")[-1]
+    if plain.endswith("squared"):
+        return "squares"
     for group in ("samples", "tail slope", "drift time"):
         if plain.startswith(group):
             return group

@@ -132,7 +132,7 @@ def _row(name: str, told: Mapping[str, Any]) -> str:
         f'<tr><td class="name">{escape(name)}</td><td>{told["simulated"]:.5g}</td>'
         f"<td>{told['value']:.5g}</td><td>{told['error']:.2g}</td>"
         f"<td>{told['error_all']:.2g}</td><td>{prior['value']:.4g} ± {prior['error']:.2g}</td>"
-        f'<td class="name">{escape(prior["source"])}</td></tr>'
+        f'<td class="long">{escape(prior["source"])}</td></tr>'
     )
 
 

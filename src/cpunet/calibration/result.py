@@ -12,8 +12,8 @@ from cpunet.calibration.nuisances import Nuisance, Values, priors
 from cpunet.calibration.search import Calibrated
 from cpunet.training.matching import GOOD_FIT
 
-# Offsets of a profile in errors.
-OFFSETS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+# Offsets of a profile in errors, and steps with which all else follows.
+OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
 # Errors of its prior from which on a parameter is far from what was thought possible, and part
 # of them in which it is at a bound.
 FAR, AT_BOUND = 3.0, 1e-6
@@ -141,31 +141,40 @@ def _profiles(calibrated: Calibrated) -> dict[str, Any]:
     problem = calibrated.problem
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
     here, n = parameters.vector(), parameters.n_chain
+    if not parameters.free:
+        return {}
+    jacobian = problem.jacobian(here, problem.residuals(here))
     found = {}
     for k, i in enumerate(parameters.free):
-        column = calibrated.covariance[:, n + k]
-        # to where the others go if this one is moved by one error
-        way = column / np.sqrt(column[n + k])
+        others = [j for j in range(len(here)) if j != n + k]
+        follow = np.asarray(np.linalg.pinv(jacobian[:, others]), float)
+        error = np.sqrt(calibrated.covariance[n + k, n + k])
         nuisance = physics.nuisances[i]
         nominal = physics.nominal(nuisance)
-        costs = [_cost(problem, here + offset * way) for offset in OFFSETS]
-        found[nuisance.name] = {
-            "value": [
-                _unbounded(nuisance, nominal, float(here[n + k] + offset * way[n + k]))
-                for offset in OFFSETS
-            ],
-            "chi_square": costs,
-        }
+        values, costs = [], []
+        for offset in OFFSETS:
+            moved = here.copy()
+            moved[n + k] += offset * error
+            values.append(_unbounded(nuisance, nominal, float(moved[n + k])))
+            costs.append(_lowest(problem, moved, others, follow))
+        found[nuisance.name] = {"value": values, "chi_square": costs}
     parameters.set(here)
     return found
+
+
+def _lowest(problem: JointProblem, vector: Values, others: list[int], follow: Values) -> float:
+    """Sum of squares with one coordinate held and all others at their best for it."""
+    residuals = problem.residuals(vector)
+    lowest = float(residuals @ residuals)
+    for _ in range(FOLLOWING):
+        vector = vector.copy()
+        vector[others] -= follow @ residuals
+        residuals = problem.residuals(vector)
+        lowest = min(lowest, float(residuals @ residuals))
+    return lowest
 
 
 def _unbounded(nuisance: Nuisance, nominal: float, coordinate: float) -> float:
     if nuisance.kind == "added":
         return nominal + coordinate
     return nuisance.value(nominal, coordinate)
-
-
-def _cost(problem: JointProblem, vector: Values) -> float:
-    residuals = problem.residuals(vector)
-    return float(residuals @ residuals)

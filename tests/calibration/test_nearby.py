@@ -1,0 +1,73 @@
+"""Pulses near those that were simulated, held against a simulation there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpunet.calibration._shape_kernels import half_maxima, move
+from cpunet.calibration.nearby import Nearby, Simulator
+from cpunet.calibration.nuisances import Physics, named
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+
+FREE = [named(name) for name in ("temperature", "impurity", "self_repulsion")]
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    detector = read_detector("ppc", ["grid_mm=0.25"])
+    rng = np.random.default_rng(2)
+    place = rng.uniform([-12, -12, 5], [12, 12, 30], (60, 3))
+    hits = Hits.of(place, rng.uniform(200, 1000, 60), np.arange(0, 61, 3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield Simulator(hits, Physics(detector, SimulationSettings(dt_ns=4), tuple(FREE)))
+
+
+def laid_over(pulses, others):
+    """Pulses moved so that they pass half of their height where the others do."""
+    at, there, moved = np.zeros(len(pulses)), np.zeros(len(pulses)), np.empty_like(pulses)
+    half_maxima(pulses, at)
+    half_maxima(others, there)
+    move(pulses, at - there, moved)
+    return moved
+
+
+def test_small_changes_are_those_of_a_simulation(simulator):
+    nearby = Nearby.about(simulator, np.zeros(3), range(3))
+    there = np.array([0.4, -0.008, 0.3])
+    exact = simulator.exact(there)
+    near = nearby.at(there)
+    change = laid_over(exact, nearby.base) - nearby.base
+    left = laid_over(near, nearby.base) - laid_over(exact, nearby.base)
+    assert np.sqrt((left**2).mean()) < 0.25 * np.sqrt((change**2).mean())
+
+
+def test_at_its_centre_nothing_is_added(simulator):
+    centre = np.array([1.0, 0.0, 0.0])
+    nearby = Nearby.about(simulator, centre, [])
+    assert np.array_equal(nearby.at(centre), simulator.exact(centre))
+    assert np.array_equal(nearby.at(centre, 7), simulator.exact(centre)[:7])
+
+
+def test_self_repulsion_is_never_negative(simulator):
+    """Below 0 there is none; its slope is that upwards."""
+    nearby = Nearby.about(simulator, np.zeros(3), [2])
+    assert np.abs(nearby.slopes[2]).max() > 0
+
+
+@given(st.floats(1, 8), st.floats(-6, 6))
+def test_pulses_are_moved_where_they_are_told(width, samples):
+    time = np.arange(200.0)
+    pulse = (1 / (1 + np.exp(-(time - 100.3) / width)))[np.newaxis].astype(np.float32)
+    at, moved = np.zeros(1), np.empty_like(pulse)
+    half_maxima(pulse, at)
+    assert at[0] == pytest.approx(100.3, abs=0.1)
+    move(pulse, np.array([samples]), moved)
+    wanted = 1 / (1 + np.exp(-(time + samples - 100.3) / width))
+    inside = slice(10, 180)
+    assert np.abs(moved[0] - wanted)[inside].max() < 0.05 / width**2 + 1e-4

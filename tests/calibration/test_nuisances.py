@@ -1,0 +1,73 @@
+"""Coordinates of the physics, and what they do to a detector and its settings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpunet.calibration.nuisances import NUISANCES, Physics, named, priors
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+
+PHYSICS = Physics(read_detector("icpc"), SimulationSettings(), NUISANCES)
+
+
+@given(st.sampled_from(NUISANCES), st.floats(-0.5, 0.5))
+def test_a_value_has_one_coordinate(nuisance, fraction):
+    nominal = PHYSICS.nominal(nuisance)
+    low, high = nuisance.bounds(nominal)
+    coordinate = min(max(fraction * nuisance.prior, low), high)
+    value = nuisance.value(nominal, coordinate)
+    assert nuisance.lowest <= value <= nuisance.highest
+    assert nuisance.coordinate(nominal, value) == pytest.approx(coordinate, abs=1e-9)
+
+
+@given(st.sampled_from(NUISANCES))
+def test_a_slope_is_the_change_of_the_value(nuisance):
+    nominal = PHYSICS.nominal(nuisance)
+    at = nuisance.step
+    value = nuisance.value(nominal, at)
+    change = nuisance.value(nominal, 1.001 * at) - value
+    if nuisance.name == "cloud_fwhm_mm":
+        assert nuisance.slope(nominal, value) == pytest.approx(change / (0.001 * at), rel=0.2)
+    else:
+        assert nuisance.slope(nominal, value) == pytest.approx(change / (0.001 * at), rel=0.01)
+
+
+def test_nothing_changes_at_zero():
+    assert PHYSICS.at(np.zeros(len(NUISANCES))) == (PHYSICS.detector, PHYSICS.settings)
+
+
+def test_each_coordinate_reaches_what_it_names():
+    before = {**PHYSICS.detector.model_dump(), **PHYSICS.settings.model_dump()}
+    for i, nuisance in enumerate(NUISANCES):
+        coordinates = np.zeros(len(NUISANCES))
+        coordinates[i] = nuisance.step
+        detector, settings = PHYSICS.at(coordinates)
+        after = {**detector.model_dump(), **settings.model_dump()}
+        assert after[nuisance.field] > before[nuisance.field]
+        assert {name for name in after if after[name] != before[name]} == {nuisance.field}
+
+
+def test_priors_are_the_defaults_or_those_given():
+    some = PHYSICS.of([named("temperature"), named("impurity_factor")])
+    default, given_ = priors(some, {}), priors(some, {"impurity_factor": (1.1, 0.011)})
+    assert [p.centre for p in default] == [0, 0]
+    assert given_[0] == default[0]
+    assert given_[1].centre == pytest.approx(np.log(1.1))
+    assert given_[1].width == pytest.approx(0.01)
+
+
+def test_what_is_not_known_or_possible_is_refused():
+    with pytest.raises(CpunetError, match="no such parameter of the physics; there are temp"):
+        named("colour")
+    hot = PHYSICS.of([named("li_thickness")])
+    with pytest.raises(CpunetError, match="with li_thickness_mm = 5 there can be none"):
+        Physics(
+            PHYSICS.detector.model_copy(update={"bore_length": 90.0, "li_thickness": 3.0}),
+            PHYSICS.settings,
+            hot.nuisances,
+        ).at(np.array([2.0]))

@@ -1,0 +1,144 @@
+"""``cpunet calibrate``: a detector that is 3 K warmer than it was simulated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.simulation.geometry_readers import read_detector
+
+EVENTS = "FEP=420,DEP=60"
+
+
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory) -> Path:
+    """A small stand; made by the package's own job, in this process."""
+    from cpunet.electronics.presets import read_electronics
+    from cpunet.jobs.hit_sources import energy_windows
+    from cpunet.jobs.stand import make_stand
+    from cpunet.recipes import load_recipe
+    from cpunet.simulation.shifted import Shift
+
+    out = tmp_path_factory.mktemp("calibrate") / "stand"
+    make_stand(
+        read_electronics("legend200"),
+        read_detector("ppc"),
+        tuple(energy_windows("FEP,DEP", load_recipe("fast").peaks, 0.5)),
+        (420, 60),
+        out,
+        kind="shifted",
+        shift=Shift(temperature_K=3),
+        seed=3,
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def calibrated(stand, tmp_path_factory) -> Path:
+    from cpunet.jobs.calibrate import Calibration
+    from cpunet.jobs.calibration_inputs import Freedom, Start
+    from cpunet.jobs.inputs import InputFile
+    from cpunet.recipes import load_recipe
+
+    run = tmp_path_factory.mktemp("calibrated") / "run"
+    Calibration(
+        Start(sim=InputFile(stand / "sim.lh5")),
+        InputFile(stand / "data.lh5"),
+        load_recipe("fast"),
+        Freedom.of("temperature", "", []),
+    ).run(run)
+    return run
+
+
+def test_the_temperature_is_found(calibrated):
+    told = json.loads((calibrated / "calibration.json").read_text())
+    temperature = told["parameters"]["temperature_K"]
+    simulated = read_detector("ppc").temperature_K
+    assert temperature["simulated"] == simulated
+    assert 0 < temperature["error"] < 0.5
+    assert abs(temperature["value"] - simulated - 3) < 3.5 * temperature["error"]
+    chi = told["chi_square"]
+    assert chi["after"] < 1.6 * chi["moments"] < chi["before"]
+    assert len(told["pulls"]["after"]) == chi["moments"]
+    assert told["directions"][0]["components"] == {"temperature_K": 1.0}
+    names = told["covariance"]["names"]
+    assert np.shape(told["covariance"]["matrix"]) == (len(names), len(names))
+    profile = told["profiles"]["temperature_K"]["chi_square"]
+    assert np.argmin(profile) == 2  # of five, the middle one
+    assert "temperature_K" in (calibrated / "calibration.html").read_text()
+
+
+def test_it_is_a_run_like_any_other(calibrated, stand, command, tmp_path):
+    detector = read_detector(calibrated / "detector.yaml")
+    told = json.loads((calibrated / "calibration.json").read_text())
+    assert detector.temperature_K == told["parameters"]["temperature_K"]["value"]
+    out = tmp_path / "translated.lh5"
+    done = command("translate", calibrated, calibrated / "sim.lh5", "--out", out)
+    assert done.code == 0, done.err
+    done = command("info", calibrated)
+    assert done.code == 0, done.err
+    words = ("--detector", calibrated / "detector.yaml", "--hits", calibrated / "sim.lh5")
+    again = tmp_path / "again.lh5"
+    settings = ("--settings", calibrated / "settings.yaml", "--cluster-mm", "0")
+    done = command("simulate", *words, *settings, "--out", again)
+    assert done.code == 0, done.err
+
+
+def test_a_plan_is_told_before_any_fit(stand, command, tmp_path):
+    out = tmp_path / "plan"
+    words = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--plan", "--out", out)
+    done = command("calibrate", *words, "--free", "temperature,hole_velocity_low,impurity")
+    assert done.code == 0, done.err
+    assert "temperature_K" in done.out
+    assert "in units of the prior" in done.out
+    told = json.loads((out / "plan.json").read_text())
+    of_temperature = told["errors"]["temperature_K"]
+    assert of_temperature["alone"]["40000"] < of_temperature["alone"]["1000"]
+    assert of_temperature["alone"]["1000"] < of_temperature["all_free"]["1000"]
+    assert (out / "plan.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((), "give --out, the run folder to make, or --plan"),
+        (("--out", "run", "--free", "colour"), "'colour': no such parameter of the physics"),
+        (("--out", "run", "--prior", "temperature=90"), "expected NAME=VALUE±ERROR"),
+        (("--out", "run", "--prior", "temperature=90±0"), "expected NAME=VALUE±ERROR"),
+        (("--out", "run", "--free", "bias", "--fix", "bias"), "all of it is fixed"),
+        (("--out", "run", "--recipe", "small"), "has no readout chain"),
+        (("--out", "run", "--hits", "x.lh5"), "give either --sim FILE, with its hits, or"),
+    ],
+)
+def test_a_wrong_call_is_one_line(stand, command, words, told, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    both = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5")
+    done = command("calibrate", *both, *words)
+    assert done.code == 2
+    assert told in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_pulses_without_hits_are_refused(stand, command, tmp_path):
+    words = ("--sim", stand / "data.lh5", "--data", stand / "data.lh5")
+    done = command("calibrate", *words, "--out", tmp_path / "run")
+    assert done.code == 2
+    assert "give an output of cpunet simulate or cpunet stand" in done.err
+
+
+def test_hits_need_a_detector(stand, command, tmp_path):
+    words = ("--hits", stand / "sim.lh5", "--data", stand / "data.lh5")
+    done = command("calibrate", *words, "--out", tmp_path / "run")
+    assert done.code == 2
+    assert "give the --detector that they lie in" in done.err
+
+
+def test_an_input_is_not_overwritten(stand, command):
+    words = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5")
+    done = command("calibrate", *words, "--out", stand, "--force")
+    assert done.code == 2
+    assert (stand / "sim.lh5").is_file()
