@@ -69,6 +69,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
             "after": calibrated.chi_square,
             "moments": problem.moments,
             "degrees_of_freedom": problem.moments - len(vector),
+            "errors_scaled_by": calibrated.scale,
         },
         "directions": [_direction(direction) for direction in calibrated.directions],
         "covariance": {

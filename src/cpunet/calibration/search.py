@@ -48,7 +48,7 @@ class Calibrated:
     problem
         Where the search has ended: chain, coordinates, functions, pulses.
     covariance
-        Of its parameters.
+        Of its parameters; if chi-square per degree of freedom is above 1, times that.
     chi_square_before, pulls_before
         Of the chain alone, with the physics as simulated.
     chi_square
@@ -83,6 +83,11 @@ class Calibrated:
         """Of the free coordinates."""
         n = self.problem.parameters.n_chain
         return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
+
+    @property
+    def scale(self) -> float:
+        """By how much errors are larger than if all were explained: a root of chi-square."""
+        return _scale(self.problem, self.chi_square)
 
 
 @dataclass(eq=False)
@@ -287,17 +292,19 @@ class Search:
         vector = before.parameters.vector()
         promised, information = self._promised(problem)
         nuisances = self.simulator.physics.nuisances
+        chi_square = problem.chi_square(problem.parameters.vector())
+        scale = _scale(problem, chi_square)
         return Calibrated(
             problem=problem,
-            covariance=found.covariance,
+            covariance=scale**2 * found.covariance,
             chi_square_before=before.chi_square(vector),
             pulls_before=before.pulls(vector),
-            chi_square=problem.chi_square(problem.parameters.vector()),
+            chi_square=chi_square,
             directions=information.directions(),
             errors_all=dict(
                 zip(
                     (nuisance.name for nuisance in information.nuisances),
-                    information.errors().tolist(),
+                    (scale * information.errors()).tolist(),
                     strict=True,
                 )
             ),
@@ -318,6 +325,12 @@ class Search:
                 slope = nuisance.slope(physics.nominal(nuisance), value)
                 told.append(f"{nuisance.name} {value:.4g} ± {slope * error:.2g}")
         self.note(", ".join(told))
+
+
+def _scale(problem: JointProblem, chi_square: float) -> float:
+    """Where chain and physics do not explain all, errors grow with the root of chi-square."""
+    freedom = problem.moments - len(problem.parameters.vector())
+    return float(np.sqrt(max(1.0, chi_square / freedom)))
 
 
 def _jacobian(problem: JointProblem) -> Values:

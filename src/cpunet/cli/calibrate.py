@@ -67,6 +67,14 @@ LengthUnit = Annotated[
 EnergyUnit = Annotated[
     str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
 ]
+ClusterMm = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        help="Of --hits: merge those nearer than this. Self-repulsion acts in what is merged.",
+        rich_help_panel=HITS,
+    ),
+]
 SettingsFile = Annotated[
     Path | None,
     typer.Option(
@@ -131,6 +139,7 @@ def calibrate(
     flip_z: FlipZ = False,
     length_unit: LengthUnit = None,
     energy_unit: EnergyUnit = None,
+    cluster_mm: ClusterMm = 0.05,
     settings_file: SettingsFile = None,
     set_values: Set = None,
     crystal: options.Crystal = None,
@@ -169,7 +178,7 @@ def calibrate(
         refuse_inputs(out_folder, recipe, detector, settings_file)
     start = _start(
         sim, detector, hits, settings_file, set_values or [], crystal, hits_detector,
-        origin, flip_z, length_unit, energy_unit, insist,
+        origin, flip_z, length_unit, energy_unit, cluster_mm, insist,
     )  # fmt: skip
     measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
     job = Calibration(
@@ -203,6 +212,7 @@ def _start(
     flip_z: bool,
     length_unit: str | None,
     energy_unit: str | None,
+    cluster_mm: float,
     insist: bool,
 ) -> Start:
     from cpunet.jobs.calibration_inputs import Start
@@ -227,6 +237,7 @@ def _start(
         source,
         None if detector is None else read_detector(detector, of_detector, crystal),
         load_settings(settings_file, of_settings) if given else None,
+        cluster_mm,
     )
 
 

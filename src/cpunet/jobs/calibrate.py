@@ -302,7 +302,7 @@ def _simulate_calibrated(
     _write_physics(folder, detector, settings)
     simulate_file(
         detector,
-        HitFile(sides.sim_path),
+        HitFile(sides.sim_path, placed=True),
         folder / SIM,
         settings,
         cluster_mm=0.0,

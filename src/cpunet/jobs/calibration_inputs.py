@@ -98,12 +98,15 @@ class Start:
         Of the events to be simulated; None with `sim`.
     detector, settings
         To simulate them with; with `sim`, None for those that it was made with.
+    cluster_mm
+        Of `hits`, those nearer than this to each other are merged.
     """
 
     sim: InputFile | None = None
     hits: HitFile | None = None
     detector: Detector | None = None
     settings: SimulationSettings | None = None
+    cluster_mm: float = 0.05
 
     def __post_init__(self) -> None:
         if (self.sim is None) == (self.hits is None):
@@ -200,7 +203,9 @@ def _simulated(start: Start, path: Path, dt_ns: float, monitor: Monitor) -> Path
     assert start.hits is not None
     assert start.detector is not None
     settings = start.settings or SimulationSettings(dt_ns=dt_ns)
-    simulate_file(start.detector, start.hits, path, settings, monitor=monitor)
+    simulate_file(
+        start.detector, start.hits, path, settings, cluster_mm=start.cluster_mm, monitor=monitor
+    )
     return path
 
 

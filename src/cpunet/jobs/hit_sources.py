@@ -82,7 +82,8 @@ def energy_windows(
 class HitFile:
     """Hits of a file, see `cpunet.simulation.hit_readers.read_hits`.
 
-    With `windows`, only events whose deposits add up to an energy in one of them.
+    With `windows`, only events whose deposits add up to an energy in one of them.  If they are
+    `placed`, it was looked at already whether they lie in the crystal.
     """
 
     path: Path
@@ -91,6 +92,7 @@ class HitFile:
     length_unit: str | None = None
     energy_unit: str | None = None
     windows: tuple[Window, ...] = ()
+    placed: bool = False
 
     def open(self, detector: Detector) -> OpenHits:
         """Read the file.
@@ -114,7 +116,8 @@ class HitFile:
                 names = ", ".join(window.name for window in self.windows)
                 raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
         blocks = (hits[i : i + BLOCK_EVENTS] for i in range(0, hits.n_events, BLOCK_EVENTS))
-        return OpenHits(hits.n_events, blocks, self._outside(hits, detector))
+        warning = "" if self.placed else self._outside(hits, detector)
+        return OpenHits(hits.n_events, blocks, warning)
 
     def provenance(self) -> dict[str, Any]:
         """What the output tells of its hits."""
