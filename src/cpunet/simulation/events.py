@@ -174,7 +174,8 @@ def _sum_exact(
             trapped += hit[3] * share
         lost_kev[event], trapped_kev[event] = lost, trapped
         if collected > trapped:
-            waveforms[event] = out / (collected - trapped)
+            for j in range(len(out)):
+                waveforms[event, j] = out[j] / (collected - trapped)
 
 
 @kernel(parallel=True)

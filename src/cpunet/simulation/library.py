@@ -146,7 +146,8 @@ def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
     """Corners (n, 2) of cells at which no charge has been drifted yet."""
     new = np.zeros(library.column.shape, np.bool_)
     new[tuple((cells[:, None] + size * _CORNERS).reshape(-1, 2).T)] = True
-    return np.argwhere(new & (library.column == UNTRIED))
+    # in one layout: for another all that drifts is compiled again
+    return np.ascontiguousarray(np.argwhere(new & (library.column == UNTRIED)))
 
 
 def _with_nodes(

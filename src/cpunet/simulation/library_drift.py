@@ -27,6 +27,8 @@ class Task(NamedTuple):
     """What the compiled loops need, beside the maps, to drift a charge and smear its pulse.
 
     `rounding`: siggen rounds the cloud's duration to whole steps, by one up on average.
+    `stride` is that of `cpunet.simulation.drift.drift`; as a constant there it would have
+    the drift compiled again for it.
     """
 
     cloud_fwhm_mm: float
@@ -36,6 +38,7 @@ class Task(NamedTuple):
     step_ns: float
     per_sample: int
     n_samples: int
+    stride: int = 1
 
 
 @kernel
@@ -67,7 +70,8 @@ def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> N
                         - library.half_ns[high * azimuths + k]
                     )
             if found > 0:
-                bends[c, axis] *= 0.5 / found
+                for k in range(azimuths):
+                    bends[c, axis, k] *= 0.5 / found
 
 
 @kernel(parallel=True)
@@ -128,7 +132,7 @@ def _fine_pulse(
     before = library.margin * task.per_sample
     cloud = (task.cloud_fwhm_mm, task.diffusion, task.repulsion, False)
     last, arrived, fwhm, trapped = point_signal(
-        maps, hit, cloud, task.step_ns, 1, signal[before:]
+        maps, hit, cloud, task.step_ns, task.stride, signal[before:]
     )
     fwhm += task.rounding if fwhm > 0.0 else 0.0
     group = task.per_sample // library.phases
@@ -145,7 +149,8 @@ def _fine_pulse(
             1.0,
             sample,
         )
-        rows[p] = sample
+        for j in range(len(sample)):  # an assignment compiles what it would tell of shapes
+            rows[p, j] = sample[j]
     # two FWHM is where the cloud is cut
     end = (last + before + int(2.0 * fwhm) + 2) // task.per_sample + 2
     return min(end, rows.shape[1]), arrived, trapped

@@ -208,6 +208,7 @@ def _all_signals(
             maps, hits[i], cloud, times[0], times[2], signal
         )
         smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, 1.0, out)
-        waveforms[i] = out
+        for j in range(len(out)):
+            waveforms[i, j] = out[j]
         facts[i, 0], facts[i, 1] = last, 1.0 if arrived else 0.0
         facts[i, 2], facts[i, 3] = fwhm, trapped
