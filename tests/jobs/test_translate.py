@@ -319,7 +319,7 @@ def require_same_bytes(path, expected):
     pytest.fail(f"{path} holds what {expected} does, in other bytes")
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     run, many, sequential, tmp_path, jobs
 ):

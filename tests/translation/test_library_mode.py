@@ -164,6 +164,7 @@ def test_reboost_reads_the_translated_library(chain, tmp_path):
     assert 30 < halves[1] - halves[0] < 60
 
 
+@pytest.mark.slow  # ten seconds, in which reboost compiles its own loops
 def test_reboost_finds_the_current_amplitude(chain, tmp_path):
     psd, utils = (pytest.importorskip(f"reboost.hpge.{name}") for name in ("psd", "utils"))
     ak = pytest.importorskip("awkward")
@@ -198,7 +199,10 @@ def test_a_library_of_our_own(chain, tmp_path):
     utils = pytest.importorskip("reboost.hpge.utils")
     settings = SimulationSettings(dt_ns=4, length_ns=3200, step_ns=2)
     counts = write_library(
-        read_detector("ppc"), tmp_path / "psl.lh5", settings=settings, grid_mm=8
+        read_detector("ppc", ["grid_mm=0.2"]),
+        tmp_path / "psl.lh5",
+        settings=settings,
+        grid_mm=8,
     )
     told = translate_library(chain, tmp_path / "psl.lh5", tmp_path / "ren.lh5")
     assert counts["templates"] == told["templates"]
