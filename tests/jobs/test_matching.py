@@ -35,6 +35,7 @@ ONE_START = (
     "training.start_factors=[1]",
     "training.steps=14",
 )
+SHORT = ("training.steps=4", "training.ringing_mhz=[]")
 RECIPE = load_recipe("fast", ONE_START)
 
 
@@ -191,7 +192,7 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
 def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
-    monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, "training.steps=4"])
+    monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, *SHORT])
     info = train_run(other, files.data, tmp_path / "run", recipe, device="cpu", monitor=monitor)
     fit = info["fit"]
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
