@@ -84,6 +84,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         },
         "profiles": _profiles(calibrated),
         "rounds": calibrated.rounds,
+        "settled": calibrated.settled,
         "notes": notes(calibrated),
     }
 

@@ -59,8 +59,8 @@ class Calibrated:
         By how much chi-square would fall if a parameter that was not free were.
     errors_all
         Errors of all coordinates looked at, if all of them were free.
-    rounds
-        Of the search.
+    rounds, settled
+        Of the search, and whether the physics stayed where they were in the last one.
     """
 
     problem: JointProblem
@@ -72,6 +72,7 @@ class Calibrated:
     promised: dict[str, float]
     errors_all: dict[str, float]
     rounds: int
+    settled: bool
 
     @property
     def response(self) -> ElectronicsResponse:
@@ -150,7 +151,7 @@ class Search:
         before = self._problem(response, nearby, [])
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
-        may_ring, more = True, 0
+        may_ring, more, last = True, 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
             problem = self._problem(response, nearby, free, held=number == 1)
             found = levenberg_marquardt(problem, STEPS, None, coarse=number == 1)
@@ -167,8 +168,9 @@ class Search:
                 break
             if added is not None:
                 free, more = sorted([*free, added]), more + 1
-            nearby = self._moved(nearby, moved, free)
-        return self._ended(problem, found, before, number)
+            last = _relaxed(moved, last)
+            nearby = self._moved(nearby, last, free)
+        return self._ended(problem, found, before, number, settled=settled)
 
     @property
     def _n(self) -> int:
@@ -288,6 +290,8 @@ class Search:
         found: Minimum,
         before: JointProblem,
         rounds: int,
+        *,
+        settled: bool,
     ) -> Calibrated:
         vector = before.parameters.vector()
         promised, information = self._promised(problem)
@@ -310,6 +314,7 @@ class Search:
             ),
             promised={nuisances[i].name: fall for i, fall in promised.items()},
             rounds=rounds,
+            settled=settled,
         )
 
     def _tell(self, when: str, problem: JointProblem, found: Minimum | None = None) -> None:
@@ -340,6 +345,17 @@ def _jacobian(problem: JointProblem) -> Values:
 
 def _poor(problem: JointProblem) -> bool:
     return problem.chi_square(problem.parameters.vector()) > GOOD_FIT * problem.moments
+
+
+def _relaxed(moved: Values, last: Values) -> Values:
+    """Moves that turn back end where they and those before them would meet.
+
+    Where pulses are far from in proportion, a search goes back and forth about its end.
+    """
+    back = moved * last < 0
+    share = np.ones(len(moved))
+    share[back] = 1 / (1 + np.abs(moved[back] / last[back]))
+    return share * moved
 
 
 def _settled(problem: JointProblem, found: Minimum, moved: Values) -> bool:
