@@ -32,6 +32,13 @@ COMMANDS = {
         ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN"),
         ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN/new"),
     ],
+    "calibrate": [
+        (TRAINING, "D"),
+        (f"{TRAINING} --plan", "D"),
+        ("--hits D/hits.lh5 --detector icpc --data data.lh5", "D/hits.lh5"),
+        ("--sim sim.lh5 --detector D/my.yaml --data data.lh5", "D"),
+        (f"{TRAINING} --settings D/my.yaml", "D/my.yaml"),
+    ],
     "ensemble": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
     "tune": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
     "translate": [
