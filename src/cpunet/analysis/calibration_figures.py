@@ -118,7 +118,7 @@ def _group(name: str) -> str:
     plain = name.split(": ")[-1]
     if plain.endswith("squared"):
         return "squares"
-    for group in ("samples", "tail slope", "drift time"):
+    for group in ("samples", "drift time"):
         if plain.startswith(group):
             return group
     kind = "current amplitude" if plain.startswith("current") else "components"

@@ -150,7 +150,8 @@ def _profiles(calibrated: Calibrated) -> dict[str, Any]:
     for k, i in enumerate(parameters.free):
         others = [j for j in range(len(here)) if j != n + k]
         follow = np.asarray(np.linalg.pinv(jacobian[:, others]), float)
-        error = np.sqrt(calibrated.covariance[n + k, n + k])
+        error = float(np.sqrt(calibrated.covariance[n + k, n + k]))
+        valley = calibrated.covariance[:, n + k] / error
         nuisance = physics.nuisances[i]
         nominal = physics.nominal(nuisance)
         values, costs = [], []
@@ -158,7 +159,8 @@ def _profiles(calibrated: Calibrated) -> dict[str, Any]:
             moved = here.copy()
             moved[n + k] += offset * error
             values.append(_unbounded(nuisance, nominal, float(moved[n + k])))
-            costs.append(_lowest(problem, moved, others, follow))
+            starts = (moved, here + offset * valley)
+            costs.append(min(_lowest(problem, s, others, follow) for s in starts))
         found[nuisance.name] = {"value": values, "chi_square": costs}
     parameters.set(here)
     return found

@@ -1,0 +1,53 @@
+"""Parts of a search that can be told without one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpunet.calibration.nuisances import Physics, named
+from cpunet.calibration.search import _relaxed
+from cpunet.jobs.calibration_inputs import Freedom, known_depletion
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.superposition import solve
+
+
+@given(st.floats(-3, -0.05), st.floats(0.1, 10))
+def test_a_search_that_goes_back_and_forth_ends_between(slope, begin):
+    """Where each round overshoots in proportion, two rounds are enough."""
+    where, last = np.array([begin]), np.zeros(1)
+    for _ in range(2):
+        last = _relaxed((slope - 1) * where, last)
+        where = where + last
+    assert abs(where[0]) < 1e-9 * begin
+
+
+def test_a_search_that_goes_on_is_not_held():
+    assert _relaxed(np.array([1.0, -2.0]), np.array([3.0, 0.0])).tolist() == [1.0, -2.0]
+
+
+def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
+    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path))
+    detector = read_detector("ppc", ["grid_mm=0.25"])
+    nuisances = named("impurity"), named("tilt")
+    physics = Physics(detector, SimulationSettings(), nuisances)
+    voltage = solve(detector).depletion_V(1.1, 0.01)
+    freedom = Freedom.of("impurity,tilt", "", [f"depletion_voltage={voltage}+-10"])
+    known = known_depletion(physics, freedom.priors["depletion_voltage"])
+    # scale and tilt add up to first order; the voltage is found to some volts
+    assert known(np.array([np.log(1.1), 0.01]))[0] == pytest.approx(0, abs=1.5)
+    assert known(np.zeros(2))[0] < -5
+    assert not len(known_depletion(physics, None)(np.zeros(2)))
+
+
+def test_what_is_free_and_what_is_not():
+    freedom = Freedom.of("auto", "cloud,tilt", ["impurity = 1.0 ± 0.05"])
+    names = [nuisance.name for nuisance in freedom.looked_at]
+    assert names[:2] == ["temperature_K", "impurity_factor"]
+    assert not {"cloud_fwhm_mm", "impurity_tilt_1e10_per_cm4", "li_thickness_mm"} & set(names)
+    assert freedom.priors == {"impurity_factor": (1.0, 0.05)}
+    some = Freedom.of("li_thickness,bias", "bias", [])
+    assert [nuisance.name for nuisance in some.looked_at] == ["li_thickness_mm"]
