@@ -141,16 +141,7 @@ class Calibration:
         with folder_written_aside(
             out, RUN, *self.files, force=force, note=monitor.note
         ) as folder:
-            sides = read_sides(
-                self.start,
-                self.data,
-                self.recipe,
-                self.peak,
-                self.events,
-                self.seed,
-                folder,
-                monitor,
-            )
+            sides = self._sides(folder, monitor)
             with monitor.stage("Calibrating") as advance:
                 calibrated = self._search(sides, monitor, lambda: advance(1)).run()
             self._require_hope(calibrated, sides)
@@ -206,16 +197,7 @@ class Calibration:
         return content
 
     def _planned(self, folder: Path, monitor: Monitor) -> dict[str, Any]:
-        sides = read_sides(
-            self.start,
-            self.data,
-            self.recipe,
-            self.peak,
-            self.events,
-            self.seed,
-            folder,
-            monitor,
-        )
+        sides = self._sides(folder, monitor)
         with monitor.stage("Planning") as advance:
             search = self._search(sides, monitor, lambda: advance(1))
             information = search.plan()
@@ -236,16 +218,8 @@ class Calibration:
         }
 
     def _sides(self, folder: Path, monitor: Monitor) -> Sides:
-        return read_sides(
-            self.start,
-            self.data,
-            self.recipe,
-            self.peak,
-            self.events,
-            self.seed,
-            folder,
-            monitor,
-        )
+        inputs = self.start, self.data, self.recipe, self.peak, self.events, self.seed
+        return read_sides(*inputs, folder, monitor)
 
     def _search(self, sides: Sides, monitor: Monitor, simulated: Callable[[], None]) -> Search:
         """The search, ready to begin."""

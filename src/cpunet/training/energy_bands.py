@@ -21,7 +21,8 @@ from cpunet.recipes.schema import PeakConfig
 Values = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
-WIDEST = 1.3  # ratio of a band's ends
+# Ratios of a band's ends: the next only if pulses are too few for any band of the one before.
+WIDEST = (1.3, 2.0, 4.0, np.inf)
 LEAST = 200  # pulses of each side without which a band is not compared
 SLICES, IN_SLICE = 32, 50  # of a band at most, and pulses of each: spectra are made alike there
 HEAVIEST = 5.0  # weight of a simulated pulse
@@ -84,9 +85,12 @@ def energy_bands(
         if min(len(sim), len(data)) >= LEAST:
             bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
     inside = {band.name for band in bands}
-    between = [np.flatnonzero(~np.isin(of, [*inside])) for of in labels]
-    bands += _continuum(sim_kev, data_kev, *between)
-    if not bands:
+    sim, data = (np.flatnonzero(~np.isin(of, [*inside])) for of in labels)
+    for widest in WIDEST:
+        bands += _continuum(sim_kev, data_kev, sim, data, widest)
+        if bands:
+            break
+    else:
         raise CpunetError(
             f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {LEAST} of each at "
             "the same energies are needed: select more energies (--peak), simulate more, or "
@@ -95,7 +99,9 @@ def energy_bands(
     return bands
 
 
-def _continuum(sim_kev: Values, data_kev: Values, sim: Rows, data: Rows) -> list[EnergyBand]:
+def _continuum(
+    sim_kev: Values, data_kev: Values, sim: Rows, data: Rows, widest: float
+) -> list[EnergyBand]:
     """Bands of what is on no line, from the highest energy down."""
     bands, energies = [], (sim_kev, data_kev)
     rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
@@ -103,7 +109,7 @@ def _continuum(sim_kev: Values, data_kev: Values, sim: Rows, data: Rows) -> list
         top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
         rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
         counts = [
-            int((e[r] >= top / WIDEST).sum()) for r, e in zip(rows, energies, strict=True)
+            int((e[r] >= top / widest).sum()) for r, e in zip(rows, energies, strict=True)
         ]
         left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
         if min(counts) >= LEAST and min(left) < LEAST and max(left) < 2 * LEAST:
