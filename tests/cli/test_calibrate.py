@@ -179,6 +179,14 @@ def test_pulses_without_hits_are_refused(stand, command, tmp_path):
     assert "give an output of cpunet simulate or cpunet stand" in done.err
 
 
+def test_settings_keep_the_period_of_the_pulses(stand, command, tmp_path):
+    words = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--set", "dt_ns=8")
+    done = command("calibrate", *words, "--out", tmp_path / "run")
+    assert done.code == 2
+    assert "dt_ns = 8, but the pulses of" in done.err
+    assert not (tmp_path / "run").exists()
+
+
 def test_hits_need_a_detector(stand, command, tmp_path):
     words = ("--hits", stand / "sim.lh5", "--data", stand / "data.lh5")
     done = command("calibrate", *words, "--out", tmp_path / "run")

@@ -43,10 +43,11 @@ def steps_of(tiny, dtype: torch.dtype) -> tuple[Step, Step]:
     ("dtype", "apart", "tolerance"),
     [(torch.float64, True, 1e-9), (torch.float32, False, 1e-5)],
 )
-def test_ten_steps_have_the_same_losses(tiny, sets, dtype, apart, tolerance):
+@pytest.mark.parametrize("steps", [10, pytest.param(20, marks=pytest.mark.slow)])
+def test_steps_have_the_same_losses(tiny, sets, dtype, apart, tolerance, steps):
     plain, fast = steps_of(tiny, dtype)
     sim, data = (torch.from_numpy(pulses[:, None]).to(dtype) for pulses in sets)
-    for iteration in range(10):
+    for iteration in range(steps):
         rows = torch.randperm(len(data))[:4]
         expected = plain(iteration, sim[rows], data[rows.flip(0)])
         found = fast(iteration, sim[rows], data[rows.flip(0)])

@@ -9,6 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
+from cpunet.cli.simulate import EnergyUnit, FlipZ, HitTable, LengthUnit, Origin
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -43,29 +44,6 @@ HitFileName = Annotated[
         help="Hits to simulate, as for cpunet simulate, instead of --sim.",
         rich_help_panel=HITS,
     ),
-]
-HitTable = Annotated[
-    str | None,
-    typer.Option(
-        "--hits-detector", help="Which of the file's detectors.", rich_help_panel=HITS
-    ),
-]
-Origin = Annotated[
-    str | None,
-    typer.Option(
-        help="X,Y,Z in mm: the point contact's centre in the file's frame.",
-        rich_help_panel=HITS,
-    ),
-]
-FlipZ = Annotated[
-    bool,
-    typer.Option("--flip-z", help="The file's point contact is on top.", rich_help_panel=HITS),
-]
-LengthUnit = Annotated[
-    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
-]
-EnergyUnit = Annotated[
-    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
 ]
 ClusterMm = Annotated[
     float,

@@ -194,7 +194,13 @@ def read_sides(
     # in an order of which any beginning is a fair part
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
-    physics = Physics(start.detector or stored.detector, start.settings or stored.settings, ())
+    settings = start.settings or stored.settings
+    if not np.isclose(settings.dt_ns, simulated.dt_ns):
+        raise CpunetError(
+            f"--settings: dt_ns = {settings.dt_ns:g}, but the pulses of {sim.path} have "
+            f"{simulated.dt_ns:g}; give that"
+        )
+    physics = Physics(start.detector or stored.detector, settings, ())
     return Sides(some, data, sim.path, physics, stored, selection, temporary)
 
 
