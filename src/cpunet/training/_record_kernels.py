@@ -197,6 +197,17 @@ def read_records(
         amplitudes[row] = _amplitude(current, first, first + 2 * (reach - half) + 1, weights)
 
 
+@kernel(error_model="numpy")
+def add_noise(
+    records: Any, traces: Any, trace: Any, start: Any, factor: Any, noisy: Any
+) -> None:  # pragma: no cover - compiled
+    """Records plus a stretch of a trace each: which one, from which sample on, times what."""
+    for row in range(len(records)):
+        drawn, first, scale = traces[trace[row]], start[row], factor[row]
+        for i in range(records.shape[1]):
+            noisy[row, i] = records[row, i] + scale * drawn[first + i]
+
+
 @kernel(error_model="numpy", fastmath=FAST)
 def project(aligned: Any, matrix: Any, out: Any) -> None:  # pragma: no cover - compiled
     """Product of aligned pulses and a matrix (samples, columns), without threads of its own."""

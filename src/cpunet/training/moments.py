@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -303,8 +304,12 @@ def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, Floa
     """Mean, and the first components in units of their standard deviation, (samples, n)."""
     mean = aligned.mean(axis=0)
     covariance = np.cov(aligned.T.astype(float), bias=True)
-    variances, axes = np.linalg.eigh(covariance)
-    variances, axes = variances[::-1][:n], axes[:, ::-1][:, :n]
+    size = len(covariance)
+    # only these: all of them may take seconds
+    variances, axes = scipy.linalg.eigh(
+        covariance, subset_by_index=(max(size - n, 0), size - 1)
+    )
+    variances, axes = variances[::-1], axes[:, ::-1]
     scaled = axes / np.sqrt(np.maximum(variances, np.finfo(float).tiny))
     return mean, np.ascontiguousarray(scaled, np.float32)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from cpunet.networks.response import (
     record_length,
 )
 from cpunet.pulses.container import FloatArray
+from cpunet.training._record_kernels import add_noise
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
 
 # Half maxima come at most this many samples after the aligned one: what the response delays.
@@ -33,6 +34,7 @@ PLATEAU = 100  # samples after the window whose mean tells the height of a recor
 # Traces of noise that are kept, each twice as long as a record.  More pulses than these share
 # them, at other places and with other signs.
 NOISE_TRACES = 4096
+SPECTRA_BYTES = 2**27  # of pulses that are not transformed anew for each response
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +93,12 @@ class Noise:
 
     def add(self, records: FloatArray, draw: int, first: int) -> FloatArray:
         """Records of the pulses from `first` on, with the noise of a draw."""
-        noisy = np.empty_like(records)
-        length = records.shape[1]
-        for i, record in enumerate(records):
-            row = first + i
-            start = self.start[draw, row]
-            drawn = self.traces[self.trace[draw, row], start : start + length]
-            np.multiply(drawn, self.factor[draw, row], out=noisy[i])
-            noisy[i] += record
+        noisy = np.empty(records.shape, np.float32)
+        rows = slice(first, first + len(records))
+        trace, start, factor = (
+            each[draw, rows] for each in (self.trace, self.start, self.factor)
+        )
+        add_noise(records, self.traces, trace, start, factor, noisy)
         return noisy
 
 
@@ -122,6 +122,9 @@ class Translated:
     noise: Noise
     moments: Moments
     weights: Values
+    _spectra: dict[tuple[int, int], npt.NDArray[np.complex64]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __len__(self) -> int:
         return len(self.sim)
@@ -202,13 +205,8 @@ class Translated:
     ) -> Iterator[Readings]:
         """Readings of one block of pulses, draw by draw."""
         preparation = self.moments.preparation
-        sim = self.sim[first : first + BLOCK]
+        spectrum = self._spectrum(first) * transfer
         padded = padded_length(self.length)
-        current = np.zeros((len(sim), self.length), np.float32)
-        current[:, ROOM_BEFORE] = sim[:, 0]
-        np.subtract(sim[:, 1:], sim[:, :-1], out=current[:, ROOM_BEFORE + 1 : -ROOM_AFTER])
-        spectrum = scipy.fft.rfft(current, padded)
-        spectrum *= transfer
         records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
         plateau = records[:, -ROOM_AFTER : PLATEAU - ROOM_AFTER].mean(axis=1, keepdims=True)
         records *= preparation.tail_level / plateau
@@ -217,3 +215,18 @@ class Translated:
             noisy = self.noise.add(records, draw, first)
             weights = self.weights[first : first + BLOCK]
             yield self.moments.read(noisy, last, cut=cut, weights=weights)
+
+    def _spectrum(self, first: int) -> npt.NDArray[np.complex64]:
+        """Fourier transform of the currents of one block, kept as far as there is room."""
+        sim = self.sim[first : first + BLOCK]
+        if (kept := self._spectra.get((first, len(sim)))) is not None:
+            return kept
+        current = np.zeros((len(sim), self.length), np.float32)
+        current[:, ROOM_BEFORE] = sim[:, 0]
+        np.subtract(sim[:, 1:], sim[:, :-1], out=current[:, ROOM_BEFORE + 1 : -ROOM_AFTER])
+        spectrum: npt.NDArray[np.complex64] = scipy.fft.rfft(
+            current, padded_length(self.length)
+        )
+        if (first + len(sim)) * spectrum[0].nbytes <= SPECTRA_BYTES:
+            self._spectra[first, len(sim)] = spectrum
+        return spectrum
