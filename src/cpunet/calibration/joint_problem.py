@@ -24,6 +24,8 @@ RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 HOLD = 4.0
 # Events from which derivatives are taken, and of each band at the least.
 FOR_DERIVATIVES, OF_BAND = 1536, 100
+# Simulated pulses of a band that tell how the functions vary.
+FOR_COVARIANCE = 4096
 # Of the reach of a slope: the step of a finite difference.
 FINITE = 0.1
 
@@ -99,7 +101,8 @@ class JointProblem:
     known
         Deviations, in standard deviations, of what else is known of the coordinates.
     held
-        Whether steps beyond the reach of the slopes are to cost.
+        Whether steps beyond the reach of the slopes are to cost.  It is for the way from far:
+        how simulated pulses vary there tells nothing of errors.
     """
 
     def __init__(
@@ -133,6 +136,10 @@ class JointProblem:
         for band, functions in zip(self.bands, self.functions, strict=True):
             values = functions(band.moments.data, clip)
             covariance = np.cov(values.T) / band.pairs
+            if not self.held:
+                # of both sides: weights that follow the chances of one would draw the fit to it
+                simulated = self._covariance(band, functions) / band.pairs
+                covariance = 0.5 * (covariance + simulated)
             sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
             correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
             correlation += RIDGE * np.eye(len(sigma))
@@ -163,6 +170,10 @@ class JointProblem:
         """Of the functions alone."""
         deviations = self._deviations(vector)
         return float(deviations @ deviations)
+
+    def weigh_like(self, other: JointProblem) -> None:
+        """Take over errors and correlations of the same functions."""
+        self._sigma, self._whiten = other._sigma, other._whiten
 
     def residuals(self, vector: Values) -> Values:
         """Uncorrelated deviations, and those of all that is known before.
@@ -212,6 +223,21 @@ class JointProblem:
                 f"give no pulse ({told}); narrow the --prior of what is free"
             )
         return prepared.pulses
+
+    def _covariance(self, band: Band, functions: SlicedFunctions) -> Values:
+        """Covariance of the functions over the simulated pulses of a band."""
+        some = band.sim.first(FOR_COVARIANCE)
+        waveforms = self.prepared(self.nearby.centre).waveforms[band.rows[: len(some)]]
+
+        def of(readings: Readings) -> tuple[Values, ...]:
+            values = functions(readings, self._clip)
+            return readings.weights @ values, (readings.weights * values.T) @ values
+
+        (total, squares), n = replace(some, sim=waveforms).sums(
+            self.parameters.chain.response, of, cut=self._clip is None, draws=1
+        )
+        mean = total / max(n, 1e-9)
+        return np.asarray(squares / max(n, 1e-9) - np.outer(mean, mean))
 
     def _deviations(self, vector: Values, most: int | None = None) -> Values:
         pulls = self._pulls(vector, most)

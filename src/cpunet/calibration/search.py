@@ -148,7 +148,7 @@ class Search:
         """
         nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
         response = self._chain()
-        before = self._problem(response, nearby, [])
+        before = self._problem(response, nearby, [], held=True)
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
         may_ring, more, last = True, 0, np.zeros(self._n)
@@ -293,6 +293,7 @@ class Search:
         *,
         settled: bool,
     ) -> Calibrated:
+        before.weigh_like(problem)
         vector = before.parameters.vector()
         promised, information = self._promised(problem)
         nuisances = self.simulator.physics.nuisances
