@@ -128,7 +128,8 @@ class Stand:
     data_waveforms: npt.NDArray[np.uint16]
     data_kev: npt.NDArray[np.float64]
 
-    write = staticmethod(write)
+    charge, respond = staticmethod(charge), staticmethod(respond)
+    digitised, write = staticmethod(digitised), staticmethod(write)
 
     @property
     def inputs(self) -> list[str]:

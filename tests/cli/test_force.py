@@ -23,6 +23,7 @@ COMMANDS = {
     ],
     "fields": [("D/my.yaml", "D/my.yaml")],
     "stand": [("--preset D/my.yaml", "D"), ("--preset ornl --detector D/my.yaml", "D")],
+    "check": [(TRAINING, "D/data.lh5"), (f"{TRAINING} --recipe D/my.yaml", "D/my.yaml")],
     "train": [
         (TRAINING, "D"),
         (TRAINING, "."),

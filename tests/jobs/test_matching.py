@@ -142,7 +142,8 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
 
 
 def test_what_is_told_on_the_way(run: Run) -> None:
-    assert run.monitor.warnings == []
+    # few pulses are told of, and nothing else
+    assert [w for w in run.monitor.warnings if "1000 or more are better" not in w] == []
     total, *steps = run.monitor.stages["Matching"]
     assert total is None  # most fits end long before they must
     assert steps == [1] * run.info["fit"]["steps"]

@@ -12,6 +12,7 @@ import typer
 
 import cpunet
 from cpunet.cli.calibrate import calibrate
+from cpunet.cli.check import check
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.ensemble import ensemble
@@ -69,6 +70,7 @@ for command in (
     simulate,
     fields,
     stand,
+    check,
     train,
     calibrate,
     ensemble,

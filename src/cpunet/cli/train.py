@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -123,6 +124,9 @@ def train(
     out.print(
         f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
     )
+    words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]
+    report = out_folder.with_name(f"{out_folder.name}-report")
+    shown.note(f"next: {shlex.join(map(str, [*words, report]))}")
 
 
 def _follows(launched: Launch | None) -> bool:

@@ -87,6 +87,8 @@ def draw_figures(
         assert sim is not None  # or `_stored` had raised
         assert data is not None
         files_of(_possible(folder))  # before a minute goes into scores
+        info = read_info(folder)
+        sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
         given = _Given(folder, sim, data, truth, rivals, seed)
         found = given.drawings(device, monitor)
     files = files_of(found)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,11 @@ from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import require_side
 from cpunet.recipes.schema import Recipe
 
+_READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
 Energies = npt.NDArray[np.float64]
 
+MOST_KEV, LEAST_KEV = 20_000.0, 20.0  # most energies of gammas lie between
+LOW_KEV = 300.0  # below, noise hides shapes
 LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
@@ -45,6 +49,31 @@ class InputFile:
         """What is read, for `cpunet.outputs.refuse_inputs`."""
         return self.path, self.energy
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """What was said of how to read it."""
+        given = {name: getattr(self, name) for name in _READ_AS}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def as_before(self, run_info: Mapping[str, Any], side: str) -> InputFile:
+        """The same file, read as a run read it if nothing else is said.
+
+        Parameters
+        ----------
+        run_info
+            The content of ``run.json``.
+        side
+            ``"sim"`` or ``"data"``.
+        """
+        told = run_info.get(side)
+        if self.options or not isinstance(told, dict):
+            return self
+        before, read_as = told.get("file"), told.get("read_as")
+        same = isinstance(before, str) and Path(before).resolve() == self.path.resolve()
+        if not same or not isinstance(read_as, dict):
+            return self
+        return replace(self, **{name: read_as[name] for name in _READ_AS if name in read_as})
+
     def open(self) -> PulseSource:
         """Open the file."""
         return open_pulses(
@@ -60,7 +89,8 @@ class InputFile:
 class InputSet:
     """What was made of a file: prepared pulses, and the cuts if it was measured.
 
-    ``energies_kev`` holds the known energies of all its pulses, selected or not.
+    ``energies_kev`` holds the known energies of all its pulses, selected or not; ``read_as``
+    how the file was read, see `InputFile.options`.
     """
 
     prepared: Prepared
@@ -68,12 +98,14 @@ class InputSet:
     path: Path
     energies_kev: Energies
     cuts: CutWindows | None = None
+    read_as: dict[str, Any] = field(default_factory=dict)
 
     def provenance(self) -> dict[str, Any]:
         """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
         return {
             "file": str(self.path),
+            "read_as": self.read_as,
             "dt_ns": self.dt_ns,
             "read": self.prepared.n_read,
             "used": len(self.prepared),
@@ -161,14 +193,17 @@ def _load(
         return selection.select(energy_kev)
 
     with monitor.stage(f"Preparing {file.path.name}", source.n_pulses) as advance:
-        prepared = load_prepared(
-            source,
-            recipe.preparation,
-            side,
-            select=select,
-            peaks=lambda energies: label_peaks(energies, recipe.peaks),
-            progress=advance,
-        )
+        try:
+            prepared = load_prepared(
+                source,
+                recipe.preparation,
+                side,
+                select=select,
+                peaks=lambda energies: label_peaks(energies, recipe.peaks),
+                progress=advance,
+            )
+        except CpunetError as error:
+            raise CpunetError(f"{error}{_where_energies_are(seen, selection)}") from error
     cuts = None
     if measured:
         cuts = fit_cuts(prepared, recipe.cuts)
@@ -187,7 +222,25 @@ def _load(
         f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
         + (f" (left out: {rejected})" if rejected else "")
     )
-    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts)
+    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options)
+
+
+def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:
+    """What energies there are, if none is selected: to choose others, or to calibrate them."""
+    energies = np.concatenate(seen) if seen else np.empty(0)
+    if not len(energies) or selection.select(energies).any():
+        return ""
+    low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
+    there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
+    if high > MOST_KEV:
+        return f"{there}: if these are ADC counts, give --kev-per-adc"
+    if high < LEAST_KEV:
+        return f"{there}: if these are MeV, give --kev-per-adc 1000"
+    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
+    n = int((energies >= from_kev).sum())
+    if not n:
+        return there
+    return f"{there}; --peak {from_kev:.0f}- takes {n} pulses"
 
 
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:

@@ -19,6 +19,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.recipes.schema import Recipe
+from cpunet.training.diagnosis import beyond, diagnosis
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import Record
 from cpunet.training.matching import fit_response
@@ -129,6 +130,11 @@ def match(
             f"and {beside[1]} measured pulses"
         )
     monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
+    causes = diagnosis(fit.pulls) if fit.poor else []
+    for number, cause in enumerate(causes, 1):
+        monitor.note(f"  {number}. {cause}")
+    for found in beyond(response.describe()):
+        monitor.note(f"warning: {found}")
     recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
@@ -156,6 +162,7 @@ def match(
         "parameters": response.describe(),
         **asdict(fit),
         "verdict": fit.verdict,
+        "causes": causes,
         "in_no_band": {"sim": beside[0], "data": beside[1]},
         "noise": {
             "baselines": noise.n_baselines,

@@ -18,6 +18,7 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
+from cpunet.jobs.check import Level, compare_sides
 from cpunet.jobs.devices import enough_memory, peak_memory_mb
 from cpunet.jobs.inputs import (
     InputFile,
@@ -128,6 +129,9 @@ def train_run(
             require_same_sampling(sim_set, data_set)
             for note in require_both_sides(sim_set, data_set, selection):
                 told.note(note)
+            for finding in compare_sides(sim_set, data_set, selection):
+                if finding.level != Level.FINE:
+                    told.note(f"warning: {finding}")
             if init is not None:
                 _require_sampling(init, data_set)
             sides = sim_set, data_set, data

@@ -18,6 +18,7 @@ from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.views import report_views
 from cpunet.jobs.when_asked import WhenAsked
+from cpunet.training.run_folder import read_info
 
 QUIET = Monitor()
 
@@ -68,6 +69,8 @@ def validate_run(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
+    info = read_info(run)
+    sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     read = (run, *sim.files, *data.files, truth)
     with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
         found = evaluate(

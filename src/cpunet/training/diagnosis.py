@@ -1,0 +1,151 @@
+"""Where a poor fit is off, and what the likely causes are.
+
+A readout is the same for all pulses and shapes no onset: the parts of a pulse that are off tell
+physics, slow parts, remains of earlier pulses and energies from each other.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+OFF = 4.0  # standard deviations, of the mean square of a part's moments
+AS_MUCH = 0.3  # of the worst part: others are told beside it
+# An onset that is off by so much is not drawn off by a fit of what follows it.
+PHYSICS = 8.0
+# Shares of charge that arrive late; an overshoot makes them negative, by some percent.
+MOST_NEGATIVE, MOST_SLOW = -0.25, 0.5
+ONSET, TOP, TAIL = -8, 15, 84  # samples from the half maximum at which the parts end or begin
+_SAMPLES = re.compile(r"samples (-?\d+) to (-?\d+)")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the pulses, what shapes it, and how to find out.
+
+    Parameters
+    ----------
+    name
+        In words.
+    cause
+        What most likely makes it differ.
+    remedy
+        What tests that.
+    """
+
+    name: str
+    cause: str
+    remedy: str
+
+
+ONSET_PART = Part(
+    "the onset",
+    "no readout shapes it: the physics simulated are not those of the detector",
+    "cpunet calibrate finds temperature, impurities and clouds",
+)
+PARTS = {
+    "onset": ONSET_PART,
+    "edge": Part(
+        "the edge",
+        "the bandwidth is of another kind, or the physics differ",
+        "cpunet calibrate; cpunet response tells what was fitted",
+    ),
+    "top": Part(
+        "the top",
+        "charge that arrives late with times that the recipe does not have, or a ringing",
+        "--set generator.slow_ns=[…]",
+    ),
+    "tail": Part(
+        "the tail",
+        "remains of earlier pulses, pile-up, or a decay that the recipe does not have",
+        "cpunet check tells how many traces are left out; --set generator.fast_decays_us=[…]",
+    ),
+    "amplitude": Part(
+        "the current amplitude",
+        "another detector, or other energies than simulated",
+        "cpunet check compares both sides",
+    ),
+}
+
+
+def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
+    """Parts of the pulses that are off, worst first, with by how many standard deviations.
+
+    Parameters
+    ----------
+    pulls
+        Of the moments, by name, as a fit gives them.
+
+    Examples
+    --------
+    >>> parts_off({"samples -40 to -25": 9.0, "samples 140 to 180": -1.0, "tail slope": 30.0})
+    {'onset': 9.0, 'tail': 21.2}
+    """
+    squares: dict[str, list[float]] = {}
+    for name, pull in pulls.items():
+        part = _part(name.split(": ")[-1])
+        if part:
+            squares.setdefault(part, []).append(pull**2)
+    sizes = {part: round(float(np.sqrt(np.mean(s))), 1) for part, s in squares.items()}
+    worst = max(sizes.values(), default=0.0)
+    off = {part: size for part, size in sizes.items() if size > OFF and size > AS_MUCH * worst}
+
+    def order(part: str) -> tuple[bool, float]:
+        return part == "onset" and off[part] > PHYSICS, off[part]
+
+    return {part: off[part] for part in sorted(off, key=order, reverse=True)}
+
+
+def diagnosis(pulls: Mapping[str, float]) -> list[str]:
+    """A line for each part that is off: how much, why, and what to try."""
+    return [
+        f"{PARTS[part].name} is off by {size:.0f} σ: {PARTS[part].cause}; "
+        f"try: {PARTS[part].remedy}"
+        for part, size in parts_off(pulls).items()
+    ]
+
+
+def beyond(parameters: Mapping[str, float]) -> list[str]:
+    """What of a chain no readout has.
+
+    Parameters
+    ----------
+    parameters
+        As `ElectronicsResponse.describe` gives them.
+
+    Examples
+    --------
+    >>> beyond({"pole_1_ns": 40.0, "slow_100_ns": -0.5, "slow_400_ns": -0.2})
+    ['70 % of the charge would arrive too early, which no readout does; see the fit']
+    """
+    slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
+    if slow < MOST_NEGATIVE:
+        return [
+            f"{-100 * slow:.0f} % of the charge would arrive too early, which no readout does; "
+            "see the fit"
+        ]
+    if slow > MOST_SLOW:
+        return [
+            f"{100 * slow:.0f} % of the charge would arrive late, as of slower pulses than "
+            "simulated; see the fit"
+        ]
+    return []
+
+
+def _part(name: str) -> str:
+    if name.startswith("current amplitude"):
+        return "amplitude"
+    if name == "tail slope":
+        return "tail"
+    match = _SAMPLES.fullmatch(name)
+    if match is None:
+        return ""
+    first, stop = map(int, match.groups())
+    if stop <= ONSET:
+        return "onset"
+    if first < TOP:
+        return "edge"
+    return "top" if first < TAIL else "tail"

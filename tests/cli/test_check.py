@@ -1,0 +1,220 @@
+"""``cpunet check``: wrong starts, each told with its cause and a remedy that works."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.validate import validate_run
+
+N = 240
+FEP = 2614.511
+
+
+class Sides:
+    """Both sides of a small stand, each of which may be made wrong."""
+
+    def __init__(self, stand: Any, folder: Path) -> None:
+        self._stand, self.folder = stand, folder
+        rng = np.random.default_rng(31)
+        self.sim, self.kev = stand.charge(N, rng), np.full(N, FEP) + rng.normal(0, 0.5, N)
+        self.records = stand.respond(stand.charge(N, rng))
+
+    def write_sim(self, name: str = "sim", waveforms: Any = None, kev: Any = None) -> Path:
+        waveforms = np.float32(self.sim if waveforms is None else waveforms)
+        kev = self.kev if kev is None else kev
+        return self._stand.write(
+            self.folder / f"{name}.lh5", "geds/sim", waveforms, kev, units=""
+        )
+
+    def write_data(
+        self, name: str = "data", traces: Any = None, kev: Any = None, dt_ns: float = 16.0
+    ) -> Path:
+        traces = self.traces if traces is None else traces
+        kev = self.kev if kev is None else kev
+        file = self.folder / f"{name}.lh5"
+        return self._stand.write(file, "geds/raw", traces, kev, dt_ns=dt_ns)
+
+    @property
+    def traces(self) -> Any:
+        return self._stand.digitised(self.records, self.kev, seed=21)
+
+
+@pytest.fixture
+def sides(stand, tmp_path) -> Sides:
+    return Sides(stand, tmp_path)
+
+
+@pytest.fixture
+def check(command) -> Callable[..., Any]:
+    def run(sim: Path, data: Path, *words: object) -> Any:
+        return command("check", "--sim", sim, "--data", data, *words)
+
+    return run
+
+
+def first(outcome: Any) -> str:
+    """The first line that is not fine."""
+    return next(line for line in outcome.out.splitlines() if not line.startswith("ok"))
+
+
+def test_sides_that_fit(sides, check):
+    picture = sides.folder / "check.png"
+    done = check(sides.write_sim(), sides.write_data(), "--out", picture)
+    assert done.code == 0
+    bad = [line for line in done.out.splitlines() if line.startswith(("look", "stop"))]
+    # few pulses are told of, and nothing else
+    assert all("1000 or more are better" in line for line in bad)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    again = check(sides.write_sim(), sides.write_data(), "--out", picture)
+    assert "exists" in again.err.splitlines()[-1]
+
+
+def test_another_peak(sides, check):
+    sim, data = sides.write_sim(), sides.write_data(kev=sides.kev - 1000)
+    told = first(check(sim, data))
+    assert "energy_outside_selection" in told
+    assert "Energies there: 1614 to 1615 keV" in told
+    assert "--peak 1600- takes 240 pulses" in told
+    assert "outside" not in first(check(sim, data, "--peak", "1600-"))
+
+
+@pytest.mark.parametrize(
+    ("factor", "told", "remedy"),
+    [(1e-3, "if these are MeV, give --kev-per-adc 1000", 1000), (40, "ADC counts", 1 / 40)],
+)
+def test_energies_in_other_units(sides, check, factor, told, remedy):
+    sim, data = sides.write_sim(), sides.write_data(kev=sides.kev * factor)
+    assert told in first(check(sim, data))
+    done = check(sim, sides.write_data("right", kev=sides.kev * factor * remedy))
+    assert "Energies there" not in done.out
+
+
+def test_a_calibration_that_is_off(sides, check):
+    sim, data = sides.write_sim(), sides.write_data(kev=sides.kev * 0.99)
+    told = next(
+        line for line in check(sim, data, "--peak", "2500-").out.splitlines() if "-26.1" in line
+    )
+    assert "line FEP of the measured pulses at 2588.4 keV" in told
+    assert "energies times 1.01010" in told
+    right = sides.write_data("right", kev=sides.kev * 0.99 * 1.0101)
+    assert "would put it right" not in check(sim, right).out
+
+
+def test_swapped_sides(sides, check):
+    sim, data = sides.write_sim(), sides.write_data()
+    done = check(data, sim)
+    assert done.code == 1
+    assert "are --sim and --data swapped?" in first(done)
+    assert check(sim, data).code == 0
+
+
+def test_another_period(sides, check):
+    sim = sides.write_sim()
+    other = sides.write_data("other", dt_ns=10.0)
+    told = first(check(sim, other))
+    assert "sampled every 16 ns" in told
+    assert "every 10 ns" in told
+    assert "resample" in told
+
+
+def test_another_detector(sides, check):
+    slow = np.apply_along_axis(
+        lambda row: np.interp(np.arange(450) / 2, np.arange(225), row), 1, sides.sim
+    )
+    done = check(sides.write_sim(waveforms=slow), sides.write_data())
+    told = next(line for line in done.out.splitlines() if "drift times" in line)
+    assert told.startswith("look")
+    assert "another detector" in told
+    assert "cpunet calibrate" in told
+
+
+def test_pulses_sharper_than_simulated(sides, check):
+    kernel = np.ones(31) / 31
+    padded = np.pad(sides.sim, ((0, 0), (30, 30)), mode="edge")
+    wide = np.apply_along_axis(np.convolve, 1, padded, kernel, "valid")
+    done = check(sides.write_sim(waveforms=wide), sides.write_data())
+    assert "no readout makes pulses sharper" in done.out
+
+
+def test_too_few_pulses(sides, check):
+    few = sides.write_data(traces=sides.traces[:50], kev=sides.kev[:50])
+    done = check(sides.write_sim(), few)
+    assert done.code == 1
+    told = next(line for line in done.out.splitlines() if line.startswith("stop"))
+    assert "measured pulses of 50 can be used" in told
+    assert "more files, or more energies" in told
+
+
+def test_saturated_traces(sides, check):
+    traces = sides.traces
+    top = np.quantile(traces.max(axis=1), 0.5)
+    done = check(sides.write_sim(), sides.write_data(traces=np.minimum(traces, int(top))))
+    told = next(line for line in done.out.splitlines() if "saturated" in line)
+    assert "choose lower energies" in told
+
+
+def test_windowed_traces(sides, check):
+    windowed = sides.traces[:, 480:640]
+    told = first(check(sides.write_sim(), sides.write_data(traces=windowed)))
+    assert "window_outside_record" in told
+    assert "give longer records or allow more" in told
+
+
+def test_remains_of_earlier_pulses(sides, check):
+    traces = sides.traces.astype(float)
+    late = np.exp(-np.arange(traces.shape[1]) / 3400)
+    rng = np.random.default_rng(3)
+    size = rng.exponential(0.3 * np.ptp(traces, axis=1)) * (rng.uniform(size=N) < 0.4)
+    traces += size[:, None] * late
+    done = check(sides.write_sim(), sides.write_data(traces=np.uint16(traces.round())))
+    assert "remains of earlier pulses" in done.out
+
+
+def test_training_tells_of_findings(sides, stand, tiny, command):
+    few = sides.write_data(traces=sides.traces[:50], kev=sides.kev[:50])
+    words = ["train", "--sim", sides.write_sim(), "--data", few, *tiny]
+    done = command(*words, "--out", sides.folder / "run")
+    assert done.code == 0
+    assert "measured pulses of 50 can be used; 1000 or more are better" in done.err
+    assert done.err.splitlines()[-1].startswith("next: cpunet validate ")
+
+
+class SeenError(Exception):
+    """In place of a minute of scores."""
+
+
+def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch):
+    """What was said of a file in training holds for the same file in validation."""
+    info = json.loads((trained / "run.json").read_text())
+    read_as = {"kev_per_adc": 0.25, "table": "geds/raw"}
+    info["data"] |= {"file": str(stand.data), "read_as": read_as}
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    (run / "run.json").write_text(json.dumps(info))
+    seen: list[InputFile] = []
+
+    def evaluated(_run: Path, sim: InputFile, data: InputFile, **_: object) -> None:
+        seen.extend([sim, data])
+        raise SeenError
+
+    monkeypatch.setattr("cpunet.jobs.validate.evaluate", evaluated)
+    sim = InputFile(stand.sim)
+    other = Path(shutil.copy(stand.data, tmp_path / "other.lh5"))
+    for data, expected in (
+        (InputFile(stand.data), InputFile(stand.data, "geds/raw", None, 0.25)),
+        (InputFile(stand.data, kev_per_adc=2.0), InputFile(stand.data, None, None, 2.0)),
+        (InputFile(other), InputFile(other)),
+    ):
+        with pytest.raises(SeenError):
+            validate_run(run, sim, data, tmp_path / "report")
+        assert seen[-2:] == [sim, expected]
+    assert sim.options == {}
+    assert expected.options == {}
