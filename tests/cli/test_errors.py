@@ -298,14 +298,24 @@ def test_names_with_brackets_are_printed_as_they_are(refused):
         ("unknown",),
         ("info", "x.lh5", "--unknown"),
         ("train", "--sim", "a", "--data", "b", "--out", "c", "--threads", "0"),
+        ("train", "--sim", "a", "--data", "b", "--out", "c", "--threads", "100000"),
         ("validate", "r", "--sim", "a", "--data", "b", "--out", "c", "--seed", "-1"),
+        ("translate", "r", "s", "--out", "o", "--realisations", "1000000"),
     ],
 )
 def test_wrong_usage(command, words):
     outcome = command(*words)
+    assert (outcome.code, outcome.out) == (2, "")
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: ")
+    assert line.endswith("--help")
+
+
+@pytest.mark.parametrize("words", [(), ("library",), ("import",)])
+def test_no_command_at_all(command, words):
+    outcome = command(*words)
     assert outcome.code == 2
-    assert "Traceback" not in outcome.err
-    assert "Error" in outcome.err
+    assert "Usage" in outcome.out + outcome.err
 
 
 @pytest.mark.parametrize("name", [[], ["train"], ["translate"], ["validate"], ["info"]])

@@ -19,8 +19,7 @@ PARAMETERS = ("current_amplitude", "drift_time", "tail_slope")
 def screen(request, monkeypatch) -> int:
     """A terminal of some width."""
     narrow = Console(width=request.param)
-    for module in (messages, scores):
-        monkeypatch.setattr(module, "out", narrow)
+    monkeypatch.setattr(messages, "out", narrow)
     return int(request.param)
 
 

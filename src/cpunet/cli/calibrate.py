@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, out, tell
 from cpunet.cli.simulate import EnergyUnit, FlipZ, HitTable, LengthUnit, Origin
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
@@ -48,7 +48,7 @@ HitFileName = Annotated[
 ClusterMm = Annotated[
     float,
     typer.Option(
-        min=0,
+        callback=options.within(0, 100),
         help="Of --hits: merge those nearer than this. Self-repulsion acts in what is merged.",
         rich_help_panel=HITS,
     ),
@@ -102,7 +102,11 @@ RecipeName = Annotated[
 ]
 Events = Annotated[
     int,
-    typer.Option(min=200, help="Simulated events, at most, that are drifted again and again."),
+    typer.Option(
+        min=200,
+        max=10_000_000,
+        help="Simulated events, at most, that are drifted again and again.",
+    ),
 ]
 
 
@@ -175,7 +179,7 @@ def calibrate(
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())
     for line in result_lines(content):
-        out.print(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _start(

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table
+from cpunet.cli.messages import out, print_table, tell, tell_table
 
 if TYPE_CHECKING:
     from cpunet.analysis.side_by_side import SideBySide
@@ -38,11 +38,13 @@ def compare(
     from cpunet.jobs.compare import compare_reports
 
     compared = compare_reports(reports, method=method, out=out_file, force=force)
-    print_table(comparison_table(compared))
+    table = comparison_table(compared)
+    print_table(table) if out_file is None else tell_table(table)
+    say = out.print if out_file is None else tell
     for note in compared.notes:
-        out.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        say(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     if out_file is not None:
-        out.print(str(out_file), markup=False, highlight=False, soft_wrap=True)
+        tell(str(out_file), markup=False, highlight=False, soft_wrap=True)
 
 
 def comparison_table(compared: SideBySide) -> Table:

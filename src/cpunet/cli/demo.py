@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import DetectorFile, Events, Kind, KindOption, wanted_events
 from cpunet.outputs import refuse_inputs
@@ -66,4 +66,4 @@ def demo(
         monitor=monitor(),
     )
     print_scores(metrics, leave_out=("FEP",))
-    out.print(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)

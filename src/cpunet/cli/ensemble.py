@@ -10,19 +10,25 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import err, monitor, out, print_table
+from cpunet.cli.environment import MOST_THREADS
+from cpunet.cli.messages import err, monitor, tell, tell_table
 from cpunet.cli.scores import PARAMETERS
 from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the run folders to make.")]
-Seeds = Annotated[int, typer.Option(min=1, help="How many seeds, from 0 on.")]
+Seeds = Annotated[int, typer.Option(min=1, max=10_000, help="How many seeds, from 0 on.")]
 Jobs = Annotated[
     int | None,
-    typer.Option(min=1, help="Processes at a time; as many as cores by default, 1 on a GPU."),
+    typer.Option(
+        min=1,
+        max=MOST_THREADS,
+        help="Processes at a time; as many as cores by default, 1 on a GPU.",
+    ),
 ]
 Threads = Annotated[
-    int | None, typer.Option(min=1, help="CPU threads of each; its share of the cores.")
+    int | None,
+    typer.Option(min=1, max=MOST_THREADS, help="CPU threads of each; its share of the cores."),
 ]
 Validate = Annotated[
     bool, typer.Option("--validate/--no-validate", help="Score each seed, or not.")
@@ -85,11 +91,11 @@ def ensemble(
         err.print("finished seeds are kept; go on with --resume", markup=False)
         raise
     if told["table"]:
-        print_table(_table(told))
+        tell_table(_table(told))
     for line in _summary(told):
-        out.print(line, markup=False, highlight=False, soft_wrap=True)
+        tell(line, markup=False, highlight=False, soft_wrap=True)
     if told["table"]:
-        out.print(str(out_folder / FIGURE), soft_wrap=True)
+        tell(str(out_folder / FIGURE), soft_wrap=True)
 
 
 def _table(told: dict[str, Any]) -> Table:

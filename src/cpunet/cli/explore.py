@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.outputs import refuse_inputs
 
 Runs = Annotated[
@@ -77,7 +77,7 @@ def explore(
         monitor=monitor(),
     )
     left_out = ", ".join(f"{n} {why}" for why, n in told["left_out"].items())
-    out.print(
+    tell(
         f"{out_file}: pulses of {told['shown']} of {told['places']} places"
         + (f" (none: {left_out})" if left_out else "")
         + (f", {told['drawn']} measured ones beside them" if "drawn" in told else "")

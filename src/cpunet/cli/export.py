@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 
 
 class Form(StrEnum):
@@ -52,7 +52,7 @@ def export(
         monitor=monitor(),
     )
     files = [done.graph, done.card] + ([done.noise] if done.noise else [])
-    out.print(
+    tell(
         f"{', '.join(map(str, files))}: within {done.difference:.1e} of the run",
         soft_wrap=True,
     )

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, out, tell
 from cpunet.outputs import refuse_inputs
 
 DetectorFile = Annotated[
@@ -53,5 +53,6 @@ def fields(
         monitor=monitor(),
     )
     width = max(map(len, told))
+    say = out.print if out_file is None else tell
     for name, value in told.items():
-        out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)
+        say(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 
 Names = Annotated[
     list[str],
@@ -76,4 +76,4 @@ def figure(
         monitor=monitor(),
     )
     for file in files:
-        out.print(str(file), soft_wrap=True)
+        tell(str(file), soft_wrap=True)

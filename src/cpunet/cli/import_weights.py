@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import err, monitor, out
+from cpunet.cli.messages import err, monitor, tell
 
 import_ = typer.Typer(
     help="Published weights become a run, pickled pulses an LH5 file; nothing is executed.",
@@ -60,7 +60,7 @@ def weights(
         force=force,
         monitor=monitor(),
     )
-    out.print(f"{out_folder}: a run of {', '.join(info['imported'])}", soft_wrap=True)
+    tell(f"{out_folder}: a run of {', '.join(info['imported'])}", soft_wrap=True)
 
 
 @import_.command()
@@ -82,9 +82,7 @@ def pulses(
         source, out_file, dt_ns=dt, table=table, units=units, force=force, monitor=monitor()
     )
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
-    out.print(
-        f"{out_file}: {told['written']} of {told['read']} pulses{rejected}", soft_wrap=True
-    )
+    tell(f"{out_file}: {told['written']} of {told['read']} pulses{rejected}", soft_wrap=True)
     if told["truncated"]:
         err.print(
             f"{source}: ends within a pulse or is damaged there; what was before it is written",

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -31,7 +31,14 @@ Set = Annotated[
 ]
 Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
 Source = Annotated[Path, typer.Argument(help="LH5 file of a library.", metavar="FILE")]
-Grid = Annotated[float, typer.Option("--grid-mm", help="Spacing of the places in r and z.")]
+Grid = Annotated[
+    float,
+    typer.Option(
+        "--grid-mm",
+        help="Spacing of the places in r and z.",
+        callback=options.within(0.01, 100),
+    ),
+]
 Angles = Annotated[str, typer.Option(help="Azimuths from <100> in degrees.")]
 Dt = Annotated[
     float | None, typer.Option("--dt-ns", "--dt", help="Sampling period in ns; 1 by default.")
@@ -84,7 +91,7 @@ def make(
         force=force,
         monitor=monitor(),
     )
-    out.print(
+    tell(
         f"{out_file}: {counts['written']} of {counts['templates']} places have a template; "
         f"{counts['outside']} give no signal, {counts['late']} are not collected in time",
         soft_wrap=True,
@@ -116,13 +123,13 @@ def translate(
         monitor=monitor(),
     )
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
-    out.print(
+    tell(
         f"{out_file}: {told['translated']} of {told['templates']} templates translated; "
         f"{told['outside']} outside{rejected}",
         soft_wrap=True,
     )
     apart = told["linearity"]
-    out.print(
+    tell(
         f"sums of {apart['events']} events: sample by sample within {apart['largest']:.1e} of "
         f"the highest, current amplitude within {apart['current_amplitude']:.1e} of itself",
         soft_wrap=True,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -18,12 +18,22 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from cpunet.cli.streams import Notes, OutputError, Results
 from cpunet.jobs.monitor import Advance, Monitor
 
-out = Console()
-err = Console(stderr=True)
+out = Results()
+err = Notes(stderr=True)
 
 LOG_EVERY_S = 30.0  # between lines of progress in a log file
+
+
+def tell(*objects: Any, **options: Any) -> None:
+    """Print a line about an output that is in place: if it cannot be, that is a warning."""
+    try:
+        out.print(*objects, **options)
+    except OutputError as error:
+        warn(f"{error}; the output is whole")
+        out.quiet = True  # once is enough
 
 
 def fail(message: str) -> None:
@@ -36,11 +46,22 @@ def warn(message: str) -> None:
     err.print(f"[bold]warning:[/] {_plain(message)}", soft_wrap=True, highlight=False)
 
 
+def tell_table(table: Table) -> None:
+    """Print a table of what is in an output that is in place, as `tell` does."""
+    try:
+        print_table(table)
+    except OutputError as error:
+        warn(f"{error}; the output is whole")
+        out.quiet = True
+
+
 def print_table(table: Table) -> None:
     """Print a table with every number whole, on a narrow screen or in a log, too.
 
     Words and headings are broken if that makes the table fit; else it is wider than the screen.
     """
+    if out.quiet:
+        return
     _, right, _, left = table.padding
     room = out.width - 1 - len(table.columns) * (left + right + 1)
     least, most = [], []
@@ -57,7 +78,7 @@ def print_table(table: Table) -> None:
         column.width, column.no_wrap, column.overflow = low + more, False, "fold"
         spare -= 0 if spare < 0 else more
     whole = out.width - room + sum(column.width or 0 for column in table.columns)
-    Console(file=out.file, width=max(out.width, whole)).print(table)
+    Results(file=out.file, width=max(out.width, whole)).print(table)
 
 
 def monitor() -> Monitor:

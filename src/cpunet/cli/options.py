@@ -2,11 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from cpunet.cli.environment import MOST_THREADS
+
+# Far beyond what anyone needs, and what a job can hold or live to see.
+MOST_SAMPLES = 1 << 20
+MOST_REALISATIONS = 10_000
+
+
+def within(
+    low: float, high: float, *, above: bool = False
+) -> Callable[[float | None], float | None]:
+    """Check of an option: a finite number from `low`, or `above` it, to `high`; or not given.
+
+    Examples
+    --------
+    >>> within(0, 10)(10.0)
+    10.0
+    """
+
+    def check(value: float | None) -> float | None:
+        if value is None or (((low < value) if above else (low <= value)) and value <= high):
+            return value
+        start = f"above {low:g}" if above else f"from {low:g}"
+        raise typer.BadParameter(f"{value:g} is not {start} to {high:g}.")
+
+    return check
 
 
 class Impurities(StrEnum):
@@ -20,6 +47,10 @@ Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
 Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="RUN")]
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random.")]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, max=MOST_THREADS, help="CPU threads; all cores by default."),
+]
 Device = Annotated[str, typer.Option(help="cpu, cuda, or auto: the GPU if there is one.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
 SimTable = Annotated[
@@ -38,12 +69,18 @@ DataEnergy = Annotated[
 KevPerAdc = Annotated[
     float | None,
     typer.Option(
-        help="Calibration of measured pulses without energies in keV: keV per ADC count."
+        help="Calibration of measured pulses without energies in keV: keV per ADC count.",
+        callback=within(0, 1e6, above=True),
     ),
 ]
 Dt = Annotated[
     float | None,
-    typer.Option("--dt-ns", "--dt", help="Sampling period in ns, if the files do not tell."),
+    typer.Option(
+        "--dt-ns",
+        "--dt",
+        help="Sampling period in ns, if the files do not tell.",
+        callback=within(1e-3, 1e9),
+    ),
 ]
 Insist = Annotated[
     bool,

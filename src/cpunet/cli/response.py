@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, print_table
+from cpunet.cli.messages import monitor, print_table, tell, tell_table
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -74,9 +74,11 @@ def response(
     elif electronics is not None:
         truth = read_electronics(electronics)
     told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
-    print_table(response_table(told))
-    if out_folder is not None:
-        out.print(f"{out_folder / 'response.png'}", soft_wrap=True)
+    if out_folder is None:
+        print_table(response_table(told))
+    else:
+        tell_table(response_table(told))
+        tell(f"{out_folder / 'response.png'}", soft_wrap=True)
 
 
 def response_table(told: dict[str, Any]) -> Table:

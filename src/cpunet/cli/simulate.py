@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.cli.values import parse_events, parse_numbers, parse_resolution
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -86,13 +86,26 @@ Peak = Annotated[
 ]
 WindowKev = Annotated[
     float,
-    typer.Option(help="Half-width about a peak; wider ones bring the continuum with them."),
+    typer.Option(
+        help="Half-width about a peak; wider ones bring the continuum with them.",
+        callback=options.within(0, 1e4, above=True),
+    ),
 ]
 SourceHeight = Annotated[
-    float, typer.Option(help="Of the source above the crystal, mm.", rich_help_panel=GAMMAS)
+    float,
+    typer.Option(
+        help="Of the source above the crystal, mm.",
+        rich_help_panel=GAMMAS,
+        callback=options.within(0, 1e4, above=True),
+    ),
 ]
 SourceRadius = Annotated[
-    float, typer.Option(help="Of the source, a disc, mm.", rich_help_panel=GAMMAS)
+    float,
+    typer.Option(
+        help="Of the source, a disc, mm.",
+        rich_help_panel=GAMMAS,
+        callback=options.within(0, 1e4),
+    ),
 ]
 Exact = Annotated[
     bool | None,
@@ -106,7 +119,7 @@ Exact = Annotated[
 ClusterMm = Annotated[
     float,
     typer.Option(
-        min=0,
+        callback=options.within(0, 100),
         help="Merge hits nearer than this; 0.05 changes no sample by more than 0.001.",
         rich_help_panel=PULSES,
     ),
@@ -259,7 +272,7 @@ def simulate(
         monitor=monitor(),
     )
     for line in summary_lines(summary):
-        out.print(f"{out_file}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_file}: {line}", markup=False, highlight=False, soft_wrap=True)
 
 
 def summary_lines(summary: Summary) -> list[str]:

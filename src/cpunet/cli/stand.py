@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -58,7 +58,10 @@ SetValues = Annotated[
 SettingsFile = Annotated[
     Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
 ]
-WindowKev = Annotated[float, typer.Option(help="Half-width about a peak.")]
+WindowKev = Annotated[
+    float,
+    typer.Option(help="Half-width about a peak.", callback=options.within(0, 1e4, above=True)),
+]
 
 
 def stand(
@@ -106,7 +109,7 @@ def stand(
         monitor=monitor(),
     )
     for line in _lines(summary):
-        out.print(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
 
 
 def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:

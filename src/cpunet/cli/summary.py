@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import out
+from cpunet.cli.messages import tell
 
 Reports = Annotated[
     list[Path],
@@ -37,8 +37,8 @@ def summary(
     entries = summarise_reports(reports, out_file, missing_ok=missing_ok, force=force)
     missing = [entry.name for entry in entries if entry.metrics is None]
     for name in missing:
-        out.print(f"no report: {name}", markup=False, highlight=False, soft_wrap=True)
-    out.print(
+        tell(f"no report: {name}", markup=False, highlight=False, soft_wrap=True)
+    tell(
         f"{out_file}: {len(entries) - len(missing)} of {len(entries)} reports",
         markup=False,
         highlight=False,

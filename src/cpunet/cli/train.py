@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import fail, monitor, out
+from cpunet.cli.messages import fail, monitor, tell
 from cpunet.errors import CpunetError
 from cpunet.jobs.monitor import Monitor
 from cpunet.outputs import refuse_inputs
@@ -31,7 +31,6 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a value: --set training.batch_size=64 (repeatable)."),
 ]
-Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores by default.")]
 Resume = Annotated[
     bool,
     typer.Option(
@@ -62,7 +61,7 @@ def train(
     dt: options.Dt = None,
     insist: options.Insist = False,
     set_values: Set = None,
-    threads: Threads = None,
+    threads: options.Threads = None,
     device: options.Device = "auto",
     tensorboard: Board = False,
     init: Init = None,
@@ -121,7 +120,7 @@ def train(
             raise typer.Exit(stop.status if stopped_too else 2) from None
     if _follows(launched):
         return
-    out.print(
+    tell(
         f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
     )
     words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]

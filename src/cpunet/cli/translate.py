@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.environment import MOST_THREADS
+from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
@@ -41,7 +42,11 @@ Noise = Annotated[
 ]
 Realisations = Annotated[
     int | None,
-    typer.Option(min=1, help="Draw the noise so many times: rows repeated, and counted."),
+    typer.Option(
+        min=1,
+        max=options.MOST_REALISATIONS,
+        help="Draw the noise so many times: rows repeated, and counted.",
+    ),
 ]
 Table = Annotated[str | None, typer.Option(help="Table to read, if the file has several.")]
 OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or geds/iren.")]
@@ -51,7 +56,10 @@ AppendColumn = Annotated[
 ]
 Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
 Jobs = Annotated[
-    int, typer.Option(min=1, help="Processes, a file each at a time.", rich_help_panel=FILES)
+    int,
+    typer.Option(
+        min=1, max=MOST_THREADS, help="Processes, a file each at a time.", rich_help_panel=FILES
+    ),
 ]
 Resume = Annotated[
     bool,
@@ -65,21 +73,32 @@ AdcPerKev = Annotated[
     float | None,
     typer.Option(
         help="Maximum over the baseline, ADC counts per keV; that of the run's data.",
+        callback=options.within(0, 1e9, above=True),
         rich_help_panel=ADC,
     ),
 ]
 Baseline = Annotated[
     float | None,
-    typer.Option(help="In ADC counts; that of the run's data.", rich_help_panel=ADC),
+    typer.Option(
+        help="In ADC counts; that of the run's data.",
+        rich_help_panel=ADC,
+        callback=options.within(-1e9, 1e9),
+    ),
 ]
 Length = Annotated[
     int | None,
-    typer.Option(min=1, help="Samples of a trace; those of a window.", rich_help_panel=ADC),
+    typer.Option(
+        min=1,
+        max=options.MOST_SAMPLES,
+        help="Samples of a trace; those of a window.",
+        rich_help_panel=ADC,
+    ),
 ]
 NPre = Annotated[
     int | None,
     typer.Option(
         min=0,
+        max=options.MOST_SAMPLES,
         help="Samples before 99.9 % of the maximum; those of a window.",
         rich_help_panel=ADC,
     ),
@@ -157,7 +176,7 @@ def translate(
             force=force,
             monitor=monitor(),
         )
-    out.print(f"{place}: {_in_words(told, adc)}", soft_wrap=True)
+    tell(f"{place}: {_in_words(told, adc)}", soft_wrap=True)
 
 
 def _adc(

@@ -11,12 +11,14 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.ensemble import Jobs, Resume, Threads
-from cpunet.cli.messages import err, monitor, out, print_table
+from cpunet.cli.messages import err, monitor, tell, tell_table
 from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the search to make.")]
-Trials = Annotated[int, typer.Option(min=1, help="Trials in all, those already done included.")]
+Trials = Annotated[
+    int, typer.Option(min=1, max=100_000, help="Trials in all, those already done included.")
+]
 
 SHOWN = 10  # trials
 
@@ -71,14 +73,14 @@ def tune(
     except SystemExit:
         err.print("finished trials are kept; go on with --resume", markup=False)
         raise
-    print_table(_table(told))
+    tell_table(_table(told))
     best, first = told["best"], told["first"]
     line = f"best: trial {best['number']} with {best['score']:.3f}"
-    out.print(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))
+    tell(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))
     if told["importances"]:
         shares = (f"{key} {share:.2f}" for key, share in told["importances"].items())
-        out.print(f"importance: {', '.join(shares)}", highlight=False, soft_wrap=True)
-    out.print(str(out_folder / BEST), soft_wrap=True)
+        tell(f"importance: {', '.join(shares)}", highlight=False, soft_wrap=True)
+    tell(str(out_folder / BEST), soft_wrap=True)
 
 
 def _table(told: dict[str, Any]) -> Table:

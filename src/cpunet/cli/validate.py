@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
 
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
@@ -52,4 +52,4 @@ def validate(
         monitor=monitor(),
     )
     print_scores(metrics)
-    out.print(f"{out_folder / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report.html'}", soft_wrap=True)

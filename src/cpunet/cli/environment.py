@@ -1,0 +1,69 @@
+"""Variables of the environment that other packages choke on, before these are imported."""
+
+from __future__ import annotations
+
+import os
+
+MOST_THREADS = 1024
+# Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
+# than most gaps between two operations and far shorter than others hold a core.
+SPIN_COUNT = "3000"
+
+_COUNTS = (
+    "OMP_NUM_THREADS",
+    "OMP_THREAD_LIMIT",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+
+
+def drop_nonsense() -> list[str]:
+    """Take numbers of threads that are none out of the environment; say which.
+
+    numba cannot be imported with them, OpenMP complains in words of its own, and children
+    would inherit them.
+
+    Examples
+    --------
+    >>> os.environ["NUMBA_NUM_THREADS"] = "0"
+    >>> drop_nonsense()
+    ["NUMBA_NUM_THREADS='0' is no number of threads (1 to 1024); it is ignored"]
+    >>> "NUMBA_NUM_THREADS" in os.environ
+    False
+    """
+    told = []
+    for name in _COUNTS:
+        value = os.environ.get(name)
+        # OpenMP takes a number for each level of nested loops
+        parts = (value or "").split(",") if name == "OMP_NUM_THREADS" else [value or ""]
+        if value is not None and not all(map(_is_count, parts)):
+            del os.environ[name]
+            shown = ascii(value if len(value) <= 20 else f"{value[:17]}...")
+            told.append(
+                f"{name}={shown} is no number of threads (1 to {MOST_THREADS}); it is ignored"
+            )
+    return told
+
+
+def _is_count(text: str) -> bool:
+    plain = text.strip()
+    return (
+        plain.isascii()
+        and plain.isdigit()
+        and len(plain) < 9
+        and 1 <= int(plain) <= MOST_THREADS
+    )
+
+
+def share_the_machine() -> None:
+    """Keep OpenMP's threads from spinning for long, before torch loads it.
+
+    By default they wait for each other in busy loops. Where something else runs too, the
+    thread that is waited for often has no core, and the loop takes the one it could have:
+    trainings then take several times as much of the machine. Short loops bridge the gaps
+    between two operations; whoever waits longer sleeps. Whoever sets OpenMP's own variables
+    is obeyed.
+    """
+    if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
+        os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT

@@ -1,0 +1,110 @@
+"""Standard output and standard error, whatever they are.
+
+Nothing fails for a sign that the encoding of a screen lacks: common ones are written otherwise,
+others by their number.  A log that cannot be written stops no job; a result that cannot be
+printed is an error of its own.
+"""
+
+from __future__ import annotations
+
+import codecs
+import errno
+import io
+import os
+import sys
+from contextlib import suppress
+from typing import Any
+
+from rich.console import Console
+
+from cpunet.errors import CpunetError
+
+_REPLACING = "cpunet.plain"  # name of the handler of signs that an encoding lacks
+_PLAIN_SIGNS = {"–": "-", "—": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u"} | {
+    "σ": "sigma", "χ": "chi", "²": "2", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*"
+}  # fmt: skip
+
+
+class OutputError(CpunetError):
+    """A result could not be written to standard output."""
+
+
+class GoneError(OutputError):
+    """Who read standard output has stopped reading."""
+
+
+class Results(Console):
+    """Standard output, which a result must reach."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print, or raise an `OutputError`."""
+        try:
+            super().print(*objects, **options)
+        except BrokenPipeError as error:
+            raise GoneError("standard output: its reader has stopped reading") from error
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"standard output: cannot be written ({reason})") from error
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on, which rich would end the program by."""
+        raise
+
+
+class Notes(Console):
+    """Standard error: what cannot be told is lost, and nothing else."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print if that can be done."""
+        with suppress(OSError):
+            super().print(*objects, **options)
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on, which rich would end the program by."""
+        raise
+
+
+class _Closed(io.TextIOBase):
+    """What stands for a standard output that was closed before the program began."""
+
+    def write(self, _text: str, /) -> int:
+        raise OSError(errno.EBADF, "it is closed")
+
+
+def prepare_streams() -> None:
+    """Make standard streams take every sign, and be there even if they were closed.
+
+    A closed one would have its number taken by the next file, into which others then print.
+    """
+    for number in range(3):
+        with suppress(OSError):  # open: as it should be
+            os.fstat(number)
+            continue
+        os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    if sys.stdout is None:
+        sys.stdout = _Closed()
+    codecs.register_error(_REPLACING, _replaced)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=_REPLACING)
+
+
+def finish_streams() -> None:
+    """Write what is left, so that nothing fails when the interpreter does that at its end."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):
+                sink = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(sink, stream.fileno())
+                os.close(sink)
+
+
+def _replaced(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    signs = error.object[error.start : error.end]
+    plain = "".join(_PLAIN_SIGNS.get(sign) or ascii(sign)[1:-1] for sign in signs)
+    return plain, error.end
