@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.kernels import KernelFiles, kernel
+from cpunet.kernels import KernelFiles, code_folder, kernel
+from cpunet.trusted_folders import trusted
 
 CALLED = """
 from cpunet.kernels import kernel
@@ -94,3 +95,44 @@ def test_code_of_older_sources_is_not_taken_and_removed(tmp_path: Path) -> None:
     after.save("other key", "new code")
     assert after.load("key") is None
     assert len([*tmp_path.iterdir()]) == 2  # one index, one piece of code
+
+
+@pytest.mark.parametrize("part", ["index", "code"])
+@pytest.mark.parametrize("damage", ["empty", "half", "flipped", "foreign"])
+def test_damaged_code_is_compiled_again(tmp_path: Path, part: str, damage: str) -> None:
+    files = KernelFiles(str(tmp_path), "loop", "stamp")
+    files.save("key", "code")
+    (path,) = tmp_path.glob("*.nbi" if part == "index" else "*.nbc")
+    whole = path.read_bytes()
+    flipped = whole[:-3] + bytes([whole[-3] ^ 4]) + whole[-2:]
+    contents = {"empty": b"", "half": whole[: len(whole) // 2], "foreign": b"\xff" * 99}
+    path.write_bytes((contents | {"flipped": flipped})[damage])
+    found = files.load("key")
+    assert found is None or (part, damage, found) == ("index", "flipped", "code")
+    files.save("key", "new code")
+    assert files.load("key") == "new code"
+
+
+def test_code_is_never_kept_where_others_can_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "own"
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda _name: own)
+    private, shared = tmp_path / "private", tmp_path / "shared"
+    for folder, mode in ((private, 0o755), (shared, 0o777)):
+        folder.mkdir()
+        folder.chmod(mode)
+    assert code_folder(private) == private
+    for folder in (shared, shared / "below"):
+        folder.mkdir(exist_ok=True)
+        found = code_folder(folder)
+        assert found is not None
+        assert own in found.parents
+        assert trusted(found)
+    shared.chmod(0o775)  # a group is others, too
+    assert code_folder(shared) != shared
+    shared.chmod(0o1777)
+    (shared / "mine").mkdir(mode=0o700)
+    assert code_folder(shared / "mine") == shared / "mine"
+    own.chmod(0o777)
+    assert code_folder(shared) is None

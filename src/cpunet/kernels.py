@@ -3,13 +3,16 @@
 numba's own cache looks at the file of a function alone, so that a function goes on with old
 code of what it calls in other files; and of two processes that compile at once, as the first
 jobs after an installation do, one may be given the other's code.  Neither happens here.
-Where the code is kept is numba's choice: beside the package, or in ``NUMBA_CACHE_DIR``.
+Where the code is kept is numba's choice: beside the package, or in ``NUMBA_CACHE_DIR``; but
+never where others can write, since whoever chooses the code that is run can do anything.  Then
+it is kept in the user's own cache.  What is damaged is compiled again.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import pickle
 import re
 import sys
 import uuid
@@ -19,10 +22,14 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
+import platformdirs
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+from cpunet.trusted_folders import trusted
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
+_DIGEST_BYTES = hashlib.sha256().digest_size
 _IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
 
 
@@ -71,8 +78,51 @@ def digest(module: str) -> str:
     return hashlib.sha256(b"\0".join(contents)).hexdigest()
 
 
+def code_folder(chosen: Path) -> Path | None:
+    """The folder to keep code in, instead of the one chosen if that is not to be trusted.
+
+    Returns
+    -------
+    Path or None
+        None if there is no place that only the user can write to.
+    """
+    if trusted(chosen):
+        return chosen
+    own = platformdirs.user_cache_path("cpunet") / "kernels" / chosen.resolve().name
+    own = own.with_name(
+        f"{own.name}-{hashlib.sha256(bytes(chosen.resolve())).hexdigest()[:16]}"
+    )
+    try:
+        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return own if trusted(own) else None
+
+
 class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
-    """Files of one function: an index, and one with the code for each kind of arguments."""
+    """Files of one function: an index, and one with the code for each kind of arguments.
+
+    Code has a digest before it, and neither it nor the index is taken if it is damaged.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            found = super()._load_index()
+        except Exception:  # whatever unpickling makes of damaged bytes
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _load_data(self, name: str) -> Any:
+        content = (Path(self._cache_path) / name).read_bytes()
+        known, code = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(code).digest() != known:
+            raise OSError("damaged")  # numba takes it as not there
+        return pickle.loads(code)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        code = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as stream:
+            stream.write(hashlib.sha256(code).digest() + code)
 
     def save(self, key: Any, data: Any) -> None:
         """Keep code; another process may do so at the same time."""
@@ -92,8 +142,15 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
 class _Cache(FunctionCache):  # type: ignore[misc]
     """numba's cache of one function, which holds as long as its sources do."""
 
+    _cache_path: str
+
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        folder = code_folder(Path(self._cache_path))
+        if folder is None:
+            self.disable()
+            return
+        self._cache_path = str(folder)
         self._cache_file = KernelFiles(
             self._cache_path, self._impl.filename_base, digest(function.__module__)
         )

@@ -120,6 +120,15 @@ def test_numbers_of_threads_that_are_none(monkeypatch, name, value, dropped):
     assert all(len(line) < 120 for line in told)
 
 
+def test_a_folder_of_code_that_others_can_write_to(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "to be made"))
+    assert drop_nonsense() == []
+    tmp_path.chmod(0o777)
+    (line,) = drop_nonsense()
+    assert "can be written by others; it is ignored" in line
+    assert "NUMBA_CACHE_DIR" not in os.environ
+
+
 def run(*words: object, **options: object) -> subprocess.CompletedProcess[str]:
     environment = os.environ | dict(options.pop("env", {}))  # type: ignore[call-overload]
     return subprocess.run(

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import stat
+from pathlib import Path
+
+from cpunet.trusted_folders import trusted
 
 MOST_THREADS = 1024
 # Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
@@ -22,7 +26,8 @@ def drop_nonsense() -> list[str]:
     """Take numbers of threads that are none out of the environment; say which.
 
     numba cannot be imported with them, OpenMP complains in words of its own, and children
-    would inherit them.
+    would inherit them.  A folder of compiled code that others can write to is nonsense, too:
+    what lies there is run.
 
     Examples
     --------
@@ -43,7 +48,17 @@ def drop_nonsense() -> list[str]:
             told.append(
                 f"{name}={shown} is no number of threads (1 to {MOST_THREADS}); it is ignored"
             )
+    code = os.environ.get("NUMBA_CACHE_DIR")
+    if code and not _is_private(Path(code)):
+        del os.environ["NUMBA_CACHE_DIR"]
+        told.append(f"NUMBA_CACHE_DIR={code!a} can be written by others; it is ignored")
     return told
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether a folder, or the one in which it would be made, is the user's own."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    return trusted(there) or (there != folder and bool(there.stat().st_mode & stat.S_ISVTX))
 
 
 def _is_count(text: str) -> bool:

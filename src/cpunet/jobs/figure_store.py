@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.jobs.figures import Drawing
 from cpunet.jobs.inputs import InputFile
@@ -63,17 +63,21 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
         If the file cannot be read.
     """
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            index = json.loads(str(archive[_INDEX]))
-            drawings = {
-                name: Drawing(one["kind"], _found(one["values"], archive))
-                for name, one in index["figures"].items()
-            }
-            return drawings, index["made"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        arrays = npz_files.read_arrays(file, npz_files.keys(file))
+        index = json.loads(str(arrays[_INDEX]))
+        drawings = {
+            name: Drawing(one["kind"], _found(one["values"], arrays))
+            for name, one in index["figures"].items()
+        }
+        made = index["made"]
+        if not isinstance(made, dict):
+            raise ValueError("not said of what the figures were made")
+    except (*npz_files.DAMAGED, AttributeError) as error:
         raise CpunetError(
-            f"{file}: cannot be read ({error}); remove it, and score the run again"
+            f"{file}: cannot be read ({npz_files.said(error)}); remove it, and score the run "
+            "again"
         ) from error
+    return drawings, made
 
 
 def _told(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:

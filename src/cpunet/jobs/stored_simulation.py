@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import h5py
 import numpy as np
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import is_column, opened
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
@@ -75,14 +75,21 @@ class StoredSimulation:
 
 def _record(path: Path) -> tuple[dict[str, Any], Any]:
     """How the pulses were made, and the numbers of their events."""
+    with opened(path) as file:
+        text = file[_PULSES].attrs.get("simulation") if _PULSES in file else None
+        if text is None or HIT_TABLE not in file:
+            raise CpunetError(
+                f"{path}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
+                "an output of cpunet simulate or cpunet stand"
+            )
+        column = file.get(f"{_PULSES}/event_number")
+        numbers = np.asarray(column[()]) if is_column(column) else np.empty(0)
     try:
-        with h5py.File(path, "r") as file:
-            text = file[_PULSES].attrs.get("simulation") if _PULSES in file else None
-            if text is None or HIT_TABLE not in file:
-                raise CpunetError(
-                    f"{path}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
-                    "an output of cpunet simulate or cpunet stand"
-                )
-            return json.loads(text), np.asarray(file[f"{_PULSES}/event_number"], np.int64)
-    except (OSError, KeyError, ValueError) as error:
-        raise CpunetError(f"{path}: not a readable HDF5 file; is it truncated?") from error
+        made = json.loads(text)
+        if not isinstance(made, dict) or numbers.dtype.kind not in "iu":
+            raise TypeError
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CpunetError(
+            f"{path}: what {_PULSES} tells of its simulation is damaged; simulate it again"
+        ) from error
+    return made, numbers.astype(np.int64)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
+from cpunet import npz_files
 from cpunet.electronics.finishing import BLOCK, finish
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputSet
@@ -18,6 +17,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import PreparationConfig
 
 _NAME = "response"
+_MOST_SAMPLES = 1 << 20
 
 
 def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
@@ -63,18 +63,29 @@ class Responses:
     def __init__(self, path: Path, sim: InputSet) -> None:
         self.path = path
         self._index = sim.prepared.index
-        with self._opened() as (_, shape, by_column, self._dtype):
-            if len(shape) != 2 or shape[0] != sim.prepared.n_read:
-                raise CpunetError(
-                    f"{path}: response has shape {shape}, but {sim.path} holds "
-                    f"{sim.prepared.n_read} pulses; give the truth of that file"
-                )
-        if by_column:
+        with self._readable():
+            if path.is_file() and not zipfile.is_zipfile(path):
+                raise ValueError("no archive of arrays")
+            headers = npz_files.headers(path)
+        if _NAME not in headers:
+            names = ", ".join(headers) or "none"
+            raise CpunetError(f"{path}: has no array '{_NAME}' (found {names})")
+        shape, dtype = headers[_NAME].shape, headers[_NAME].dtype
+        if len(shape) != 2 or shape[0] != sim.prepared.n_read:
+            raise CpunetError(
+                f"{path}: response has shape {shape}, but {sim.path} holds "
+                f"{sim.prepared.n_read} pulses; give the truth of that file"
+            )
+        if dtype.kind not in "iuf" or not 2 <= shape[1] <= _MOST_SAMPLES:
+            raise CpunetError(
+                f"{path}: response is of {dtype}, {shape[1]} samples each; give traces"
+            )
+        if headers[_NAME].by_columns:
             raise CpunetError(
                 f"{path}: response is stored column by column; "
                 "save numpy.ascontiguousarray(response)"
             )
-        self._shape = shape
+        self._shape, self._dtype = shape, dtype
 
     def blocks(self, size: int = BLOCK) -> Iterator[FloatArray]:
         """Float32 traces of `size` pulses in use at a time, in their order.
@@ -86,7 +97,8 @@ class Responses:
         """
         n, samples = self._shape
         waiting = np.empty((0, samples), np.float32)
-        with self._opened() as (stream, *_):
+        with self._readable(), npz_files.member(self.path, _NAME) as stream:
+            npz_files.read_header(stream)
             for first in range(0, n, size):
                 rows = min(size, n - first)
                 raw = stream.read(rows * samples * self._dtype.itemsize)
@@ -101,32 +113,10 @@ class Responses:
             yield waiting
 
     @contextmanager
-    def _opened(
-        self,
-    ) -> Iterator[tuple[IO[bytes], tuple[int, ...], bool, np.dtype[np.generic]]]:
-        """Open the array behind its header: shape, whether by columns, and type."""
+    def _readable(self) -> Iterator[None]:
         try:
-            with zipfile.ZipFile(self.path) as archive:
-                names = [name.removesuffix(".npy") for name in archive.namelist()]
-                if _NAME not in names:
-                    raise CpunetError(
-                        f"{self.path}: has no array '{_NAME}' "
-                        f"(found {', '.join(names) or 'none'})"
-                    )
-                with archive.open(f"{_NAME}.npy") as stream:
-                    yield stream, *_header(stream)
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise CpunetError(f"{self.path}: cannot be read as .npz ({error})") from error
-
-
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.generic]]:
-    version = np.lib.format.read_magic(stream)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, by_column, dtype = read(stream)
-    if dtype.hasobject:
-        raise ValueError("objects instead of numbers")
-    return shape, by_column, dtype
+            yield
+        except npz_files.DAMAGED as error:
+            raise CpunetError(
+                f"{self.path}: cannot be read as .npz ({npz_files.said(error)})"
+            ) from error

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import platformdirs
 
+from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.simulation.grid import Grid
@@ -33,18 +35,32 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
     None if they are not there or damaged.
     """
     try:
-        # opened here: numpy leaves a damaged file open
-        with cache_file(key).open("rb") as file, np.load(file, allow_pickle=False) as kept:
-            axes = {name: kept[name] for name in _OF_GRID}
-            nodes = {name: kept[name] for name in _OF_NODES}
-            capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        file = cache_file(key)
+        kept = npz_files.read_arrays(file, npz_files.keys(file))
+        axes = {name: kept[name] for name in _OF_GRID}
+        nodes = {name: kept[name] for name in _OF_NODES}
+        capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
+        if not (_belong_together(axes, nodes) and np.isfinite([capacitance, depletion]).all()):
+            return None
+    except npz_files.DAMAGED:
         return None  # solved anew, and written over
-    shape = (len(axes["r_mm"]), len(axes["z_mm"]))
-    if any(values.shape != shape for values in (axes["region"], *nodes.values())):
-        return None
     grid = Grid(step_mm=step_mm, **axes)
     return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
+
+
+def _belong_together(
+    axes: dict[str, npt.NDArray[Any]], nodes: dict[str, npt.NDArray[Any]]
+) -> bool:
+    """Whether all arrays are of one grid, and their values numbers: loops trust both."""
+    n_r, n_z = len(axes["r_mm"]), len(axes["z_mm"])
+    shapes = {"r_mm": (n_r,), "z_mm": (n_z,), "region": (n_r, n_z)}
+    shapes |= {"r_steps": (n_r - 1, n_z), "z_steps": (n_r, n_z - 1)}
+    return all(
+        values.shape == shapes.get(name, (n_r, n_z))
+        and values.dtype.kind == ("i" if name == "region" else "f")
+        and np.isfinite(values).all()
+        for name, values in (axes | nodes).items()
+    )
 
 
 def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:

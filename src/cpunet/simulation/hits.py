@@ -13,6 +13,10 @@ from cpunet.errors import CpunetError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+# No laboratory is larger, and no event has more: compiled loops, which turn places into
+# indices, could not count so far.
+FARTHEST_MM, MOST_KEV = 1e7, 1e9
+
 
 @dataclass(frozen=True, eq=False)
 class Hits:
@@ -35,7 +39,7 @@ class Hits:
     Raises
     ------
     CpunetError
-        If the lengths disagree or the offsets fall.
+        If the lengths disagree, the offsets fall, or a hit lies beyond `FARTHEST_MM`.
 
     Examples
     --------
@@ -58,6 +62,12 @@ class Hits:
         for name in ("x_mm", "y_mm", "z_mm", "edep_kev"):
             if getattr(self, name).shape != (n,):
                 raise CpunetError(f"hits: {name} does not have one value per hit ({n})")
+        for values in (self.x_mm, self.y_mm, self.z_mm):
+            if np.any(np.abs(values) > FARTHEST_MM):
+                raise CpunetError(
+                    f"hits: one lies {np.nanmax(np.abs(values)):g} mm away; check the units "
+                    "and the origin"
+                )
         ends_fit = len(self.offsets) > 0 and self.offsets[0] == 0 and self.offsets[-1] == n
         if not ends_fit or np.any(np.diff(self.offsets) < 0):
             raise CpunetError(f"hits: offsets must rise from 0 to the number of hits, {n}")

@@ -19,6 +19,7 @@ from cpunet.simulation.cloud import (
 )
 from cpunet.simulation.drift import drift
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.hits import FARTHEST_MM
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
 
@@ -116,7 +117,8 @@ def hit_table(
     except ValueError as error:
         raise CpunetError("hits: x, y, z and energy differ in number; give one each") from error
     table = np.ascontiguousarray(np.stack(columns, axis=-1), dtype=np.float64).reshape(-1, 4)
-    bad = np.flatnonzero(~np.isfinite(table).all(1))
+    near = (np.abs(table[:, :3]) <= FARTHEST_MM).all(1)  # NaN is not
+    bad = np.flatnonzero(~(near & np.isfinite(table[:, 3])))
     if len(bad):
         raise CpunetError(f"hits: hit {bad[0]}: no finite place or energy; leave it out")
     return table

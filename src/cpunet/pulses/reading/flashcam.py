@@ -16,6 +16,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
+_MOST_CHANNELS = 1 << 16
+
 
 class FlashCamSource(PulseSource):
     """The traces of one channel; `table` is its index where there are several.
@@ -28,9 +30,13 @@ class FlashCamSource(PulseSource):
     def __init__(self, options: ReadOptions) -> None:
         with _opened(options.path) as stream:
             config = stream.config
+            if config is None:
+                raise CpunetError(f"{options.path}: holds no configuration; copy it again")
             n_channels = int(config.adcs)
             length = int(config.eventsamples)
             period_ns = np.asarray(float(config.sampling_period_ns))
+        if not 0 < n_channels <= _MOST_CHANNELS:
+            raise CpunetError(f"{options.path}: {n_channels} channels; copy the file again")
         self._channel = _channel(options, n_channels)
         layout = Layout(
             format="FlashCam",
@@ -80,6 +86,8 @@ class FlashCamSource(PulseSource):
         if rows.size == 0:
             return None
         number = int(event.eventnumber)
+        if rows[0] >= len(event.trace):
+            raise CpunetError(f"{self.path}: event {number}: no traces; copy the file again")
         trace = event.trace[rows[0]].copy()
         if len(trace) != self.length:
             raise CpunetError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -12,9 +13,13 @@ import numpy.typing as npt
 from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.hdf5 import columns_of, opened
+from cpunet.hdf5_files import opened, require_stored, text_attribute
+from cpunet.pulses.reading.hdf5 import columns_of
 from cpunet.pulses.reading.hdf5_tables import WaveformColumn, choose_waveforms
+from cpunet.pulses.reading.lh5_rows import read_rows
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+
+_PARTS = ("cumulative_length", "flattened_data")  # of vectors
 
 
 def open_hdf5(options: ReadOptions) -> PulseSource:
@@ -30,6 +35,7 @@ class Lh5Source(PulseSource):
     def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
+            _require_waveforms(options.path, file, self._values)
             n_pulses = lh5.read_n_rows(self._values, file) or 0
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             layout = Layout(
@@ -52,9 +58,15 @@ class Lh5Source(PulseSource):
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
         # lh5 decodes LEGEND's encoded waveforms; it reads only the rows asked for.
-        values = lh5.read(self._values, file, start_row=start, n_rows=size)
+        values = read_rows(file[self._values], start, size)
         if not isinstance(values, VectorOfVectors):
-            return np.asarray(values.nda)
+            traces = np.asarray(values.nda)
+            if traces.ndim != 2 or traces.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
+                    f"{traces.shape}; give a file of traces"
+                )
+            return traces
         lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
         expected = int(lengths[0]) if length is None else length
         if (other := lengths != expected).any():
@@ -67,6 +79,26 @@ class Lh5Source(PulseSource):
         return flat.reshape(len(lengths), expected)
 
 
+def _require_waveforms(path: Path, file: h5py.File, name: str) -> None:
+    """Raise a `CpunetError` unless at `name` are waveforms as LH5 has them, all stored."""
+    values = file[name]
+    kind = text_attribute(values, "datatype")
+    if isinstance(values, h5py.Dataset):
+        fits, stored = values.ndim == 2 and values.dtype.kind in "iuf", [values]
+    elif "encoded" in kind:
+        parts = [values.get(f"encoded_data/{one}") for one in _PARTS]
+        fits, stored = {"encoded_data", "decoded_size"} <= set(values), parts
+    else:
+        fits, stored = True, [values.get(one) for one in _PARTS]
+    if not fits or not all(isinstance(one, h5py.Dataset) for one in stored):
+        raise CpunetError(
+            f"{path}: {name} ({kind or 'of no LH5 type'}) holds no waveforms; give a file of "
+            "traces"
+        )
+    for dataset in stored:
+        require_stored(path, dataset)
+
+
 class Hdf5Source(PulseSource):
     """A dataset of two dimensions (event, sample), and the columns beside it."""
 
@@ -74,6 +106,7 @@ class Hdf5Source(PulseSource):
         self._values = chosen.path
         with opened(options.path) as file:
             dataset = file[chosen.path]
+            require_stored(options.path, dataset)
             columns = columns_of(options.path, file[chosen.table or "/"])
             period_name = "dt_ns" if "dt_ns" in columns else "dt"
             layout = Layout(

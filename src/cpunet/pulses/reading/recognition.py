@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from cpunet.errors import CpunetError
+from cpunet.regular_files import require_file
 
 Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "text"]
 
@@ -65,12 +66,12 @@ def _head(path: Path) -> bytes:
     try:
         if path.is_dir():
             raise CpunetError(f"{path}: is a folder; give a file of pulses")
-        with path.open("rb") as file:
+        with require_file(path).open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except FileNotFoundError:
         raise CpunetError(f"{path}: no such file; check the name") from None
     except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+        raise CpunetError(f"{path}: cannot be read ({error.strerror}); check it") from error
     if not head:
         raise CpunetError(f"{path}: is empty; copy or write it again")
     return head

@@ -17,6 +17,9 @@ from cpunet.pulses.reading.columns import Column, require_length
 from cpunet.pulses.reading.energies import resolve_energies
 from cpunet.pulses.reading.sampling import resolve_sampling
 
+MOST_SAMPLES = 1 << 20  # of a trace: 17 ms at 16 ns
+BLOCK_BYTES = 1 << 28  # of a block of traces in single precision
+_MOST_NUMBER = 2.0**62
 _EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
 
 
@@ -99,6 +102,11 @@ class PulseSource(ABC):
                 f"{options.path}: {layout.table or layout.format} holds no pulses; "
                 "give a file with events"
             )
+        if not 0 < layout.length <= MOST_SAMPLES:
+            raise CpunetError(
+                f"{options.path}: a trace of {layout.length} samples is no pulse (at most "
+                f"{MOST_SAMPLES}); cut the traces"
+            )
         self.path = options.path
         self.n_pulses = layout.n_pulses
         self.length = layout.length
@@ -130,6 +138,8 @@ class PulseSource(ABC):
     def blocks(self, size: int = 4096) -> Iterator[Pulses]:
         """Give the pulses of the file in order, at most `size` at a time.
 
+        Of long traces there are fewer, so that a block stays within `BLOCK_BYTES`.
+
         Raises
         ------
         CpunetError
@@ -139,7 +149,7 @@ class PulseSource(ABC):
         if size < 1:
             raise ValueError(f"block size is {size}; expected at least 1")
         start = 0
-        for traces in self._traces(size):
+        for traces in self._traces(min(size, max(1, BLOCK_BYTES // (4 * self.length)))):
             yield self._pulses(start, traces)
             start += len(traces.waveforms)
         if start == 0:
@@ -186,8 +196,21 @@ class PulseSource(ABC):
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
             )
-        event_number = np.asarray(numbers, np.int64)
+        event_number = self._whole(start, np.asarray(numbers))
         self._sampling.check(start, event_number)
         return Pulses.of(
             waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number
         )
+
+    def _whole(self, start: int, numbers: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """Event numbers as integers; some files keep them as real numbers."""
+        if numbers.dtype.kind == "i":
+            return numbers.astype(np.int64)
+        values = numbers.astype(np.float64)
+        bad = ~((values == np.rint(values)) & (np.abs(values) < _MOST_NUMBER))
+        if bad.any():
+            raise CpunetError(
+                f"{self.path}: row {start + int(bad.argmax())}: the event number is "
+                f"{values[bad][0]:g}; number the events anew"
+            )
+        return numbers.astype(np.int64)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.hit_readers.g4simple import of_detector
-from cpunet.simulation.hit_readers.steps import Steps, Units
+from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _NAMES = {
     "event": ("event", "event#", "eventid", "evtid"),
@@ -46,7 +46,11 @@ def read_csv(path: Path, detector: str | None, units: Units) -> Steps:
         data[:, get[axis]] * units.to_mm(path, columns[get[axis]], unit(axis)) for axis in "xyz"
     ]
     edep = data[:, get["edep"]] * units.to_kev(path, columns[get["edep"]], unit("edep"))
-    steps = Steps(data[:, get["event"]].astype(np.int64), np.stack(axes, axis=1), edep)
+    steps = Steps(
+        whole_numbers(path, columns[get["event"]], data[:, get["event"]]),
+        np.stack(axes, axis=1),
+        edep,
+    )
     if "detector" in get:
         return of_detector(path, steps, data[:, get["detector"]], detector)
     if detector is not None:

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hit_readers.steps import Steps
+from cpunet.hdf5_files import require_stored
+from cpunet.simulation.hit_readers.steps import Steps, whole_numbers
 
 NTUPLE = "default_ntuples/g4sntuple"
 
@@ -21,7 +22,7 @@ def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps
     x, y, z, event = (_column(path, ntuple, name) for name in ("x", "y", "z", "event"))
     if any(len(column) != rows for column in (x, y, z, event)):
         raise CpunetError(f"{path}: columns of {NTUPLE} differ in length; is it truncated?")
-    steps = Steps(event.astype(np.int64), np.stack([x, y, z], axis=1), edep)
+    steps = Steps(whole_numbers(path, "event", event), np.stack([x, y, z], axis=1), edep)
     if "volID" not in ntuple:
         if detector is not None:
             raise CpunetError(f"{path}: no column volID to pick detector {detector} by")
@@ -34,7 +35,8 @@ def of_detector(
 ) -> Steps:
     """The steps of a detector given by its number; of the only one if none is given."""
     # where nothing is deposited there is no detector: world, holders of no interest
-    there = sorted({int(n) for n in np.unique(number[steps.edep_kev > 0])})
+    volumes = whole_numbers(path, "the detector's number", number)
+    there = sorted({int(n) for n in np.unique(volumes[steps.edep_kev > 0])})
     names = ", ".join(map(str, there))
     if detector is None:
         if len(there) > 1:
@@ -42,9 +44,10 @@ def of_detector(
                 f"{path}: holds detectors {names}; give detector (--hits-detector) as one"
             )
         return steps
-    if not detector.lstrip("-").isdigit() or int(detector) not in there:
+    known = {str(n): n for n in there}
+    if detector not in known:
         raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
-    mine = number == int(detector)
+    mine = volumes == known[detector]
     return Steps(steps.event[mine], steps.position_mm[mine], steps.edep_kev[mine])
 
 
@@ -55,4 +58,5 @@ def _column(path: Path, ntuple: h5py.Group, name: str) -> npt.NDArray[np.float64
             f"{path}: no step-wise column {name} in {NTUPLE}; write it with g4simple's "
             "stepwise option"
         )
+    require_stored(path, pages)
     return np.asarray(pages[()], float)

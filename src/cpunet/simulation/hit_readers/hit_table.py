@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import lh5
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hit_readers.steps import Steps, Units
+from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
+from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 from cpunet.simulation.hits import Hits
 
 TABLE = "geds/hits"
+_EVENTS = "geds/sim/event_number"
 _AXES = ("x", "y", "z")
 
 
@@ -42,21 +43,30 @@ def read_hit_table(path: Path, units: Units) -> Steps:
     Raises
     ------
     CpunetError
-        If the table cannot be read, lacks a column or a unit, or its columns differ
-        in length.
+        If the table cannot be read, lacks a column or a unit, its columns differ in
+        length, or it has no hits of an event whose pulse is in the file.
     """
-    try:
-        table = lh5.read(TABLE, str(path))
-    # truncated and foreign files fail in as many ways as the library has layers
-    except Exception as error:
-        raise CpunetError(f"{path}: {TABLE} cannot be read; is the file truncated?") from error
-    missing = [name for name in ("event_number", *_AXES, "edep") if name not in table]
-    if missing:
-        raise CpunetError(f"{path}: {TABLE} has no column {missing[0]}; write the file again")
-    values = {name: np.asarray(table[name].nda) for name in ("event_number", *_AXES, "edep")}
+    values, named = {}, {}
+    with opened(path) as file:
+        for name in ("event_number", *_AXES, "edep"):
+            column = file.get(f"{TABLE}/{name}")
+            if column is None:
+                raise CpunetError(f"{path}: {TABLE} has no column {name}; write the file again")
+            if not is_column(column):
+                raise CpunetError(f"{path}: {TABLE}/{name} holds no numbers; write it again")
+            require_stored(path, column)
+            values[name] = np.asarray(column[()])
+            named[name] = text_attribute(column, "units")
+        pulses = file.get(_EVENTS)
+        events = np.asarray(pulses[()]) if is_column(pulses) else np.empty(0, np.int64)
     if len({column.shape for column in values.values()}) != 1:
         raise CpunetError(f"{path}: columns of {TABLE} differ in length; is it truncated?")
-    named = {name: table[name].attrs.get("units") for name in (*_AXES, "edep")}
+    number = whole_numbers(path, f"{TABLE}/event_number", values["event_number"])
+    without = ~np.isin(events, number)
+    if without.any():
+        raise CpunetError(
+            f"{path}: {TABLE} has no hit of event {events[without][0]}; simulate it again"
+        )
     position = [values[a] * units.to_mm(path, f"{TABLE}/{a}", named[a]) for a in _AXES]
     energy = values["edep"] * units.to_kev(path, f"{TABLE}/edep", named["edep"])
-    return Steps(values["event_number"].astype(np.int64), np.stack(position, axis=1), energy)
+    return Steps(number, np.stack(position, axis=1), energy)

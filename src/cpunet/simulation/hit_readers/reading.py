@@ -7,6 +7,8 @@ from pathlib import Path
 import h5py
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened
+from cpunet.regular_files import require_file
 from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
@@ -59,7 +61,7 @@ def read_hits(
 
 def _steps(path: Path, detector: str | None, units: Units) -> Steps:
     try:
-        with path.open("rb") as stream:
+        with require_file(path).open("rb") as stream:
             start = stream.read(512)
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
@@ -76,13 +78,10 @@ def _steps(path: Path, detector: str | None, units: Units) -> Steps:
 
 
 def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
-    try:
-        with h5py.File(path, "r") as file:
-            if NTUPLE in file:
-                return read_g4simple(path, file[NTUPLE], detector)
-            is_remage, is_kept = "stp" in file, TABLE in file
-    except OSError as error:
-        raise CpunetError(f"{path}: not a readable HDF5 file; is it truncated?") from error
+    with opened(path) as file:
+        if isinstance(file.get(NTUPLE), h5py.Group):
+            return read_g4simple(path, file[NTUPLE], detector)
+        is_remage, is_kept = isinstance(file.get("stp"), h5py.Group), TABLE in file
     if is_remage:
         return read_remage(path, detector, units)
     if is_kept:

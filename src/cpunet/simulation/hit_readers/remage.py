@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import h5py
-import lh5
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hit_readers.steps import Steps, Units
+from cpunet.hdf5_files import opened, require_all_stored, text_attribute
+from cpunet.pulses.reading.lh5_rows import read_rows
+from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _AXES = ("xloc", "yloc", "zloc")
 
@@ -20,26 +22,21 @@ def read_remage(path: Path, detector: str | None, units: Units) -> Steps:
     """Steps of one table of ``stp``, relative to the detector's origin if the file has it."""
     name = _detector(path, detector)
     table = _read(path, f"stp/{name}")
-    missing = [c for c in ("evtid", "edep", *_AXES) if c not in table]
-    if missing:
-        raise CpunetError(
-            f"{path}: stp/{name} has no column {missing[0]}; choose a germanium detector"
-        )
     edep, counts = _flat(path, table, "edep")
     edep = edep * units.to_kev(path, f"stp/{name}/edep", _unit(table, "edep"))
     columns = []
     for axis in _AXES:
-        values, _ = _flat(path, table, axis)
-        if len(values) != len(edep):
+        values, same = _flat(path, table, axis)
+        if not np.array_equal(same, counts):
             raise CpunetError(f"{path}: stp/{name}: {axis} and edep differ in length")
         columns.append(values * units.to_mm(path, f"stp/{name}/{axis}", _unit(table, axis)))
-    numbers = np.asarray(table["evtid"].nda)
+    numbers = whole_numbers(path, f"stp/{name}/evtid", _real(path, "evtid", table["evtid"]))
     position = np.stack(columns, axis=1) - _origin(path, name, units)
-    return Steps(np.repeat(numbers, counts).astype(np.int64), position, edep)
+    return Steps(np.repeat(numbers, counts), position, edep)
 
 
 def _detector(path: Path, detector: str | None) -> str:
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         there = [
             str(name)
             for name, table in file["stp"].items()
@@ -60,24 +57,33 @@ def _detector(path: Path, detector: str | None) -> str:
 def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
     """Origin of a detector in mm; zero if the file does not tell."""
     origin = np.zeros(3)
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         if f"detector_origins/{name}" not in file:
             return origin
         for i, axis in enumerate(_AXES):
             where = f"detector_origins/{name}/{axis}"
-            number = file[where]
-            unit = number.attrs.get("units")
+            number = file.get(where)
+            if not isinstance(number, h5py.Dataset) or number.size != 1:
+                raise CpunetError(f"{path}: {where} is no number; write the file again")
+            unit = text_attribute(number, "units")
             # an origin may come without a unit; all lengths of remage are in m
             origin[i] = float(number[()]) * units.to_mm(path, where, unit or "m")
     return origin
 
 
-def _read(path: Path, name: str) -> Any:
-    try:
-        return lh5.read(name, str(path))
-    # truncated and foreign files fail in as many ways as the library has layers
-    except Exception as error:
-        raise CpunetError(f"{path}: {name} cannot be read; is the file truncated?") from error
+def _read(path: Path, name: str) -> dict[str, Any]:
+    """The columns needed of a table, as LH5 objects."""
+    table = {}
+    with opened(path) as file:
+        for column in ("evtid", "edep", *_AXES):
+            item = file.get(f"{name}/{column}")
+            if item is None:
+                raise CpunetError(
+                    f"{path}: {name} has no column {column}; choose a germanium detector"
+                )
+            require_all_stored(path, item)
+            table[column] = read_rows(item, 0, sys.maxsize)
+    return table
 
 
 def _flat(
@@ -86,14 +92,22 @@ def _flat(
     """All steps' values of a column, and the number of steps per row."""
     vectors = table[column]
     if not hasattr(vectors, "cumulative_length"):
-        values = np.asarray(vectors.nda, float)
-        return values, np.ones(len(values), np.int64)
-    ends = np.asarray(vectors.cumulative_length.nda, np.int64)
-    values = np.asarray(vectors.flattened_data.nda, float)
+        values = _real(path, column, vectors)
+        ends = np.arange(1, len(values) + 1)
+    else:
+        ends = np.asarray(vectors.cumulative_length.nda, np.int64)
+        values = _real(path, column, vectors.flattened_data)
     counts = np.diff(ends, prepend=0)
-    if len(ends) != len(table["evtid"]) or np.any(counts < 0) or ends[-1:].sum() > len(values):
+    if len(ends) != len(table["evtid"]) or np.any(counts < 0) or ends[-1:].sum() != len(values):
         raise CpunetError(f"{path}: column {column} does not divide into events; truncated?")
-    return values[: ends[-1] if len(ends) else 0], counts
+    return values, counts
+
+
+def _real(path: Path, column: str, values: Any) -> npt.NDArray[np.float64]:
+    numbers = np.asarray(getattr(values, "nda", None))
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iuf":
+        raise CpunetError(f"{path}: column {column} is of {numbers.dtype}; give numbers")
+    return numbers.astype(float)
 
 
 def _unit(table: Any, column: str) -> str | None:

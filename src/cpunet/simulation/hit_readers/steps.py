@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.hits import FARTHEST_MM, MOST_KEV, Hits
 
 FloatArray = npt.NDArray[np.float64]
 
+_MOST_NUMBER = 2.0**62
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
 
@@ -77,12 +79,14 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
     CpunetError
         If a step has no finite position or energy, a negative energy, or none deposits.
     """
-    bad = ~(np.isfinite(steps.position_mm).all(axis=1) & np.isfinite(steps.edep_kev))
-    bad |= steps.edep_kev < 0
+    # written so that NaN is bad
+    placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
+    bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MOST_KEV))
     if bad.any():
         event = steps.event[np.argmax(bad)]
         raise CpunetError(
-            f"{path}: event {event}: a step has no finite position or no energy of at least 0; "
+            f"{path}: event {event}: a step has no finite position or no energy of at least 0 "
+            f"(nor may it lie {FARTHEST_MM / 1e6:g} km away or have {MOST_KEV / 1e9:g} TeV); "
             "remove the event or simulate again"
         )
     kept = steps.edep_kev > 0
@@ -102,6 +106,23 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
         numbers[in_file],
     )
     return ReadHits(hits, int((~kept).sum()))
+
+
+def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """A column of whole numbers, also where they are stored as real ones.
+
+    Raises
+    ------
+    CpunetError
+        If one is not whole, or too large.
+    """
+    kind = values.dtype.kind
+    fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MOST_NUMBER).all())
+    if fit and kind == "f":
+        fit = bool((values == np.rint(values)).all())
+    if not fit:
+        raise CpunetError(f"{path}: {name} holds what is no whole number; write it again")
+    return values.astype(np.int64)
 
 
 def _factor(

@@ -1,0 +1,115 @@
+"""HDF5 files opened for reading, with whatever their damage makes the libraries raise."""
+
+from __future__ import annotations
+
+import math
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+
+# The package brings the compression filters of LEGEND's files with it.
+from lh5.io.exceptions import LH5DecodeError
+
+from cpunet.errors import CpunetError
+from cpunet.regular_files import require_file
+
+_LIBRARIES = re.compile(r"(^|[/\\])(h5py|lh5|lgdo|awkward|numpy)[/\\]")
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; library errors inside become a `CpunetError`.
+
+    File locking is off, as shared file systems of clusters often lack it.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, foreign or damaged.
+    """
+    with reading(path), h5py.File(require_file(path), "r", locking=False) as file:
+        yield file
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Have what the libraries raise over a damaged file become a `CpunetError`."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise CpunetError(f"{path}: no such file; check the name") from None
+    except CpunetError:
+        raise
+    except (OSError, RuntimeError, ValueError, LH5DecodeError) as error:
+        raise _damaged(path, error) from error
+    except Exception as error:
+        if not _from_a_library(error):
+            raise
+        raise _damaged(path, error) from error
+
+
+def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    """An attribute of text, ``""`` if it is not there."""
+    value = item.attrs.get(name, "")
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def is_column(item: object) -> bool:
+    """Whether something in a file is numbers of one dimension, or one number."""
+    return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+
+
+def require_all_stored(path: Path, item: h5py.Group | h5py.Dataset) -> None:
+    """As `require_stored`, for all datasets within a group."""
+    if isinstance(item, h5py.Dataset):
+        require_stored(path, item)
+        return
+    for name in item:
+        inner = item.get(name)
+        if inner is not None and inner != item.parent:
+            require_all_stored(path, inner)
+
+
+def require_stored(path: Path, dataset: h5py.Dataset) -> None:
+    """Raise a `CpunetError` if rows of a dataset are a mere claim, without values in the file.
+
+    Such a file of a few bytes would be read as any number of zeros.
+    """
+    n_bytes = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
+    if n_bytes == 0 or dataset.is_virtual or dataset.external:
+        return
+    missing = dataset.id.get_storage_size() == 0
+    if dataset.chunks is not None and not missing:
+        extents = zip(dataset.shape, dataset.chunks, strict=True)
+        expected = math.prod(-(-extent // chunk) for extent, chunk in extents)
+        missing = dataset.id.get_num_chunks() < expected
+    if missing:
+        raise CpunetError(
+            f"{path}: {dataset.name} says it has {dataset.shape[0]} rows, but not all of them "
+            "are in the file; copy or write it again"
+        )
+
+
+def _damaged(path: Path, error: Exception) -> CpunetError:
+    text = str(error)
+    if "truncated" in text:
+        what = "is truncated"
+    elif "file signature not found" in text:
+        return CpunetError(f"{path}: not an HDF5 file; give an LH5 or HDF5 file")
+    else:
+        what = f"cannot be read ({_one_line(error)})"
+    return CpunetError(f"{path}: {what}; copy or write it again")
+
+
+def _from_a_library(error: Exception) -> bool:
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and _LIBRARIES.search(frames[-1].filename) is not None
+
+
+def _one_line(error: Exception) -> str:
+    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return text if len(text) <= 160 else f"{text[:160]}…"
