@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cpunet.errors import CpunetError
+from cpunet.yaml_files import plain_json
 
 MARKER = ".cpunet.json"
 PROGRAM = "cpunet"
@@ -215,7 +216,7 @@ def _same(one: Path, other: Path) -> bool:
 
 def _marker(folder: Path) -> dict[str, object]:
     try:
-        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+        content = plain_json((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     ours = isinstance(content, dict) and content.get("program") == PROGRAM
@@ -235,7 +236,9 @@ def _others(folder: Path, kind: FolderKind) -> Iterator[Path]:
     """What in a folder is not the program's own."""
     marker = _marker(folder)
     files = marker.get("files")
-    listed = set(files) if isinstance(files, list) else set()
+    listed = (
+        {file for file in files if isinstance(file, str)} if isinstance(files, list) else set()
+    )
     own = re.compile(kind.own if isinstance(files, list) else f"{kind.own}|{kind.older}")
     for path in _leaves(folder):
         name = _relative(path, folder)

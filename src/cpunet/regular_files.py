@@ -28,6 +28,14 @@ def require_file(path: Path | str) -> Path:
     return file
 
 
+def is_there(name: Path | str) -> bool:
+    """Whether there is something of a name, also of one that cannot be."""
+    try:
+        return Path(name).exists()
+    except (OSError, ValueError):  # too long, or with a NUL
+        return False
+
+
 def read_text(path: Path | str, most_bytes: int) -> str:
     """Text of a file in UTF-8.
 

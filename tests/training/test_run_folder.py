@@ -10,11 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run_folder import (
+    WEIGHTS,
     append_losses,
     load_network,
     read_info,
@@ -23,6 +25,7 @@ from cpunet.training.run_folder import (
     versions,
     write_run,
 )
+from cpunet.training.run_schema import FORMAT
 
 INFO = {"recipe": "paper", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
 INFO |= {"seconds": 1.5, "device": "cpu"}
@@ -51,7 +54,7 @@ def blank(recipe) -> PositionalUNet:
 
 
 def test_everything_comes_back(run, model, recipe):
-    assert read_info(run) == INFO
+    assert read_info(run) == {"format": FORMAT} | INFO
     assert read_recipe(run) == recipe
     for name in ("ren", "iren", "discriminator_data", "discriminator_sim"):
         fresh = getattr(CycleGan(recipe), name)
@@ -166,6 +169,71 @@ def test_damaged_info(run, text, message):
     one_line(error, str(run), message)
 
 
+# What is wrong with run.json: key and value
+WRONG_FACTS = [
+    *(("dt_ns", v) for v in (None, "16", [16], {}, True, 0, -16, 10**50, 1e10)),
+    *(("peak", v) for v in (None, 3, ["FEP"])),
+    *(("recipe", v) for v in (None, {"name": "fast"})),
+    *(("seed", v) for v in ("0", -1, 1.5, [0])),
+    *(("seconds", v) for v in ("9", -1, [1])),
+    *(("device", v) for v in (None, 0)),
+    *(("data", v) for v in (3, "x", [1], {"cuts": 3}, {"cuts": {"amplitude": 1}})),
+    *(("sim", v) for v in (3, {"file": 3}, {"used": [3]})),
+    *(("fit", v) for v in (3, {"errors": [1]}, {"covariance": [["a"]]})),
+    *(("format", v) for v in ("1", -1, FORMAT + 1)),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), WRONG_FACTS)
+def test_facts_of_other_types(run, key, value):
+    (run / "run.json").write_text(json.dumps(INFO | {key: value}))
+    with pytest.raises(CpunetError) as error:
+        read_info(run)
+    one_line(error, str(run), "run.json: damaged (", key)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1" * 400, "1" * 5000, "1e400"])
+def test_facts_beyond_all_numbers(run, number):
+    (run / "run.json").write_text(json.dumps(INFO).replace("16.0", number))
+    with pytest.raises(CpunetError) as error:
+        read_info(run)
+    one_line(error, str(run), "run.json: damaged (")
+
+
+def test_runs_of_the_previous_release_load(run):
+    """Which said nothing of a format, and may have more keys than are known now."""
+    (run / "run.json").write_text(json.dumps(INFO | {"other": {"kept": [1]}}))
+    assert read_info(run)["other"] == {"kept": [1]}
+
+
+def test_nested_without_end(run):
+    (run / "run.json").write_text("[" * 100_000)
+    (run / "recipe.yaml").write_text("[" * 5000)
+    for read in (read_info, read_recipe):
+        with pytest.raises(CpunetError) as error:
+            read(run)
+        one_line(error, str(run), "damaged")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w: w.fill_(torch.nan), "is not finite; train again"),
+        (lambda w: w.view(-1)[:1].fill_(torch.inf), "is not finite; train again"),
+        (lambda w: w.zero_(), "all weights of ren are zero; train again"),
+    ],
+)
+def test_weights_that_are_no_numbers(run, recipe, change, message):
+    weights = load_file(run / WEIGHTS)
+    for values in weights.values():
+        if values.is_floating_point():
+            change(values)
+    save_file(weights, run / WEIGHTS)
+    with pytest.raises(CpunetError) as error:
+        load_network(run, "ren", blank(recipe))
+    one_line(error, WEIGHTS, message)
+
+
 @pytest.mark.parametrize("text", [None, "", "{", "name: x", "- 1", "a: [\n"])
 def test_damaged_recipe(run, text):
     (run / "recipe.yaml").unlink()
@@ -176,7 +244,20 @@ def test_damaged_recipe(run, text):
     one_line(error, str(run / "recipe.yaml"))
 
 
-@pytest.mark.parametrize("text", ['{"iteration": 0', "x\n", "\n\n[1"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"iteration": 0',
+        "x\n",
+        "\n\n[1",
+        "[]",
+        "3",
+        '{"iteration": 1, "losses": [2]}',
+        '{"iteration": "1", "losses": {}}',
+        '{"iteration": 1, "losses": {"a": "b"}}',
+        "\xff",
+    ],
+)
 def test_a_damaged_log(run, text):
     (run / "losses.jsonl").write_text(text)
     with pytest.raises(CpunetError) as error:

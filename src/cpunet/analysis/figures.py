@@ -89,7 +89,7 @@ def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
     axes = figure.subplots()
     axes.plot(
         [record["iteration"] for record in records],
-        [record["losses"][CHI_SQUARE] for record in records],
+        [record["losses"].get(CHI_SQUARE, np.nan) for record in records],
         color="black",
         marker="o",
         markersize=3,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import out
+from cpunet.cli.messages import out, warn
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
@@ -29,6 +29,7 @@ def info(
     """
     from cpunet.jobs.info import describe
     from cpunet.recipes import load_recipe
+    from cpunet.training.run_schema import problem
 
     told = describe(
         source,
@@ -38,6 +39,8 @@ def info(
         dt_ns=dt,
         peaks=load_recipe("small").peaks,
     )
+    if told["kind"] == "run" and (wrong := problem(told)):
+        warn(f"{source}: its run.json is damaged ({wrong}); train again")
     width = max(len(name) for name, _ in _lines(told))
     for name, value in _lines(told):
         out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)

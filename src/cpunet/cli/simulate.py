@@ -88,7 +88,7 @@ WindowKev = Annotated[
     float,
     typer.Option(
         help="Half-width about a peak; wider ones bring the continuum with them.",
-        callback=options.within(0, 1e4, above=True),
+        callback=options.within(-1e4, 1e4),
     ),
 ]
 SourceHeight = Annotated[
@@ -96,7 +96,7 @@ SourceHeight = Annotated[
     typer.Option(
         help="Of the source above the crystal, mm.",
         rich_help_panel=GAMMAS,
-        callback=options.within(0, 1e4, above=True),
+        callback=options.within(-1e4, 1e4),
     ),
 ]
 SourceRadius = Annotated[

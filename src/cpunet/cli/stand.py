@@ -10,6 +10,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
+from cpunet.cli.values import event_count
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -60,7 +61,7 @@ SettingsFile = Annotated[
 ]
 WindowKev = Annotated[
     float,
-    typer.Option(help="Half-width about a peak.", callback=options.within(0, 1e4, above=True)),
+    typer.Option(help="Half-width about a peak.", callback=options.within(-1e4, 1e4)),
 ]
 
 
@@ -121,7 +122,7 @@ def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
     names = [name.strip() for name, _, _ in pairs]
     if len(set(names)) < len(names):
         raise CpunetError(f"--events {events}: names a peak twice; give each once")
-    return names, tuple(int(number) for _, _, number in pairs)
+    return names, tuple(event_count(number) for _, _, number in pairs)
 
 
 def _lines(summary: StandSummary) -> list[str]:

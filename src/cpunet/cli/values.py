@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from cpunet.errors import CpunetError
+from cpunet.yaml_files import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
     from cpunet.jobs.hit_sources import Window
     from cpunet.jobs.simulate import Resolution
     from cpunet.recipes.schema import PeakConfig
+
+
+MOST_EVENTS = 1_000_000_000  # of a window; simulate more in several files
+_LARGEST = 1e6
 
 
 def parse_events(
@@ -38,12 +43,12 @@ def parse_events(
 
     if "=" not in events:
         windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
-        return windows, (_count(events),) * len(windows)
+        return windows, (event_count(events),) * len(windows)
     if peak is not None:
         raise CpunetError(f"--events {events} names its peaks; leave out --peak")
     pairs = [part.partition("=") for part in events.split(",")]
     windows = energy_windows(",".join(name for name, _, _ in pairs), peaks, window_kev)
-    return windows, tuple(_count(number) for _, _, number in pairs)
+    return windows, tuple(event_count(number) for _, _, number in pairs)
 
 
 def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:
@@ -64,7 +69,11 @@ def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise CpunetError(f"{option} {text}: expected {n} numbers separated by commas")
+        raise CpunetError(
+            f"{option} {shown(text)[1:-1]}: expected {n} numbers separated by commas"
+        )
+    if max(map(abs, numbers), default=0) > _LARGEST:
+        raise CpunetError(f"{option} {shown(text)[1:-1]}: at most {_LARGEST:g}")
     return numbers
 
 
@@ -84,8 +93,20 @@ def parse_resolution(text: str | None) -> Resolution | None:
     return Resolution(noise, fano)
 
 
-def _count(text: str) -> int:
+def event_count(text: str) -> int:
+    """A number of events.
+
+    Raises
+    ------
+    CpunetError
+        If `text` is none, or there are too many.
+    """
     # underscores and signs, which int() takes, are more likely slips
+    digits = text.strip().lstrip("0") or "0"
     if not text.strip().isdecimal():
-        raise CpunetError(f"--events: {text!r} is no number of events; give N or FEP=N,DEP=M")
-    return int(text)
+        raise CpunetError(
+            f"--events: {shown(text)} is no number of events; give N or FEP=N,DEP=M"
+        )
+    if len(digits) > len(str(MOST_EVENTS)) or int(digits) > MOST_EVENTS:
+        raise CpunetError(f"--events: {shown(text)} are too many; at most {MOST_EVENTS}")
+    return int(digits)

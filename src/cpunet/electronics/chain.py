@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
-from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
+from cpunet.recipes.base import Config, Fraction, NonNegative, Positive, Samples
 
 REFERENCE_KEV = 2614.5
 """Energy (keV) at which figures that depend on it are given: the full-energy peak."""
@@ -171,9 +171,9 @@ class Electronics(_Figures):
     pile_up: PileUp
     adc_bits: Annotated[int, Field(ge=8, le=16)]
     resolution_fwhm_kev: NonNegative
-    n_pre: Count
-    length: Count
-    dt_ns: Positive
+    n_pre: Samples
+    length: Samples
+    dt_ns: Annotated[float, Field(ge=0.1, le=1e6)]
 
     @model_validator(mode="after")
     def _is_possible(self) -> Electronics:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.outputs import refuse_existing
+from cpunet.regular_files import read_text
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 REPORT = "report"  # folder of a demonstration that holds the metrics
 
@@ -70,8 +71,8 @@ def read_metrics(file: Path) -> dict[str, Any]:
         If it cannot be read, or holds no scores of a validation.
     """
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        content = plain_json(read_text(file, MOST_BYTES))
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise CpunetError(
             f"{file}: cannot be read ({reason}); validate the run again"

@@ -13,7 +13,9 @@ from cpunet.jobs.stand import MARKER, STAND
 from cpunet.jobs.stand_plan import StandPlan
 from cpunet.outputs import Note, made_here, remove_own, require_replaceable, told_kept
 from cpunet.recipes.schema import Recipe
+from cpunet.regular_files import read_text
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 # in the order they are made; and the file that each has when it is whole
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
@@ -89,7 +91,7 @@ def remove_parts(out: Path, note: Note) -> None:
 def _read_stand(stand: Path) -> dict[str, Any]:
     path = stand / MARKER
     try:
-        made = json.loads(path.read_text(encoding="utf-8"))
+        made = plain_json(read_text(path, MOST_BYTES))
     except OSError as error:
         raise CpunetError(
             f"{stand}: is no stand ({MARKER} cannot be read); give another --out"

@@ -18,10 +18,12 @@ from cpunet.jobs.response import describe_responses
 from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import NetworkBackend, ResponseBackend
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
 from cpunet.translation.translator import IREN, REN, Translator
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 QUIET = Monitor()
 _LANGUAGES = {
@@ -116,7 +118,7 @@ def _write_noise(path: Path, noise: BaselineNoise) -> None:
 def _scores(report: Path) -> Mapping[str, Any]:
     path = report / "metrics.json"
     try:
-        peaks = json.loads(path.read_text(encoding="utf-8"))["peaks"]
+        peaks = plain_json(read_text(path, MOST_BYTES))["peaks"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CpunetError(
             f"{path}: no scores; give the folder that `cpunet validate` made"

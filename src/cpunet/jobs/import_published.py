@@ -18,6 +18,7 @@ from cpunet.files import folder_written_aside
 from cpunet.jobs.monitor import Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.source import MOST_SAMPLES
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import RUN, versions, write_run
@@ -28,6 +29,7 @@ QUIET = Monitor()
 BLOCK = 1024
 TABLE = "geds/raw"
 # What a report says of the training; the pulses are not part of what was published.
+_MOST_NUMBER = 2**62
 UNKNOWN = {"file": "not published with the weights", "used": "an unknown number of"}
 
 
@@ -234,7 +236,7 @@ def _pulse(entry: Any, number: int) -> tuple[dict[str, Any] | None, str]:
     if not isinstance(entry, dict) or "wf" not in entry:
         return None, "no_pulse"
     try:
-        samples = np.asarray(entry["wf"], np.float32)
+        samples = _samples(entry["wf"])
         pulse = {
             "wf": samples,
             "tp0": float(entry.get("tp0", np.nan)),
@@ -243,9 +245,22 @@ def _pulse(entry: Any, number: int) -> tuple[dict[str, Any] | None, str]:
         }
     except (TypeError, ValueError, OverflowError):
         return None, "no_numbers"
-    if samples.ndim != 1 or not len(samples):
+    if abs(int(entry.get("event", number))) > _MOST_NUMBER:
+        return None, "no_numbers"
+    if samples.ndim != 1 or not 0 < len(samples) <= MOST_SAMPLES:
         return None, "no_trace"
     return pulse, ""
+
+
+def _samples(trace: Any) -> npt.NDArray[np.float32]:
+    """A trace as an array; of nested lists, which may refer to each other, there is none."""
+    if isinstance(trace, list | tuple):
+        if len(trace) > MOST_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
+            return np.empty((0, 0), np.float32)
+    elif not isinstance(trace, np.ndarray):
+        raise TypeError
+    with np.errstate(over="ignore"):  # what is beyond single precision is counted later
+        return np.asarray(trace, np.float32)
 
 
 def _columns(

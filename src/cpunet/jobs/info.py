@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,8 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes.schema import PeakConfig
+from cpunet.regular_files import read_text
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 _RUN_FILE = "run.json"
 
@@ -132,7 +133,7 @@ def _run(folder: Path) -> dict[str, Any]:
             f"{folder}: a folder without {_RUN_FILE}; give the folder of a run, or a file"
         )
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = plain_json(read_text(file, MOST_BYTES))
     except (OSError, ValueError) as error:
         raise CpunetError(
             f"{file}: cannot be read ({error}); the run is damaged, train it again"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,9 @@ from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
 from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.regular_files import read_text
 from cpunet.training.run_folder import load_network, read_info, read_recipe
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 QUIET = Monitor()
 MARKER = "response.json"
@@ -147,7 +150,8 @@ def stand_electronics(stand: Path) -> Electronics:
     """
     path = Path(stand) / "stand.json"
     try:
-        return Electronics.model_validate(json.loads(path.read_text("utf-8"))["electronics"])
+        text = read_text(path, MOST_BYTES)
+        return Electronics.model_validate(plain_json(text)["electronics"])
     except OSError as error:
         raise CpunetError(
             f"{stand}: no test stand (stand.json cannot be read); make one with `cpunet stand`"
@@ -209,7 +213,25 @@ def _read_run(path: Path) -> _Learned:
         )
     network = ResponseGenerator(recipe.generator, float(info["dt_ns"]))
     load_network(path, "ren", network)
-    response, preparation = network.response, recipe.preparation
+    try:
+        learned = _described(path, info, recipe.preparation, network)
+    except (ArithmeticError, ValueError, LookupError, RuntimeError) as error:
+        raise CpunetError(
+            f"{path}: its weights make no response of electronics ({error}); train again"
+        ) from error
+    wrong = [name for name, value in learned.parameters.items() if not math.isfinite(value)]
+    if wrong:
+        raise CpunetError(f"{path}: {wrong[0]} of its response is no number; train again")
+    return learned
+
+
+def _described(
+    path: Path,
+    info: Mapping[str, Any],
+    preparation: PreparationConfig,
+    network: ResponseGenerator,
+) -> _Learned:
+    response = network.response
     chain = learned_chain(response, path.name)
     if int(network.n_baselines):
         chain = _with_noise(chain, network, preparation)

@@ -10,8 +10,9 @@ import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
+from cpunet.regular_files import read_text
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import yaml_fields
+from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields
 
 
 def load_settings(
@@ -71,17 +72,17 @@ def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]
             detector.append(word)
             continue
         try:
-            settings[key.strip()] = yaml.safe_load(value)
+            settings[key.strip()] = parsed(value)
         except yaml.YAMLError as error:
-            raise CpunetError(f"settings: {word!r} has no plain value") from error
+            raise CpunetError(f"settings: {shown(word)} has no plain value") from error
     return detector, settings
 
 
 def _mapping(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text"
+        text = read_text(path, MOST_BYTES)
+    except OSError as error:
+        reason = error.strerror or error
         raise CpunetError(f"{path}: cannot be read ({reason}); give a YAML file") from error
     return yaml_fields(
         text,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-import h5py
-
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened
 from cpunet.jobs.inputs import InputFile
 from cpunet.training.run_folder import RECIPE, WEIGHTS
+from cpunet.yaml_files import plain_json
 
 RECORD = "cpunet_translation"  # attribute of the file
 
@@ -99,7 +100,24 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
             told = f"other options ({', '.join(other)})"
         raise CpunetError(f"{out}: was made with {told}; choose another --out or give --force")
     counts = found.get("counts")
-    return dict(counts) if isinstance(counts, dict) else {}
+    if not isinstance(counts, dict) or not all(map(_is_count, _counted(counts))):
+        raise CpunetError(
+            f"{out}: does not say how many pulses it holds; choose another --out or give "
+            "--force"
+        )
+    return dict(counts)
+
+
+def _counted(counts: Mapping[str, Any]) -> list[Any]:
+    """What must be whole numbers among the counts of a translation."""
+    rejections = counts.get("rejections", {})
+    reasons = rejections.values() if isinstance(rejections, dict) else [None]
+    optional = [counts[name] for name in ("saturated",) if name in counts]
+    return [counts.get("read"), counts.get("translated"), *optional, *reasons]
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def stamp(file: Stamped, record: Record) -> None:
@@ -109,9 +127,9 @@ def stamp(file: Stamped, record: Record) -> None:
 
 def _read(out: Path) -> Record:
     try:
-        with h5py.File(out, "r", locking=False) as file:
-            record = json.loads(file.attrs[RECORD])
-    except (OSError, KeyError, ValueError, TypeError):
+        with opened(out) as file:
+            record = plain_json(file.attrs[RECORD])
+    except (CpunetError, LookupError, ValueError, TypeError):
         record = None
     if not isinstance(record, dict):
         raise CpunetError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -12,7 +11,8 @@ from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
-from cpunet.yaml_files import parsed
+from cpunet.regular_files import is_there, read_text
+from cpunet.yaml_files import MOST_BYTES, parsed, shown
 
 
 def recipe_names() -> list[str]:
@@ -45,11 +45,11 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     (40, 16)
     """
     if name in recipe_names():
-        text = (files("cpunet.recipes") / f"{name}.yaml").read_text()
-    elif Path(name).is_file():
+        text = (files("cpunet.recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+    elif is_there(name):
         try:
-            text = Path(name).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+            text = read_text(name, MOST_BYTES)
+        except OSError as error:
             raise CpunetError(f"recipe {name}: cannot be read as text ({error})") from error
     else:
         raise CpunetError(
@@ -58,9 +58,8 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     try:
         settings = parsed(text)
     except yaml.YAMLError as error:
-        raise CpunetError(
-            f"recipe {name}: not YAML ({' '.join(str(error).split())})"
-        ) from error
+        said = " ".join(str(error).split())
+        raise CpunetError(f"recipe {name}: not YAML ({said[:200]})") from error
     for override in overrides:
         _override(settings, override)
     return recipe_from(settings, source=f"recipe {name}")
@@ -92,14 +91,16 @@ def _keys(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
 def _override(settings: Any, override: str) -> None:
     key, equals, value = override.partition("=")
     if not equals:
-        raise CpunetError(f"--set {override}: expected KEY=VALUE, as in training.batch_size=16")
+        raise CpunetError(
+            f"--set {shown(override)}: expected KEY=VALUE, as in training.batch_size=16"
+        )
     *parents, last = key.split(".")
     node = settings
     for parent in parents:
         node = node.get(parent) if isinstance(node, dict) else None
     if not isinstance(node, dict) or last not in node:
-        raise CpunetError(f"--set {override}: the recipe has no {key}")
+        raise CpunetError(f"--set {shown(override)}: the recipe has no {shown(key)[1:-1]}")
     try:
-        node[last] = yaml.safe_load(value)
+        node[last] = parsed(value)
     except yaml.YAMLError as error:
-        raise CpunetError(f"--set {override}: {value!r} is not YAML") from error
+        raise CpunetError(f"--set {shown(override)}: {shown(value)} is not YAML") from error

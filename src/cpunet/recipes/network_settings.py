@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
+from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
 
 class PunetConfig(Config):
@@ -17,7 +17,7 @@ class PunetConfig(Config):
     """
 
     name: Literal["punet"]
-    width: Annotated[int, Field(ge=2, multiple_of=2)]
+    width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
     dropout: Fraction
     residual: bool
 
@@ -33,9 +33,9 @@ class ResponseConfig(Config):
 
     name: Literal["response"]
     poles_ns: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=4)]
-    slow_ns: tuple[Positive, ...]
+    slow_ns: Annotated[tuple[Positive, ...], Field(max_length=100)]
     decay_us: Positive
-    fast_decays_us: tuple[Positive, ...]
+    fast_decays_us: Annotated[tuple[Positive, ...], Field(max_length=100)]
     ringing_mhz: Positive | None
     ringing_ns: Positive
 
@@ -52,12 +52,12 @@ class ResidualConfig(Config):
     these must fall by the fraction ``least_fall``, and by more than chance.
     """
 
-    width: Annotated[int, Field(ge=2, multiple_of=2)]
+    width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
     iterations: Count
-    batch_size: Annotated[int, Field(ge=16)]
+    batch_size: Annotated[int, Field(ge=16, le=100_000)]
     rate: Positive
     average_decay: Fraction
-    projections: Count
+    projections: Annotated[int, Field(ge=1, le=10_000)]
     amplitude_weight: NonNegative
     size_weight: NonNegative
     slope_weight: NonNegative
@@ -82,10 +82,10 @@ class GruConfig(Config):
     """
 
     name: Literal["gru"]
-    embedding_rows: Annotated[int, Field(ge=2)]
-    embedding_dim: Count
-    hidden: Count
-    samples_per_step: Count
+    embedding_rows: Annotated[int, Field(ge=2, le=100_000)]
+    embedding_dim: Width
+    hidden: Width
+    samples_per_step: Samples
     value_range: tuple[float, float] | None
 
     @model_validator(mode="after")
@@ -104,9 +104,9 @@ class ConvConfig(Config):
     """
 
     name: Literal["conv"]
-    width: Count
+    width: Width
     layers: Annotated[int, Field(ge=1, le=9)]
-    kernel: Annotated[int, Field(ge=3)]
+    kernel: Annotated[int, Field(ge=3, le=1025)]
     current_gain: Positive
 
     @model_validator(mode="after")

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, model_validator
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.base import Config, Count, Positive
+from cpunet.recipes.base import Config, Positive, Samples
 from cpunet.recipes.network_settings import (
     ConvConfig,
     GruConfig,
@@ -40,16 +40,16 @@ class PreparationConfig(Config):
     them.  ``saturation_run`` equal samples at the top make a trace saturated.
     """
 
-    samples_before: Count
-    samples_after: Count
+    samples_before: Samples
+    samples_after: Samples
     align_fraction: Annotated[float, Field(gt=0, le=1)]
-    baseline_samples: Count
-    tail_samples: Count
+    baseline_samples: Samples
+    tail_samples: Samples
     tail_level: Positive
-    decay_fit_samples: Annotated[int, Field(ge=3)]
-    max_padding_before: Annotated[int, Field(ge=0)]
-    max_padding_after: Annotated[int, Field(ge=0)]
-    saturation_run: Count
+    decay_fit_samples: Annotated[int, Field(ge=3, le=100_000)]
+    max_padding_before: Annotated[int, Field(ge=0, le=100_000)]
+    max_padding_after: Annotated[int, Field(ge=0, le=100_000)]
+    saturation_run: Samples
 
     @property
     def length(self) -> int:
@@ -85,10 +85,10 @@ class ScoreConfig(Config):
     the survival of an A/E cut is told for them too.
     """
 
-    max_bins: Annotated[int, Field(ge=2)]
-    bootstraps: Annotated[int, Field(ge=2)]
+    max_bins: Annotated[int, Field(ge=2, le=100_000)]
+    bootstraps: Annotated[int, Field(ge=2, le=100_000)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
-    edge_samples: Count
+    edge_samples: Samples
     sideband_kev: tuple[Positive, Positive]
     continuum_kev: dict[str, tuple[Positive, Positive]]
 
@@ -145,7 +145,7 @@ class Recipe(Config):
 
     name: str
     description: str
-    peaks: dict[str, PeakConfig]
+    peaks: Annotated[dict[str, PeakConfig], Field(min_length=1, max_length=1000)]
     preparation: PreparationConfig
     cuts: CutConfig
     generator: Annotated[

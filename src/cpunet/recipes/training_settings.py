@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive
+from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples
+
+_Number = Annotated[int, Field(ge=1, le=1000)]
 
 
 class LossConfig(Config):
@@ -18,9 +20,9 @@ class LossConfig(Config):
     generators off.
     """
 
-    baseline_len: Count
-    rising_edge_len: Count
-    tail_len: Count
+    baseline_len: Samples
+    rising_edge_len: Samples
+    tail_len: Samples
     baseline_weight: NonNegative
     rising_edge_weight: NonNegative
     tail_weight: NonNegative
@@ -46,8 +48,8 @@ class TrainingConfig(Config):
 
     method: Literal["cyclegan"]
     iterations: Count
-    decay_start: Annotated[int, Field(ge=0)]
-    batch_size: Annotated[int, Field(ge=2)]
+    decay_start: Annotated[int, Field(ge=0, le=100_000_000)]
+    batch_size: Annotated[int, Field(ge=2, le=100_000)]
     rate_generators: Positive
     rate_discriminators: Positive
     betas: tuple[Fraction, Fraction]
@@ -84,23 +86,23 @@ class MatchingConfig(Config):
     """
 
     method: Literal["matching"]
-    before: Count
-    after: Count
-    baseline: tuple[Count, Count]
-    level_samples: Count
-    segments: tuple[int, ...]
-    components: Count
-    squares: Count
-    amplitude_bins: Count
+    before: Samples
+    after: Samples
+    baseline: tuple[Samples, Samples]
+    level_samples: Samples
+    segments: Annotated[tuple[int, ...], Field(max_length=1000)]
+    components: _Number
+    squares: _Number
+    amplitude_bins: _Number
     amplitude_width: Positive
     clip: Positive
     ridge: Fraction
-    search_pulses: Annotated[int, Field(ge=200)]
-    conditional_bins: Annotated[int, Field(ge=2)]
+    search_pulses: Annotated[int, Field(ge=200, le=10_000_000)]
+    conditional_bins: Annotated[int, Field(ge=2, le=1000)]
     steps: Count
-    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    ringing_mhz: tuple[Positive, ...]
-    noise_sets: Count
+    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]
+    noise_sets: _Number
 
     @property
     def iterations(self) -> int:

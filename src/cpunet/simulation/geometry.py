@@ -16,12 +16,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from cpunet.recipes.base import Config, NonNegative, Positive
+from cpunet.recipes.base import Config, Millimetres
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 RegionArray = npt.NDArray[np.int8]
 Angle = Annotated[float, Field(ge=0, lt=90)]
+_Size = Annotated[float, Field(gt=0, le=1000)]  # mm
+_Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either way
+_Density = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
 
@@ -51,39 +54,39 @@ class Detector(Config):
     """
 
     name: str = ""
-    crystal_length: Positive
-    crystal_radius: Positive
-    top_bullet_radius: NonNegative = 0.0
-    bottom_bullet_radius: NonNegative = 0.0
-    point_contact_length: NonNegative
-    point_contact_radius: Positive
-    wrap_around_radius: NonNegative = 0.0
-    ditch_depth: NonNegative = 0.0
-    ditch_thickness: NonNegative = 0.0
-    bore_length: NonNegative = 0.0
-    bore_radius: NonNegative = 0.0
-    bore_bullet_radius: NonNegative = 0.0
-    outer_taper_length: NonNegative = 0.0
-    inner_taper_length: NonNegative = 0.0
-    bottom_taper_length: NonNegative = 0.0
+    crystal_length: _Size
+    crystal_radius: _Size
+    top_bullet_radius: Millimetres = 0.0
+    bottom_bullet_radius: Millimetres = 0.0
+    point_contact_length: Millimetres
+    point_contact_radius: _Size
+    wrap_around_radius: Millimetres = 0.0
+    ditch_depth: Millimetres = 0.0
+    ditch_thickness: Millimetres = 0.0
+    bore_length: Millimetres = 0.0
+    bore_radius: Millimetres = 0.0
+    bore_bullet_radius: Millimetres = 0.0
+    outer_taper_length: Millimetres = 0.0
+    inner_taper_length: Millimetres = 0.0
+    bottom_taper_length: Millimetres = 0.0
     taper_angle_deg: Angle = 0.0
     inner_taper_angle_deg: Angle | None = None
     bottom_taper_angle_deg: Angle = 45.0
-    li_thickness: NonNegative
-    vacuum_gap: NonNegative = 0.0
-    impurity_z0_1e10_per_cm3: float
-    impurity_gradient_1e10_per_cm4: float = 0.0
-    impurity_quadratic_1e10_per_cm3: float = 0.0
-    impurity_exponential_1e10_per_cm3: float = 0.0
-    impurity_exponential_length_mm: float = 0.0
-    impurity_radial_add_1e10_per_cm3: float = 0.0
-    impurity_radial_mult: NonNegative = 1.0
-    impurity_radial_power: Positive = 2.0
-    impurity_scale: Positive = 1.0
+    li_thickness: Millimetres
+    vacuum_gap: Millimetres = 0.0
+    impurity_z0_1e10_per_cm3: _Density
+    impurity_gradient_1e10_per_cm4: _Density = 0.0
+    impurity_quadratic_1e10_per_cm3: _Density = 0.0
+    impurity_exponential_1e10_per_cm3: _Density = 0.0
+    impurity_exponential_length_mm: _Length = 0.0
+    impurity_radial_add_1e10_per_cm3: _Density = 0.0
+    impurity_radial_mult: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    impurity_radial_power: Annotated[float, Field(gt=0, le=100)] = 2.0
+    impurity_scale: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     impurity_tilt_1e10_per_cm4: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    surface_charge_1e10_per_cm2: float = 0.0
-    bias_V: Positive
-    measured_depletion_V: NonNegative = 0.0
+    surface_charge_1e10_per_cm2: _Density = 0.0
+    bias_V: Annotated[float, Field(gt=0, le=20_000)]
+    measured_depletion_V: Annotated[float, Field(ge=0, le=20_000)] = 0.0
     temperature_K: Annotated[float, Field(ge=40, le=120)]
     grid_mm: Annotated[float, Field(ge=0.02, le=1)] = 0.1
     siggen_conventions: bool = True

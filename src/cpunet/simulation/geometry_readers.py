@@ -11,12 +11,13 @@ import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
+from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_crystal import impurity_values
 from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
-from cpunet.yaml_files import yaml_fields, yaml_names
+from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
@@ -76,11 +77,13 @@ def read_detector(
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
-            raise CpunetError(f"detector {name}: {override!r} is no KEY=VALUE")
+            raise CpunetError(f"detector {name}: {shown(override)} is no KEY=VALUE")
         try:
-            values[key.strip()] = yaml.safe_load(value)
+            values[key.strip()] = parsed(value)
         except yaml.YAMLError as error:
-            raise CpunetError(f"detector {name}: {override!r} has no plain value") from error
+            raise CpunetError(
+                f"detector {name}: {shown(override)} has no plain value"
+            ) from error
     try:
         return Detector.model_validate({"name": Path(name).stem, **values})
     except ValidationError as error:
@@ -89,13 +92,13 @@ def read_detector(
 
 def _from_file(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MOST_BYTES)
     except FileNotFoundError as error:
         raise CpunetError(
             f"detector {path}: neither a file nor one of {', '.join(detector_names())}"
         ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise CpunetError(f"detector {path}: cannot be read as text ({error})") from error
+    except OSError as error:
+        raise CpunetError(f"detector {path}: cannot be read ({error.strerror})") from error
     if path.suffix.lower() not in _MAPPINGS:
         return siggen_values(text, str(path))
     return _mapping(text, f"detector {path}")
@@ -118,9 +121,9 @@ def _legend(
     if found is None:
         return values, hints
     try:
-        text = found.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CpunetError(f"crystal {found}: cannot be read as text ({error})") from error
+        text = read_text(found, MOST_BYTES)
+    except OSError as error:
+        raise CpunetError(f"crystal {found}: cannot be read ({error.strerror})") from error
     content = _mapping(text, f"crystal {found}")
     hints[_Z0] = f"production.impcc is empty or 0, and {found} has no impurity_curve"
     if content.get("impurity_curve") is None and crystal is None:
@@ -152,8 +155,8 @@ def _first_problem(error: ValidationError, hints: _Hints) -> str:
     if first["type"] == "missing":
         return f"no {key}; add it to the file, or give {key}=VALUE"
     if first["type"] == "extra_forbidden":
-        return f"unknown key {key}; known are {', '.join(Detector.model_fields)}"
+        return f"unknown key {shown(key)[1:-1]}; known are {', '.join(Detector.model_fields)}"
     message = first["msg"].removeprefix("Value error, ")
     if not key:
         return f"{message}; correct these values"
-    return f"{key} = {first['input']!r}: {message[0].lower()}{message[1:]}"
+    return f"{key} = {shown(first['input'])}: {message[0].lower()}{message[1:]}"

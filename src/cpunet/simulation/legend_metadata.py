@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.yaml_files import shown
 
 # where a diode says it: the detector's field
 _GEOMETRY = {
@@ -85,9 +86,9 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     """
     kind = diode.get("type")
     if kind is not None and kind not in _SIMULATED:
-        why = f" ({_NOT_SIMULATED[kind]})" if kind in _NOT_SIMULATED else ""
+        why = f" ({_NOT_SIMULATED[kind]})" if str(kind) in _NOT_SIMULATED else ""
         raise CpunetError(
-            f"detector {name}: type {kind!r} is not simulated{why}; give one of type "
+            f"detector {name}: type {shown(kind)} is not simulated{why}; give one of type "
             f"{', '.join(_SIMULATED)}"
         )
     geometry = _flat(diode["geometry"], name)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.recipes.base import Config, Positive
+from cpunet.recipes.base import Config
 from cpunet.simulation.velocity import VelocityFactors
 
-_Factor = Annotated[float, Field(ge=0.2, le=5, allow_inf_nan=False)]
-_PerUs = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+_Factor = Annotated[float, Field(ge=0.2, le=5)]
+_Nanoseconds = Annotated[float, Field(ge=0.01, le=1e6)]
+_Diffusion = Annotated[float, Field(gt=0, le=1000)]
+_MOST_STEPS = 2_000_000
+_PerUs = Annotated[float, Field(ge=0, le=100)]
 
 
 class SimulationSettings(Config):
@@ -62,25 +64,27 @@ class SimulationSettings(Config):
         miss it, hits are drifted.
     """
 
-    step_ns: Positive = 1.0
+    switches = ("self_repulsion",)
+
+    step_ns: _Nanoseconds = 1.0
     stride: Annotated[int, Field(ge=1, le=16)] = 1
-    dt_ns: Positive = 16.0
-    length_ns: Positive = 3600.0
+    dt_ns: _Nanoseconds = 16.0
+    length_ns: Annotated[float, Field(gt=0, le=1e7)] = 3600.0
     diffusion: bool = True
-    diffusion_constant: Positive | Literal["temperature", "siggen"] = 0.12
+    diffusion_constant: _Diffusion | Literal["temperature", "siggen"] = 0.12
     cloud_fwhm_mm: Annotated[float, Field(ge=0, le=20)] = 0.1
-    self_repulsion: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    self_repulsion: Annotated[float, Field(ge=0, le=100)] = 0.0
     electron_velocity_low_factor: _Factor = 1.0
     electron_velocity_high_factor: _Factor = 1.0
     hole_velocity_low_factor: _Factor = 1.0
     hole_velocity_high_factor: _Factor = 1.0
     electron_trapping_per_us: _PerUs = 0.0
     hole_trapping_per_us: _PerUs = 0.0
-    library_grid_mm: Positive = 2.0
+    library_grid_mm: Annotated[float, Field(ge=0.1, le=100)] = 2.0
     library_halvings: Annotated[int, Field(ge=0, le=6)] = 4
-    library_angles: Annotated[int, Field(ge=2)] = 6
-    library_step_ns: Positive = 4.0
-    library_tolerance: Positive = 0.005
+    library_angles: Annotated[int, Field(ge=2, le=181)] = 6
+    library_step_ns: _Nanoseconds = 4.0
+    library_tolerance: Annotated[float, Field(gt=0, le=1)] = 0.005
 
     @property
     def n_steps(self) -> int:
@@ -114,11 +118,13 @@ class SimulationSettings(Config):
     @classmethod
     def _known_diffusion(cls, value: Any) -> Any:
         try:
-            known = value in ("temperature", "siggen") or 0 < float(value) < math.inf
-        except (TypeError, ValueError):
+            known = value in ("temperature", "siggen") or 0 < float(value) <= 1000
+        except (TypeError, ValueError, OverflowError):
             known = False
         if not known or isinstance(value, bool):
-            raise ValueError("give a number above 0 in V mm/cm, temperature or siggen")
+            raise ValueError(
+                "give a number above 0 (to 1000) in V mm/cm, temperature or siggen"
+            )
         return value
 
     @model_validator(mode="after")
@@ -128,4 +134,9 @@ class SimulationSettings(Config):
             raise ValueError(f"dt_ns must be a multiple of {self.step_ns} ns")
         if self.length_ns < self.dt_ns:
             raise ValueError("length_ns must be at least dt_ns")
+        if self.n_steps > _MOST_STEPS:
+            raise ValueError(
+                f"length_ns has {self.n_steps} steps of step_ns; at most {_MOST_STEPS} are "
+                "held at once"
+            )
         return self

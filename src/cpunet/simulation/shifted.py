@@ -12,9 +12,10 @@ from pydantic import Field, ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.recipes.base import Config
+from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import yaml_fields
+from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -49,6 +50,8 @@ hole_velocity_low_factor, hole_velocity_high_factor
     0.95
     """
 
+    switches = ("self_repulsion",)
+
     temperature_K: Number = 0.0
     bias_V: Number = 0.0
     impurity_factor: Factor = 1.0
@@ -67,7 +70,9 @@ hole_velocity_low_factor, hole_velocity_high_factor
     @classmethod
     def default(cls) -> Shift:
         """The shift of the package."""
-        text = (files("cpunet.simulation") / "shifted_detector.yaml").read_text()
+        text = (files("cpunet.simulation") / "shifted_detector.yaml").read_text(
+            encoding="utf-8"
+        )
         return cls.model_validate(yaml.safe_load(text))
 
     @classmethod
@@ -91,9 +96,9 @@ hole_velocity_low_factor, hole_velocity_high_factor
                 values |= _file_values(Path(part))
                 continue
             try:
-                values[key.strip()] = yaml.safe_load(value)
+                values[key.strip()] = parsed(value)
             except yaml.YAMLError as error:
-                raise CpunetError(f"shift: {part!r} has no plain value") from error
+                raise CpunetError(f"shift: {shown(part)} has no plain value") from error
         try:
             return cls.model_validate(values)
         except ValidationError as error:
@@ -147,8 +152,8 @@ hole_velocity_low_factor, hole_velocity_high_factor
 
 def _file_values(path: Path) -> Mapping[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(path, MOST_BYTES)
+    except OSError as error:
         raise CpunetError(
             f"shift {path}: cannot be read; give KEY=VALUE or a YAML file"
         ) from error
@@ -168,4 +173,4 @@ def _problem(error: ValidationError, kind: type[Config]) -> str:
     if first["type"] == "extra_forbidden":
         return f"no such key {key}; there are {', '.join(kind.model_fields)}"
     message = first["msg"].removeprefix("Value error, ")
-    return f"{key} = {first['input']!r}: {message}" if key else message
+    return f"{key} = {shown(first['input'])}: {message}" if key else message

@@ -21,6 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from cpunet.errors import CpunetError
+from cpunet.regular_files import require_file
 from cpunet.training.loop import State
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
@@ -97,7 +98,7 @@ def read_checkpoints(folder: Path) -> Iterator[Checkpoint | None]:
 
 def _read(path: Path) -> Checkpoint | None:
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(require_file(path), "pt") as file:
             metadata = file.metadata()
             # copies: what an optimiser goes on with must not be a view of the file
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
@@ -106,14 +107,15 @@ def _read(path: Path) -> Checkpoint | None:
             return None
         content = json.loads(text)
         made_by = content["format"]
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError):
-        return None
+        state, facts = _joined(content["state"], tensors), content["facts"]
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError):
+        return None  # RecursionError is a RuntimeError
     if made_by != FORMAT:
         raise CpunetError(
             f"{path}: written by another version of cpunet; go on with that one, or begin "
             "again with --force"
         )
-    return Checkpoint(_joined(content["state"], tensors), content["facts"])
+    return Checkpoint(state, facts)
 
 
 def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -34,8 +34,10 @@ from cpunet.outputs import (
     require_replaceable,
     told_kept,
 )
+from cpunet.regular_files import read_text
 from cpunet.training.run_folder import INFO, RUN
 from cpunet.training.unfinished import UNFINISHED
+from cpunet.yaml_files import MOST_BYTES, plain_json
 
 ENSEMBLE = "ensemble.json"
 _LOCK = ".lock"
@@ -150,10 +152,10 @@ def read_json(path: Path) -> dict[str, Any] | None:
         If it cannot be read or is no mapping.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = plain_json(read_text(path, MOST_BYTES))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise CpunetError(f"{path}: cannot be read ({reason}); remove it") from error
     if not isinstance(content, dict):

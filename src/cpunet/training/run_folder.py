@@ -31,7 +31,10 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind
 from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe
+from cpunet.regular_files import read_text, require_file
 from cpunet.training.loop import Record
+from cpunet.training.run_schema import FORMAT, problem
+from cpunet.yaml_files import MOST_BYTES, parsed, plain_json
 
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
 RUN = FolderKind(
@@ -63,9 +66,10 @@ def write_run(folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, An
     }
     (folder / WEIGHTS).write_bytes(save(weights))
     (folder / RECIPE).write_text(
-        yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False)
+        yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False), encoding="utf-8"
     )
-    (folder / INFO).write_text(json.dumps(info, indent=2) + "\n")
+    content = {"format": FORMAT} | info
+    (folder / INFO).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def read_info(run: Path) -> dict[str, Any]:
@@ -74,11 +78,11 @@ def read_info(run: Path) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If the folder is no finished run.
+        If the folder is no finished run, or of a newer version.
     """
     path = Path(run) / INFO
     try:
-        info = json.loads(path.read_text())
+        info = plain_json(read_text(path, MOST_BYTES))
     except OSError as error:
         raise CpunetError(
             f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
@@ -87,8 +91,8 @@ def read_info(run: Path) -> dict[str, Any]:
         raise CpunetError(f"{path}: damaged ({error}); train again") from error
     if not isinstance(info, dict):
         raise CpunetError(f"{path}: damaged (no mapping); train again")
-    if missing := {"dt_ns", "peak", "recipe", "seconds", "device", "seed"} - info.keys():
-        raise CpunetError(f"{path}: damaged (no {min(missing)}); train again")
+    if wrong := problem(info):
+        raise CpunetError(f"{path}: damaged ({wrong}); train again")
     return info
 
 
@@ -96,10 +100,10 @@ def read_recipe(run: Path) -> Recipe:
     """Return the resolved recipe of a run."""
     path = Path(run) / RECIPE
     try:
-        return recipe_from(yaml.safe_load(path.read_text()), source=str(path))
+        return recipe_from(parsed(read_text(path, MOST_BYTES)), source=str(path))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except yaml.YAMLError as error:
         raise CpunetError(f"{path}: damaged; train again") from error
 
 
@@ -109,9 +113,23 @@ def read_losses(run: Path) -> list[Record]:
     if not path.is_file():
         return []
     try:
-        return [json.loads(line) for line in path.read_text().splitlines()]
+        lines = require_file(path).read_text(encoding="utf-8").splitlines()
+        records = [plain_json(line) for line in lines]
+        if not all(map(_is_record, records)):
+            raise ValueError("a line holds no losses")
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
+    return records
+
+
+def _is_record(record: Any) -> bool:
+    """Whether a line of the log is an iteration, its rate and its losses."""
+    if not isinstance(record, dict) or not isinstance(record.get("losses"), dict):
+        return False
+    numbers = [record.get("iteration"), record.get("rate", 0.0), *record["losses"].values()]
+    return all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers)
 
 
 def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") -> nn.Module:
@@ -135,6 +153,7 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
         raise CpunetError(
             f"{path}: weights of another network: {len(wrong)} tensors differ, first {wrong[0]}"
         )
+    _require_weights(path, name, own)
     network.load_state_dict(own)
     return network.to(torch.device(device)).eval()
 
@@ -170,10 +189,20 @@ def weights_sha256(run: Path) -> str:
         raise CpunetError(f"{path}: no readable weights; train again") from error
 
 
+def _require_weights(path: Path, name: str, weights: dict[str, Tensor]) -> None:
+    """Raise a `CpunetError` if there is no number, or nothing but zeros, among weights."""
+    floating = {key: w for key, w in weights.items() if w.is_floating_point()}
+    for key, values in floating.items():
+        if not bool(torch.isfinite(values).all()):
+            raise CpunetError(f"{path}: {name}.{key} is not finite; train again")
+    if floating and not any(bool(values.any()) for values in floating.values()):
+        raise CpunetError(f"{path}: all weights of {name} are zero; train again")
+
+
 def _weights_of(run: Path, device: str) -> dict[str, Tensor]:
     path = Path(run) / WEIGHTS
     try:
-        weights: dict[str, Tensor] = load_file(path, device=device)
-    except (OSError, SafetensorError) as error:
+        weights: dict[str, Tensor] = load_file(require_file(path), device=device)
+    except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise CpunetError(f"{path}: no readable weights; train again") from error
     return weights

@@ -238,7 +238,7 @@ class UnfinishedRun:
     def _latest(self) -> Checkpoint | None:
         damaged = 0
         for checkpoint in read_checkpoints(self.folder):
-            if checkpoint is None or checkpoint.facts["log_bytes"] > self._log.length:
+            if checkpoint is None or not _fits(checkpoint, self._log.length):
                 damaged += 1
                 continue
             if damaged:
@@ -262,6 +262,20 @@ class UnfinishedRun:
         self.resumed_at = [*facts["resumed_at"], iteration]
         self._log.cut(facts["log_bytes"])
         self._note(f"going on after {iteration} iterations")
+
+
+def _fits(checkpoint: Checkpoint, log_bytes: int) -> bool:
+    """Whether a checkpoint tells all that is needed to go on, and of no longer a log."""
+    facts: Any = checkpoint.facts
+    known: dict[str, Any] = {"fingerprint": dict, "environment": dict, "started": str}
+    known |= {"seconds": int | float, "resumed_at": list, "log_bytes": int}
+    return (
+        isinstance(facts, dict)
+        and all(isinstance(facts.get(name), kind) for name, kind in known.items())
+        and 0 <= facts["log_bytes"] <= log_bytes
+        and isinstance(checkpoint.state, dict)
+        and isinstance(checkpoint.state.get("iteration"), int)
+    )
 
 
 class LossLog:

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.yaml_files import yaml_fields, yaml_names
+from cpunet.regular_files import read_text
+from cpunet.yaml_files import MOST_BYTES, shown, yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.electronics.presets")
 
@@ -63,14 +64,15 @@ def read_electronics(path: str | Path) -> Electronics:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path, MOST_BYTES)
     except FileNotFoundError as error:
         raise CpunetError(
             f"electronics {path}: neither a file nor one of {', '.join(electronics_names())}"
         ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text"
-        raise CpunetError(f"electronics {path}: cannot be read ({reason})") from error
+    except OSError as error:
+        raise CpunetError(
+            f"electronics {path}: cannot be read ({error.strerror or error})"
+        ) from error
 
 
 def _first_problem(error: ValidationError) -> str:
@@ -83,4 +85,4 @@ def _first_problem(error: ValidationError) -> str:
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "value_error":
         return f"{key}: {message}" if key else message
-    return f"{key} = {first['input']!r}: {message[0].lower()}{message[1:]}; correct it"
+    return f"{key} = {shown(first['input'])}: {message[0].lower()}{message[1:]}; correct it"

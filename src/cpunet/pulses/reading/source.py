@@ -183,7 +183,8 @@ class PulseSource(ABC):
         }
 
     def _pulses(self, start: int, traces: Traces) -> Pulses:
-        waveforms = np.asarray(traces.waveforms, np.float32)
+        with np.errstate(over="ignore"):  # a sample beyond single precision is infinite
+            waveforms = np.asarray(traces.waveforms, np.float32)
         stop = start + len(waveforms)
         numbers = traces.event_number
         if self._number_column is not None:
