@@ -42,9 +42,26 @@ def test_the_folder_is_read_and_prepared(made: Path):
     made_by = json.loads((made / "stand.json").read_text())
     assert made_by["shift"]["temperature_K"] == 2
     assert made_by["data"]["detector"]["temperature_K"] == 92
-    flags = np.load(made / "data_labels.npz")
+    with np.load(made / "data_labels.npz") as stored:
+        flags = dict(stored)
     assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
     assert set(flags["label"]) <= {0, 2, 3}
+    left = flags["remains_kev"] > 1
+    assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
+    assert 0.1 < left.mean() < 0.6
+    assert set(flags) == {"label", "flag", "remains_kev", "n_piled", "piled_kev", "piled_ns"}
+
+
+def test_rates_are_options_and_are_told(command, tmp_path: Path):
+    rates = ("--rate-khz", 0, "--pile-up-khz", 40, "--hum", "50=2")
+    words = ("stand", "--preset", "ornl", "--events", "DEP=40", *rates)
+    assert command(*words, "--out", tmp_path / "stand").code == 0
+    electronics = json.loads((tmp_path / "stand" / "stand.json").read_text())["electronics"]
+    assert electronics["earlier_pulses"] == {"rate_kHz": 0}
+    assert electronics["hum"] == {"frequency_Hz": 50, "amplitude_kev": 2}
+    with np.load(tmp_path / "stand" / "data_labels.npz") as known:
+        assert (known["remains_kev"] == 0).all()
+        assert 0.3 < (known["flag"] & 2 > 0).mean() < 0.9
 
 
 def test_it_is_replaced_with_force_only(command, made: Path):
@@ -58,6 +75,7 @@ def test_it_is_replaced_with_force_only(command, made: Path):
     ("words", "said"),
     [
         (("--preset", "ornl", "--events", "FEP=0"), "FEP=0: give at least 1 event"),
+        (("--preset", "ornl", "--hum", "50"), "--hum 50: expected HZ=KEV"),
         (("--preset", "ornl", "--events", "FEP"), "expected FEP=N"),
         (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
         (("--preset", "orln"), "legend200, ornl, ringing"),

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.chain import Electronics, NoiseSpectrum
+from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum
 from cpunet.electronics.noise import coloured_noise, cut_noise, noise_power, read_baselines
+from cpunet.electronics.other_pulses import draw_other_pulses
 from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.readout import RawTraces, read_out
+from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 
 N = 300
+QUIET = read_electronics("ornl").noise.spectrum
 
 
 def changed(name: str = "legend200", **values: object) -> Electronics:
@@ -74,8 +77,8 @@ def test_noise_cut_from_baselines_is_theirs(tmp_path):
 def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
     quiet = changed(
         noise={"rms_kev": 0.0, "spectrum": read_electronics("ornl").noise.spectrum},
-        earlier_pulses={"fraction": 0.0, "largest_kev": 1, "longest_us": 1},
-        pile_up={"rate_kHz": 0.0, "largest_kev": 1},
+        earlier_pulses={"rate_kHz": 0.0},
+        pile_up={"rate_kHz": 0.0},
     )
     traces = read_out(pulses, quiet, seed=3)
     height = quiet.gain_adc_per_kev * traces.true_energy_kev[:, None]
@@ -94,11 +97,58 @@ def test_noisy_traces_scatter_about_theirs_by_the_noise(traces: RawTraces):
 
 
 def test_shares_of_disturbed_traces(traces: RawTraces):
-    assert np.mean(traces.flags & 1 > 0) == pytest.approx(0.33, abs=0.1)
-    often = changed("ornl", pile_up={"rate_kHz": 36.1, "largest_kev": 1000})
+    law = RemainsLaw(1.5, 54.6, read_electronics("ornl").other_pulses_kev)
+    assert np.mean(traces.flags & 1 > 0) == pytest.approx(law.share_above(0.98), abs=0.09)
+    often = changed("ornl", pile_up={"rate_kHz": 36.1})
     steps = Pulses.of(np.ones((N, 900)), dt_ns=4, energy_kev=np.full(N, 1000.0))
     piled = np.mean(read_out(steps, often, seed=1).flags & 2 > 0)
     assert piled == pytest.approx(0.5, abs=0.1)  # 1 - exp(-36.1 kHz x 19.2 us)
+
+
+def test_remains_follow_the_law_and_all_decays_of_the_chain():
+    chain = changed("ornl", length=1200).disturbed(rate_khz=3, pile_up_khz=0)
+    steps = Pulses.of(np.ones((4000, 10)), dt_ns=4, energy_kev=np.full(4000, 1000.0))
+    other = draw_other_pulses(steps, chain, np.random.default_rng(1))
+    law = RemainsLaw(3, 54.6, chain.other_pulses_kev)
+    above = [5, 20, 100, 500]
+    found = [(other.remains_kev > kev).mean() for kev in above]
+    # several remains add up, and a twentieth of each charge decays early
+    assert found == pytest.approx(law.share_above(above), rel=0.12, abs=0.01)
+    assert other.remains_kev.mean() == pytest.approx(0.953 * law.mean_kev, rel=0.1)
+    old = other.added_kev[other.remains_kev > 100]
+    ratio = np.median(old[:, 1000] / old[:, 0])
+    assert ratio == pytest.approx(np.exp(-16 / 54.6), rel=0.01)
+    assert (old[:, 1000] / old[:, 0]).min() < 0.97 * ratio  # of pulses a few us before
+
+
+def test_second_pulses_are_where_the_truth_says():
+    chain = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 30)
+    steps = Pulses.of(np.ones((200, 900)), dt_ns=4, energy_kev=np.full(200, 1000.0))
+    traces = read_out(steps, chain, seed=2)
+    alone = np.flatnonzero((traces.n_piled == 1) & (traces.piled_ns > 1000))
+    assert len(alone) > 10
+    adc = chain.gain_adc_per_kev
+    own = adc * traces.true_energy_kev[:, None] * traces.response
+    rest = (traces.waveforms - traces.baseline_adc[:, None] - own)[alone] / adc
+    begun = np.array([np.argmax(row > 0.3 * row.max()) for row in rest]) - chain.n_pre
+    assert begun * chain.dt_ns == pytest.approx(traces.piled_ns[alone], abs=150)
+    assert rest.max(axis=1) == pytest.approx(traces.piled_kev[alone], rel=0.03)
+    assert np.isnan(traces.piled_kev[traces.n_piled == 0]).all()
+
+
+def test_hum_is_a_wave_of_its_size():
+    chain = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(
+        0, 0, Hum(frequency_Hz=50, amplitude_kev=30)
+    )
+    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
+    traces = read_out(steps, chain, seed=2)
+    level = traces.waveforms[:, :400].mean(axis=1) - traces.baseline_adc
+    assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
+
+
+def test_quantiles_of_energies_that_fall_are_refused():
+    with pytest.raises(ValueError, match="must not fall"):
+        changed("ornl", other_pulses_kev=[100, 50])
 
 
 def test_saturation_is_flagged_and_clipped(pulses: Pulses):

@@ -15,6 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
+    from cpunet.electronics.chain import Hum
     from cpunet.jobs.stand import StandSummary
 
 
@@ -59,6 +60,19 @@ SetValues = Annotated[
 SettingsFile = Annotated[
     Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
 ]
+RateKhz = Annotated[
+    float | None,
+    typer.Option(
+        "--rate-khz", min=0, help="Pulses per ms before a record; their tails are under it."
+    ),
+]
+PileUpKhz = Annotated[
+    float | None,
+    typer.Option("--pile-up-khz", min=0, help="Pulses per ms within a record besides its own."),
+]
+HumOption = Annotated[
+    str | None, typer.Option("--hum", help="Wave of the mains: HZ=KEV, such as 50=2.")
+]
 WindowKev = Annotated[
     float,
     typer.Option(help="Half-width about a peak.", callback=options.within(-1e4, 1e4)),
@@ -75,6 +89,9 @@ def stand(
     set_values: SetValues = None,
     settings_file: SettingsFile = None,
     crystal: options.Crystal = None,
+    rate_khz: RateKhz = None,
+    pile_up_khz: PileUpKhz = None,
+    hum: HumOption = None,
     window_kev: WindowKev = 0.5,
     seed: options.Seed = 0,
     force: options.Force = False,
@@ -82,6 +99,8 @@ def stand(
     """Make a test stand: simulated pulses, raw traces of other events, and the truth.
 
     Example: cpunet stand --preset legend200 --out stand
+
+    Example: cpunet stand --preset ornl --rate-khz 3 --out busy
 
     Example: cpunet stand --preset ornl --kind shifted --shift bias_V=20 --out stand2
     """
@@ -96,8 +115,9 @@ def stand(
     refuse_inputs(out_folder, preset, detector)
     names, numbers = wanted_events(events)
     overrides, values = split_overrides(set_values or ())
+    electronics = read_electronics(preset).disturbed(rate_khz, pile_up_khz, wanted_hum(hum))
     summary = make_stand(
-        read_electronics(preset),
+        electronics,
         read_detector(detector, overrides, crystal),
         tuple(energy_windows(",".join(names), load_recipe("small").peaks, window_kev)),
         numbers,
@@ -123,6 +143,19 @@ def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
     if len(set(names)) < len(names):
         raise CpunetError(f"--events {events}: names a peak twice; give each once")
     return names, tuple(event_count(number) for _, _, number in pairs)
+
+
+def wanted_hum(hum: str | None) -> Hum | None:
+    """The wave of ``"50=2"``: 2 keV at 50 Hz."""
+    from cpunet.electronics.chain import Hum
+
+    if hum is None:
+        return None
+    try:
+        frequency, amplitude = map(float, hum.split("="))
+        return Hum(frequency_Hz=frequency, amplitude_kev=amplitude)
+    except ValueError as error:
+        raise CpunetError(f"--hum {hum}: expected HZ=KEV, such as 50=2") from error
 
 
 def _lines(summary: StandSummary) -> list[str]:

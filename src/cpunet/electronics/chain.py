@@ -103,21 +103,22 @@ class Noise(_Figures):
 
 
 class EarlierPulses(_Figures):
-    """Traces on the tail of an earlier pulse: their `fraction`.
+    """Pulses before the record, at random at a rate: their tails are under its traces."""
 
-    Its energy is uniform up to `largest_kev`, its time before the record up to `longest_us`.
-    """
-
-    fraction: Fraction
-    largest_kev: Positive
-    longest_us: Positive
+    rate_kHz: NonNegative
 
 
 class PileUp(_Figures):
-    """Second pulses in the record, at a rate, with energies uniform up to `largest_kev`."""
+    """Second pulses in the record, at a rate."""
 
     rate_kHz: NonNegative
-    largest_kev: Positive
+
+
+class Hum(_Figures):
+    """A wave of the mains under all traces, at any phase."""
+
+    frequency_Hz: Positive
+    amplitude_kev: Positive
 
 
 class Electronics(_Figures):
@@ -143,7 +144,12 @@ class Electronics(_Figures):
     trigger_jitter_ns
         RMS of the time of the pulse in the record, beside the clock's random phase.
     earlier_pulses, pile_up
-        Traces disturbed by other pulses.
+        Other pulses, by Poisson processes: before the record and in it.
+    other_pulses_kev
+        Quantiles of their energies, evenly spaced from the lowest to the highest; between
+        them the logarithm is taken as linear.
+    hum
+        A slow wave, or null.
     adc_bits
         Samples beyond ``2**adc_bits - 1`` stay there.
     resolution_fwhm_kev
@@ -169,6 +175,8 @@ class Electronics(_Figures):
     trigger_jitter_ns: NonNegative
     earlier_pulses: EarlierPulses
     pile_up: PileUp
+    other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
+    hum: Hum | None = None
     adc_bits: Annotated[int, Field(ge=8, le=16)]
     resolution_fwhm_kev: NonNegative
     n_pre: Samples
@@ -180,6 +188,8 @@ class Electronics(_Figures):
         total = sum(part.fraction for part in self.decays)
         if abs(total - 1) > 1e-6:
             raise ValueError(f"decays: their fractions add up to {total:g}; they must to 1")
+        if list(self.other_pulses_kev) != sorted(self.other_pulses_kev):
+            raise ValueError("other_pulses_kev: quantiles of energies must not fall")
         if self.n_pre >= self.length:
             raise ValueError("n_pre must be less than length, or no pulse is in the record")
         if self.baseline_mean_adc >= self.adc_top:
@@ -191,6 +201,29 @@ class Electronics(_Figures):
         if spectrum and any(line.frequency_MHz >= nyquist_MHz for line in spectrum.lines):
             raise ValueError(f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate")
         return self
+
+    def disturbed(
+        self,
+        rate_khz: float | None = None,
+        pile_up_khz: float | None = None,
+        hum: Hum | None = None,
+    ) -> Electronics:
+        """The same chain with other rates of earlier and of second pulses, or with a hum.
+
+        Examples
+        --------
+        >>> from cpunet.electronics.presets import read_electronics
+        >>> read_electronics("ornl").disturbed(rate_khz=3).earlier_pulses.rate_kHz
+        3.0
+        """
+        changes: dict[str, object] = {}
+        if rate_khz is not None:
+            changes["earlier_pulses"] = EarlierPulses(rate_kHz=rate_khz)
+        if pile_up_khz is not None:
+            changes["pile_up"] = PileUp(rate_kHz=pile_up_khz)
+        if hum is not None:
+            changes["hum"] = hum
+        return self.model_copy(update=changes)
 
     @property
     def adc_top(self) -> int:

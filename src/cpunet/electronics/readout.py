@@ -10,12 +10,13 @@ import numpy.typing as npt
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.noise import noise_of
+from cpunet.electronics.other_pulses import draw_other_pulses
 from cpunet.electronics.response import distorted, linear_response, required_energy_kev
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.gammas import with_resolution
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
-"""Bits of the flags of a trace."""
+"""Bits of the flags of a trace; a baseline decays if more than the noise's RMS is left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class RawTraces:
         the full charge, without baseline, earlier or second pulses.
     true_energy_kev, baseline_adc
         What scales and lifts it.
+    remains_kev, n_piled, piled_kev, piled_ns
+        Of other pulses, see `cpunet.electronics.other_pulses.OtherPulses`.
     """
 
     waveforms: npt.NDArray[np.uint16]
@@ -49,6 +52,10 @@ class RawTraces:
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
+    remains_kev: FloatArray
+    n_piled: npt.NDArray[np.int64]
+    piled_kev: FloatArray
+    piled_ns: FloatArray
 
     def __len__(self) -> int:
         return len(self.waveforms)
@@ -84,8 +91,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
     linear = linear_response(pulses, electronics, _shift_ns(electronics, n, clock))
     own_kev = energy[:, None] * linear
-    added_kev, flags = _other_pulses(pulses, electronics, others)
-    total_kev = own_kev + added_kev
+    other = draw_other_pulses(pulses, electronics, others)
+    total_kev = own_kev + other.added_kev
     response = linear
     if electronics.non_linearity is not None:
         figures, dt_ns = electronics.non_linearity, electronics.dt_ns
@@ -97,7 +104,11 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     )
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flags |= np.where(beyond.any(axis=1), SATURATED, 0).astype(np.uint8)
+    flags = (
+        np.where(other.remains_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
+        | np.where(other.n_piled > 0, PILE_UP, 0)
+        | np.where(beyond.any(axis=1), SATURATED, 0)
+    ).astype(np.uint8)
     return RawTraces(
         waveforms=np.clip(adc, 0, electronics.adc_top).astype(np.uint16),
         dt_ns=electronics.dt_ns,
@@ -112,6 +123,10 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         response=response.astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
+        remains_kev=other.remains_kev,
+        n_piled=other.n_piled,
+        piled_kev=other.piled_kev,
+        piled_ns=other.piled_ns,
     )
 
 
@@ -119,30 +134,3 @@ def _shift_ns(electronics: Electronics, n: int, rng: np.random.Generator) -> Flo
     """When pulses begin, after `n_pre` samples: any phase of the clock, and the trigger's."""
     phase = rng.uniform(0, electronics.dt_ns, size=n)
     return phase + rng.normal(0, electronics.trigger_jitter_ns, size=n)
-
-
-def _other_pulses(
-    pulses: Pulses, electronics: Electronics, rng: np.random.Generator
-) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
-    """Tails of earlier pulses and second pulses, in keV, and the flags of their traces."""
-    n, dt_ns, length = len(pulses), electronics.dt_ns, electronics.length
-    added_kev = np.zeros((n, length))
-    earlier, second = electronics.earlier_pulses, electronics.pile_up
-    on_tail = rng.random(n) < earlier.fraction
-    rows = np.flatnonzero(on_tail)
-    kev = rng.uniform(0, earlier.largest_kev, size=len(rows))
-    before_ns = rng.uniform(0, 1e3 * earlier.longest_us, size=len(rows))
-    centres_ns = (np.arange(length) + 0.5) * dt_ns
-    for row, height, time_ns in zip(rows, kev, before_ns, strict=True):
-        added_kev[row] = height * electronics.step_response(centres_ns + time_ns)
-    expected = second.rate_kHz * 1e-6 * length * dt_ns
-    piled = rng.random(n) < -np.expm1(-expected)
-    rows = np.flatnonzero(piled)
-    # anywhere in the record, and of the shape of any other pulse of the set
-    shift_ns = rng.uniform(-electronics.n_pre, length - electronics.n_pre, size=len(rows))
-    which = rng.integers(n, size=len(rows)) if n else rows
-    shapes = linear_response(pulses[which], electronics, shift_ns * dt_ns)
-    kev = rng.uniform(0, second.largest_kev, size=len(rows))
-    added_kev[rows] += kev[:, None] * shapes
-    flags = np.where(on_tail, DECAYING_BASELINE, 0) | np.where(piled, PILE_UP, 0)
-    return added_kev, flags.astype(np.uint8)

@@ -43,6 +43,14 @@ STAND = FolderKind(
 # Events of a side from which on building a library of pulses (20 s on two cores) takes less
 # time than drifting their hits, some 20 each.
 _LIBRARY_FROM_EVENTS = 20_000
+# What is known of a measured trace besides its line, and its name in ``data_labels.npz``.
+OF_DATA = {
+    "flags": "flag",
+    "remains_kev": "remains_kev",
+    "n_piled": "n_piled",
+    "piled_kev": "piled_kev",
+    "piled_ns": "piled_ns",
+}
 
 
 @dataclass
@@ -81,7 +89,9 @@ def make_stand(
     trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
     ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
     included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
-    baseline, 2 pile-up, 4 saturated) and ``stand.json``, which tells how it was made.
+    baseline, 2 pile-up, 4 saturated; ``remains_kev``, ``n_piled``, ``piled_kev``,
+    ``piled_ns``, see `cpunet.electronics.other_pulses`) and ``stand.json``, which tells how
+    it was made.
 
     Parameters
     ----------
@@ -181,7 +191,7 @@ def _write_data(
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = plan.electronics
     labels: list[Labels] = []
-    flags: list[npt.NDArray[np.uint8]] = []
+    known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in OF_DATA}
     writer = PulseWriter(
         folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
     )
@@ -193,15 +203,20 @@ def _write_data(
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(_as_pulses(traces))
             labels.append(label)
-            flags.append(traces.flags)
-        label, flag = np.concatenate(labels), np.concatenate(flags)
+            for name, values in known.items():
+                values.append(getattr(traces, name))
+        label = np.concatenate(labels)
+        told: dict[str, Any] = {
+            OF_DATA[name]: np.concatenate(values) for name, values in known.items()
+        }
+        flag = told["flag"]
         saturated = int((flag & SATURATED > 0).sum())
         if 2 * saturated > len(flag):
             raise CpunetError(
                 f"electronics {electronics.name}: {saturated} of {len(flag)} traces leave the "
                 "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
             )
-    np.savez(folder / "data_labels.npz", label=label, flag=flag)
+    np.savez(folder / "data_labels.npz", label=label, **told)
     summary.n_data = len(label)
     summary.data_lines = _by_line(label)
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):

@@ -1,0 +1,36 @@
+"""The law of what earlier pulses leave, against pulses drawn one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.remains_law import RemainsLaw, energies_at
+
+TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
+
+
+def test_share_above_is_the_closed_form():
+    law = RemainsLaw(2.0, 50.0, (100, 100))
+    expected = 1 - np.exp(-0.1 * np.log([100, 10, 1]))
+    assert law.share_above([1, 10, 100]) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("rate_khz", [0.3, 3.0])
+def test_density_is_that_of_drawn_remains(rate_khz: float):
+    law, rng = RemainsLaw(rate_khz, 54.6, TH228), np.random.default_rng(1)
+    drawn = law.draw(100_000, rng)
+    assert drawn.mean() == pytest.approx(law.mean_kev, rel=0.1)
+    measured = drawn + rng.normal(0, 3, len(drawn))
+    grid, density = law.density(0.5, 16384, 3.0)
+    assert density.sum() * 0.5 == pytest.approx(1, abs=1e-3)
+    for low, high in ((-5, 0), (0, 5), (10, 50), (100, 1000)):
+        inside = (grid > low) & (grid < high)
+        # the ends of an interval hold half a step each
+        share = 0.5 * (density[inside].sum() + density[(grid == low) | (grid == high)].mean())
+        assert share == pytest.approx(((measured > low) & (measured < high)).mean(), rel=0.05)
+
+
+def test_energies_follow_their_quantiles():
+    drawn = energies_at(np.random.default_rng(2).random(20_000), TH228)
+    assert np.quantile(drawn, np.linspace(0, 1, 11)) == pytest.approx(TH228, rel=0.05)
