@@ -6,6 +6,7 @@ import json
 import tracemalloc
 from pathlib import Path
 
+import lh5
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.info import describe
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PeakConfig
 
 LINES = {
@@ -67,6 +69,33 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
+
+
+def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
+    path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
+    preparation = load_recipe("fast").preparation
+    flat = tmp_path / "flat.lh5"
+    told = describe(path, kev_per_adc=calibrated, preparation=preparation, without_remains=flat)
+    assert told["remains"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
+    json.dumps(told)
+    left = lh5.read("geds/raw/remains_kev", flat).nda
+    assert len(left) == 1000
+    assert np.nanmean(left > 10) == pytest.approx(0.3, abs=0.03)
+    again = describe(flat, preparation=preparation)["remains"]
+    assert again["rate_khz"] == 0
+
+
+def test_remains_that_cannot_be_told(tmp_path):
+    rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
+    write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
+    preparation = load_recipe("fast").preparation
+    told = describe(path, preparation=preparation)
+    assert told["remains"].startswith("cannot be told: only 0 of 40 traces can be prepared")
+    with pytest.raises(CpunetError, match="only 0 of 40 traces"):
+        describe(path, preparation=preparation, without_remains=tmp_path / "flat.lh5")
+    write_pulses(tmp_path / "sim.lh5", Pulses.of(np.tile(np.arange(400), (9, 1)), dt_ns=16))
+    with pytest.raises(CpunetError, match="remains are taken off measured traces"):
+        describe(tmp_path / "sim.lh5", without_remains=tmp_path / "flat.lh5")
 
 
 def test_a_run_folder(tmp_path):

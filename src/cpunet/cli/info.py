@@ -15,6 +15,15 @@ Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", m
 TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
 Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
 
+WithoutRemains = Annotated[
+    Path | None,
+    typer.Option(
+        "--without-remains",
+        help="LH5 file to write: measured traces less what earlier pulses left under them, "
+        "with the columns remains_kev and remains_error_kev.",
+    ),
+]
+
 
 def info(
     source: Source,
@@ -22,22 +31,33 @@ def info(
     energy: Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    without_remains: WithoutRemains = None,
+    force: options.Force = False,
 ) -> None:
     """Say what is in a file or run: events, sampling, energies, peaks, provenance.
 
+    Of measured traces it says what earlier pulses have left under them, and the rate of
+    pulses that follows.
+
     Example: cpunet info raw.lh5
+
+    Example: cpunet info raw.lh5 --without-remains flat.lh5
     """
     from cpunet.jobs.info import describe
     from cpunet.recipes import load_recipe
     from cpunet.training.run_schema import problem
 
+    recipe = load_recipe("fast")
     told = describe(
         source,
         table=table,
         energy=energy,
         kev_per_adc=kev_per_adc,
         dt_ns=dt,
-        peaks=load_recipe("small").peaks,
+        peaks=recipe.peaks,
+        preparation=recipe.preparation,
+        without_remains=without_remains,
+        force=force,
     )
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is damaged ({wrong}); train again")

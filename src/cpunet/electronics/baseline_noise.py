@@ -20,7 +20,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.noise_spectrum import spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 LEAST_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
@@ -282,12 +282,7 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
             f"only {len(prepared)} of {len(raw)} traces have a known energy and can be "
             f"prepared; give {FEWEST} or more to take the noise from"
         )
-    windows = prepared.pulses.waveforms[:, : config.samples_before]
-    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
-    above = windows >= level[:, np.newaxis]
-    # The start of the pulse proper: everything from there to the alignment is above.
-    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
-    free = prepared.align_sample - config.samples_before + start - MARGIN
+    free = samples_before_pulses(prepared, config)
     length = int(np.quantile(free, SHORTEST_SHARE))
     if length < LEAST_SAMPLES:
         raise CpunetError(
@@ -300,6 +295,18 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
     return np.asarray(
         (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
     )
+
+
+def samples_before_pulses(
+    prepared: Prepared, config: PreparationConfig
+) -> npt.NDArray[np.int64]:
+    """Samples of each raw trace that surely precede its pulse, shape ``(n,)``."""
+    windows = prepared.pulses.waveforms[:, : config.samples_before]
+    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+    above = windows >= level[:, np.newaxis]
+    # The start of the pulse proper: everything from there to the alignment is above.
+    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
+    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:

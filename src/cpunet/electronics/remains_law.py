@@ -89,7 +89,8 @@ class RemainsLaw:
             Values in keV, and the density there, both of shape ``(n,)``.
         """
         u = 2 * np.pi * scipy.fft.rfftfreq(n, step_kev)
-        exponent = self.expected * exponents(u, self.energies_kev) - 0.5 * (sigma_kev * u) ** 2
+        per_pulse = characteristic_exponents(u, _some(self.energies_kev)).mean(axis=1)
+        exponent = self.expected * per_pulse - 0.5 * (sigma_kev * u) ** 2
         first = n // 4
         shifted = np.exp(exponent + 1j * u * first * step_kev)
         density = scipy.fft.irfft(np.conj(shifted), n) / step_kev
@@ -105,12 +106,19 @@ class RemainsLaw:
         return np.asarray(np.bincount(row, left, minlength=n), float)
 
 
-def exponents(u: FloatArray, energies_kev: Sequence[float]) -> npt.NDArray[np.complex128]:
-    """Logarithm of the law's characteristic function at `u` (1/keV), per expected pulse."""
-    phase = u[:, np.newaxis] * _some(energies_kev)
-    sine, cosine = scipy.special.sici(np.maximum(phase, 1e-12))
-    cin = np.euler_gamma + np.log(np.maximum(phase, 1e-12)) - cosine
-    return np.asarray((1j * sine - cin).mean(axis=1))
+def characteristic_exponents(
+    u: FloatArray, energies_kev: FloatArray
+) -> npt.NDArray[np.complex128]:
+    """Logarithm of the characteristic function at `u` (1/keV), per expected pulse.
+
+    Returns
+    -------
+    array
+        For pulses of each energy, shape ``(len(u), len(energies_kev))``.
+    """
+    phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
+    sine, cosine = scipy.special.sici(phase)
+    return np.asarray(1j * sine - (np.euler_gamma + np.log(phase) - cosine))
 
 
 def earlier_pulses(

@@ -9,15 +9,23 @@ from typing import Any
 
 import numpy as np
 
+import cpunet
+from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading import open_pulses
-from cpunet.recipes.schema import PeakConfig
+from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
+from cpunet.pulses.writing import PulseWriter
+from cpunet.recipes.schema import PeakConfig, PreparationConfig
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MOST_BYTES, plain_json
 
 _RUN_FILE = "run.json"
+LOOKED_AT, REMAINS_BLOCK = 256, 4096  # traces read at a time
 
 
 def describe(
@@ -28,6 +36,9 @@ def describe(
     kev_per_adc: float | None = None,
     dt_ns: float | None = None,
     peaks: Mapping[str, PeakConfig] | None = None,
+    preparation: PreparationConfig | None = None,
+    without_remains: Path | None = None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Say what a file of pulses or the folder of a training run holds.
 
@@ -41,6 +52,13 @@ def describe(
         As for `cpunet.pulses.reading.open_pulses`.
     peaks
         Gamma lines whose pulses are counted.
+    preparation
+        How measured traces are prepared: with it, remains of earlier pulses are told of.
+    without_remains
+        LH5 file to write: the traces less their remains, with ``remains_kev`` and
+        ``remains_error_kev`` as columns.
+    force
+        Whether to replace that file.
 
     Returns
     -------
@@ -50,12 +68,14 @@ def describe(
         `PulseSource.describe` gives, and: ``n_pulses``; ``energy_kev`` (lowest and
         highest, None if not known) and ``n_without_energy``; ``peaks`` (pulses by
         line); ``samples`` (lowest and highest, of traces all finite);
-        ``n_not_finite`` and ``n_constant`` traces.
+        ``n_not_finite`` and ``n_constant`` traces; of measured traces with `preparation`,
+        ``remains``: what `Remains.describe` gives, or why there is none.
 
     Raises
     ------
     CpunetError
-        If there is no such file, or it cannot be read.
+        If there is no such file, it cannot be read, or remains are to be taken off that
+        cannot be told.
 
     Examples
     --------
@@ -73,7 +93,44 @@ def describe(
     counts = _Counts(dict.fromkeys(peaks or {}, 0))
     for block in source.blocks():
         counts.add(block, peaks or {})
-    return {"kind": "pulses", "path": str(path), **source.describe(), **counts.summary()}
+    told = {"kind": "pulses", "path": str(path), **source.describe(), **counts.summary()}
+    if preparation is None or _side(source) != "measured":
+        if without_remains is not None:
+            raise CpunetError(f"{path}: remains are taken off measured traces; these are none")
+        return told
+    try:
+        remains = Remains.of_traces(source.blocks(REMAINS_BLOCK), preparation)
+    except CpunetError as error:
+        if without_remains is not None:
+            raise CpunetError(f"{path}: {error}") from error
+        return told | {"remains": f"cannot be told: {error}"}
+    if without_remains is not None:
+        refuse_inputs(without_remains, path, energy)
+        _write_without(source, remains, without_remains, force=force)
+    return told | {"remains": remains.describe()}
+
+
+def _side(source: PulseSource) -> Kind | None:
+    """Measured or simulated, by what the file says or its pulses look like."""
+    found = recorded_side(source)
+    if found is None:
+        first = next(iter(source.blocks(LOOKED_AT)), None)
+        found = None if first is None else apparent_side(first.waveforms)
+    # translated windows look measured, but have no raw traces
+    return None if found is None or "translated" in found.why else found.side
+
+
+def _write_without(source: PulseSource, remains: Remains, out: Path, *, force: bool) -> None:
+    """Write the traces less their remains, with these as columns."""
+    attrs = {MADE_BY: f"cpunet info {cpunet.__version__}", SIDE: "measured"}
+    with PulseWriter(
+        out, table="geds/raw", waveform_units="ADC", attrs=attrs, force=force
+    ) as writer:
+        for block in source.blocks(REMAINS_BLOCK):
+            kev = remains.measure(block)
+            error = np.where(np.isfinite(kev), remains.error_kev, np.nan)
+            columns = {"remains_kev": (kev, "keV"), "remains_error_kev": (error, "keV")}
+            writer.append(remains.subtracted_from(block), columns)
 
 
 @dataclass

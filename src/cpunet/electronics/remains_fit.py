@@ -1,0 +1,230 @@
+"""The rate of earlier pulses from what they left under many traces: a likelihood fit.
+
+What is measured of each trace is its remainder and an error, about the level of a baseline
+without any.  The law's density, blurred by that error, is known, so that rate, level and error
+follow together.  The energies are those of the file, or, where these cannot be (as of a file
+that holds a few gamma lines only), a log-normal spectrum up to the highest of them, which the
+remains themselves tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.optimize
+
+from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.remains_law import RemainsLaw, characteristic_exponents
+
+# Energies that a spectrum is made of, from the lowest that leave anything to be seen.
+LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
+QUANTILES = 41  # of the spectrum that is given out
+GRID = 16384  # points of the density
+STEPS_OF_SIGMA = 4.0
+OUTLIERS = 2e-3  # share of traces that no law has to explain
+# A spectrum that is learned has two parameters more, so much must the likelihood gain.
+WORTH = 5.0
+# Start and width of the priors: of the median energy and the spectrum's width, in logarithms.
+MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
+
+
+@dataclass(frozen=True, eq=False)
+class RateFit:
+    """What a set of remains says of their law.
+
+    Parameters
+    ----------
+    law, rate_error_khz
+        The law, and the error of its rate.
+    level_kev, sigma_kev
+        Where a trace without any remainder lies, and the spread of traces about it.
+    recorded
+        Whether the law has the energies of the file, and not a spectrum learned.
+    gain_of_law
+        Logarithm of the likelihood above that of no remains at all.
+    """
+
+    law: RemainsLaw
+    rate_error_khz: float
+    level_kev: float
+    sigma_kev: float
+    recorded: bool
+    gain_of_law: float
+
+
+def fit_rate(
+    kev: FloatArray, sigma_kev: float, decay_us: float, energies_kev: FloatArray
+) -> RateFit:
+    """Fit rate, level and error to measured remains.
+
+    Parameters
+    ----------
+    kev
+        Measured remains, of about 0 where there are none.
+    sigma_kev
+        A first guess of their error.
+    decay_us
+        Of the tails.
+    energies_kev
+        Of the file's pulses.
+    """
+    known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
+    highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
+    likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
+    candidates = [_Candidate.learned(likelihood)]
+    if len(known):
+        own = np.histogram(np.log(known), _edges(likelihood.energies))[0] / len(known)
+        candidates.insert(0, _Candidate.recorded(likelihood, own))
+    best = candidates[0]
+    for other in candidates[1:]:
+        if other.log_likelihood > best.log_likelihood + WORTH:
+            best = other
+    expected, error = best.expected
+    energies = _quantiles(likelihood.energies, best.weights)
+    return RateFit(
+        law=RemainsLaw(1e3 * expected / decay_us, decay_us, energies),
+        rate_error_khz=1e3 * error / decay_us,
+        level_kev=float(best.vector[1]),
+        sigma_kev=float(np.exp(best.vector[2])),
+        recorded=best.fixed is not None,
+        gain_of_law=best.log_likelihood - likelihood.without(),
+    )
+
+
+class _Likelihood:
+    """Of remains, as a function of rate, level, error and spectrum."""
+
+    def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
+        self.kev, self.sigma, self.energies = kev, sigma_kev, energies
+        self.step = sigma_kev / STEPS_OF_SIGMA
+        self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(GRID, self.step), float)
+        self.exponents = characteristic_exponents(self.u, energies)
+        self.first = GRID // 4
+        self.grid = (np.arange(GRID) - self.first) * self.step
+        self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
+
+    def __call__(
+        self, expected: float, level: float, sigma: float, weights: FloatArray
+    ) -> float:
+        exponent = expected * (self.exponents @ weights) - 0.5 * (sigma * self.u) ** 2
+        shift = 1j * self.u * (level + self.first * self.step)
+        density = np.fft.irfft(np.conj(np.exp(exponent + shift)), GRID) / self.step
+        at = np.interp(self.kev, self.grid, np.maximum(density, 0.0), left=0.0, right=0.0)
+        return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
+
+    def without(self) -> float:
+        """The highest of traces that differ by their error alone."""
+        weights = np.zeros(len(self.energies))
+        spread = max(float(self.kev.std()), self.sigma)
+        starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
+        found = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
+        return -min(float(one.fun) for one in found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """The best law with some kind of spectrum."""
+
+    likelihood: _Likelihood
+    fixed: FloatArray | None
+    vector: FloatArray
+    log_likelihood: float
+
+    @classmethod
+    def recorded(cls, likelihood: _Likelihood, weights: FloatArray) -> _Candidate:
+        return cls._best(likelihood, weights, (0.0, np.log(likelihood.sigma)))
+
+    @classmethod
+    def learned(cls, likelihood: _Likelihood) -> _Candidate:
+        more = (MEDIAN[0], WIDTH[0])
+        return cls._best(likelihood, None, (0.0, np.log(likelihood.sigma), *more))
+
+    @classmethod
+    def _best(
+        cls, likelihood: _Likelihood, fixed: FloatArray | None, rest: Sequence[float]
+    ) -> _Candidate:
+        found = min(
+            (
+                _minimum(lambda v: -_value(likelihood, fixed, v), (start, *rest))
+                for start in np.log([0.005, 0.1])
+            ),
+            key=lambda one: float(one.fun),
+        )
+        vector = np.asarray(found.x, float)
+        return cls(likelihood, fixed, vector, -float(found.fun))
+
+    @property
+    def weights(self) -> FloatArray:
+        """Of the energies."""
+        return _weights(self.likelihood.energies, self.fixed, self.vector)
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """Pulses in a decay time, and the error."""
+        expected = float(np.exp(self.vector[0]))
+        curvature = _curvature(
+            lambda v: -_value(self.likelihood, self.fixed, v), self.vector, self.likelihood
+        )
+        variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
+        return expected, expected * float(np.sqrt(max(variance, 0.0)))
+
+
+def _value(likelihood: _Likelihood, fixed: FloatArray | None, vector: FloatArray) -> float:
+    weights = _weights(likelihood.energies, fixed, vector)
+    prior = 0.0
+    if fixed is None:
+        for value, (centre, width) in zip(vector[3:], (MEDIAN, WIDTH), strict=True):
+            prior -= 0.5 * ((value - centre) / width) ** 2
+    expected, sigma = np.exp(np.clip(vector[[0, 2]], -20.0, 6.0))
+    return likelihood(float(expected), float(vector[1]), float(sigma), weights) + prior
+
+
+def _weights(energies: FloatArray, fixed: FloatArray | None, vector: FloatArray) -> FloatArray:
+    if fixed is not None:
+        return fixed
+    width = np.exp(np.clip(vector[4], -2.0, 2.0))
+    logs = -0.5 * ((np.log(energies) - vector[3]) / width) ** 2
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum(), float)
+
+
+def _minimum(function: object, start: Sequence[float]) -> scipy.optimize.OptimizeResult:
+    steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
+    simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}
+    return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
+
+
+def _curvature(function: object, at: FloatArray, likelihood: _Likelihood) -> FloatArray:
+    """Second derivatives by finite differences."""
+    assert callable(function)
+    steps = np.array([0.1, 0.2 * likelihood.sigma, 0.05, 0.1, 0.1])[: len(at)]
+    moves = np.diag(steps)
+    n = len(at)
+    found = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            corners = [function(at + a * moves[i] + b * moves[j]) for a, b in signs]
+            second = corners[0] - corners[1] - corners[2] + corners[3]
+            found[i, j] = found[j, i] = second / (4 * steps[i] * steps[j])
+    return found
+
+
+def _edges(energies: FloatArray) -> FloatArray:
+    """Of bins about the logarithms of energies, the outer ones open."""
+    logs = np.log(energies)
+    inner = 0.5 * (logs[1:] + logs[:-1])
+    return np.concatenate([[-np.inf], inner, [np.inf]])
+
+
+def _quantiles(energies: FloatArray, weights: npt.NDArray[np.float64]) -> tuple[float, ...]:
+    """Evenly spaced quantiles of a spectrum."""
+    edges = _edges(energies)
+    edges[[0, -1]] = np.log(energies[[0, -1]])
+    share = np.concatenate([[0.0], np.cumsum(weights)]) / weights.sum()
+    at = np.interp(np.linspace(0, 1, QUANTILES), share, edges)
+    return tuple(float(kev) for kev in np.exp(at))

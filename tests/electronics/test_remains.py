@@ -1,0 +1,157 @@
+"""What is told of remains of earlier pulses, against stands on which they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.readout import RawTraces, read_out
+from cpunet.electronics.remains import Remains, read_baselines
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.recipes import load_recipe
+
+PREPARATION = load_recipe("fast").preparation
+N = 3000
+
+
+def traces_of(
+    rate_khz: float, preset: str = "ornl", broad: bool = False, pile_up_khz: float = 0.4
+) -> RawTraces:
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (N, 1)), 0, 1)
+    energy = rng.choice([1592.5, 2103.5, 2614.5], N)
+    chain = read_electronics(preset).disturbed(rate_khz, pile_up_khz)
+    if broad:
+        energy = np.exp(rng.uniform(np.log(100), np.log(2614), N))
+        chain = chain.model_copy(update={"other_pulses_kev": tuple(np.quantile(energy, at))})
+    return read_out(Pulses.of(ramps, dt_ns=4, energy_kev=energy), chain, seed=2)
+
+
+at = np.linspace(0, 1, 21)
+
+
+def as_pulses(traces: RawTraces, rows: slice = slice(None)) -> Pulses:
+    return Pulses.of(
+        traces.waveforms[rows], dt_ns=traces.dt_ns, energy_kev=traces.energy_kev[rows]
+    )
+
+
+def in_blocks(raw: Pulses, size: int = 1000) -> Iterator[Pulses]:
+    return (raw[slice(first, first + size)] for first in range(0, len(raw), size))
+
+
+@pytest.fixture(scope="module")
+def busy() -> RawTraces:
+    return traces_of(1.0)
+
+
+@pytest.fixture(scope="module")
+def found(busy: RawTraces) -> Remains:
+    return Remains.of_traces(in_blocks(as_pulses(busy)), PREPARATION)
+
+
+def test_each_trace_has_its_remainder(busy: RawTraces, found: Remains):
+    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
+    off = (found.kev - busy.remains_kev)[alone & (busy.remains_kev < 50)]
+    assert abs(np.median(off)) < 0.3
+    assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.error_kev, rel=0.1)
+    large = alone & (busy.remains_kev > 100)
+    # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
+    assert np.median(found.kev[large] / busy.remains_kev[large]) == pytest.approx(1, abs=0.02)
+    assert alone.mean() > 0.9
+
+
+def test_the_decay_is_that_of_the_slowest(found: Remains):
+    assert found.coupled
+    assert found.decay_error_us is not None
+    # tails within the window are 25 % steeper, by the decay of 2.9 us
+    assert found.decay_us == pytest.approx(54.6, rel=0.01)
+
+
+def test_the_rate_is_found_without_the_energies(found: Remains):
+    assert not found.fit.recorded  # the file has lines alone
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(1, abs=3 * found.fit.rate_error_khz)
+    assert found.fit.rate_error_khz < 0.12
+    assert found.describe()["percent_above"]["30_kev"]["law"] == pytest.approx(10.5, abs=1.5)
+
+
+def test_recorded_energies_are_taken_if_they_do():
+    found = Remains.of_traces([as_pulses(traces_of(0.5, broad=True))], PREPARATION)
+    assert found.fit.recorded
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(0.5, abs=3 * found.fit.rate_error_khz)
+
+
+@pytest.mark.parametrize("preset", ["ornl", "legend200"])
+def test_nothing_is_invented_where_there_is_nothing(preset: str):
+    found = Remains.of_traces([as_pulses(traces_of(0.0, preset))], PREPARATION)
+    assert found.law is None
+    assert found.describe()["rate_khz"] == 0
+
+
+def test_remains_are_taken_off(busy: RawTraces, found: Remains):
+    raw = as_pulses(busy)
+    flat = found.subtracted_from(raw)
+    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
+    slopes = [
+        read_baselines(traces.waveforms[:, : found.samples].astype(float), 16, 54.6)[1]
+        for traces in (raw, flat)
+    ]
+    empty = alone & (busy.remains_kev < 0.01)
+    spread = 1.4826 * np.median(np.abs(slopes[1][alone]))
+    noise = 1.4826 * np.median(np.abs(slopes[0][empty]))
+    # less than noise alone, of which a part is taken for a remainder and off
+    assert 0.5 * noise < spread < 1.1 * noise
+    assert slopes[0][alone].std() > 10 * spread
+
+
+def test_other_traces_are_measured_alike(busy: RawTraces, found: Remains):
+    again = found.measure(as_pulses(busy, slice(500, 700)))
+    assert again == pytest.approx(found.kev[500:700], nan_ok=True, abs=1e-3)
+
+
+def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
+    """Behind a capacitor levels say nothing: here each trace has lost its own."""
+    raw = as_pulses(busy)
+    lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
+    blocks = [raw.with_waveforms(lost.astype(np.float32))]
+    found = Remains.of_traces(blocks, PREPARATION, decay_us=54.6)
+    assert not found.coupled
+    assert found.describe()["told_by"] == "slope"
+    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.remains_kev > 100)
+    ratio = np.median(found.kev[large] / busy.remains_kev[large])
+    assert ratio == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda raw: raw[slice(0, 10)], "only 10 of 10 traces can be prepared"),
+        (lambda raw: raw.with_waveforms(-raw.waveforms), "can be prepared"),
+        (lambda raw: raw.with_waveforms(raw.waveforms[:, 430:]), "window_outside_record"),
+        (lambda raw: Pulses.of(raw.waveforms, dt_ns=16), "have a known energy"),
+    ],
+)
+def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
+    with pytest.raises(CpunetError, match=said) as caught:
+        Remains.of_traces([change(as_pulses(busy, slice(0, 400)))], PREPARATION)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bench_detector_follows_the_law(reference_data: Path):
+    source = open_pulses(reference_data / "real" / "th228.fcio", kev_per_adc=2614.5 / 40265)
+    found = Remains.of_traces(source.blocks(1000), PREPARATION)
+    assert found.law is not None
+    assert found.fit.recorded
+    assert found.decay_us == pytest.approx(85, rel=0.04)
+    assert found.law.rate_khz == pytest.approx(1.4, abs=0.3)
+    shares = found.describe()["percent_above"].values()
+    for share in shares:  # in percent of a thousand traces
+        assert share["measured"] == pytest.approx(share["law"], abs=3)
