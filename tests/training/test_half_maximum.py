@@ -85,8 +85,7 @@ def test_baseline_and_height_are_taken_out(offset: float, factor: float) -> None
     windows, records = at_half_maximum(
         factor * pulses + offset, LEVEL, LAST, CONFIG, TAIL_LEVEL
     )
-    # the level is taken in whole samples, in one of which a decay loses 1/3000
-    np.testing.assert_allclose(windows.numpy(), aligned(pulses).numpy(), atol=1e-3)
+    np.testing.assert_allclose(windows.numpy(), aligned(pulses).numpy(), atol=2e-5)
     assert float(records[:, :100].abs().max()) < 1e-5
     level = windows[:, -CONFIG.level_samples :].mean(dim=1).numpy()
     np.testing.assert_allclose(level, TAIL_LEVEL, atol=1e-3)

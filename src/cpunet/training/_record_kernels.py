@@ -181,7 +181,12 @@ def read_records(
         record = records[row]
         _, sample = _crossing(record, w.level, w.last)
         _normalise(record, sample, w)
-        time, _ = _crossing(record, w.level, sample + 20)
+        time, again = _crossing(record, w.level, sample + 20)
+        if again != sample:
+            # baseline and level belong about the crossing of the normalised record: one sample
+            # off, a decay of 50 us makes that many standard deviations of a mean
+            _normalise(record, again, w)
+            time, _ = _crossing(record, w.level, again + 20)
         if not math.isfinite(time):
             aligned[row], slopes[row], amplitudes[row] = math.nan, math.nan, math.nan
             continue

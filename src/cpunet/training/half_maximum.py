@@ -64,11 +64,13 @@ def at_half_maximum(
     whole = torch.full((len(records),), last, device=records.device)
     _, sample = crossing(records, level, whole)
     first, stop = config.baseline
-    base = stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
-    records = records - base
-    tail = stretch(records, sample, config.after - config.level_samples, config.after)
-    records = records * (tail_level / tail.mean(dim=1, keepdim=True))
-    time, _ = crossing(records, level, sample + 20)
+    # once more, since baseline and level belong about the crossing of the normalised record
+    for _ in range(2):
+        base = stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
+        records = records - base
+        tail = stretch(records, sample, config.after - config.level_samples, config.after)
+        records = records * (tail_level / tail.mean(dim=1, keepdim=True))
+        time, sample = crossing(records, level, sample + 20)
     start = time.floor()
     fraction = (time - start)[:, None]
     window = stretch(records, start.long(), -config.before, config.after + 1)
