@@ -13,6 +13,7 @@ import pytest
 import scipy.signal
 from safetensors.numpy import load_file
 
+from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile
 from cpunet.jobs.monitor import Advance, Monitor
@@ -188,6 +189,41 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
     quiet = {"noise": False, "device": "cpu"}
     told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", **quiet)
     assert told == {"read": 6, "translated": 6, "rejections": {}}
+
+
+def test_remains_of_earlier_pulses_are_learned_without_being_asked(
+    files: Files, tmp_path: Path
+) -> None:
+    traces, rng = digitised(N, seed=2), np.random.default_rng(7)
+    law = RemainsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
+    left = law.draw(N, rng)[:, np.newaxis]
+    decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
+    data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
+    monitor = Listening()
+    info = train_run(
+        files.sim, data, tmp_path / "run", RECIPE, seed=3, device="cpu", monitor=monitor
+    )
+    fit = info["fit"]
+    assert fit["chi_square"] < 1.6 * fit["moments"]
+    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
+    assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
+    told = fit["remains"]
+    assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
+    assert any(note.startswith("remains of earlier pulses: ") for note in monitor.notes)
+    ren = REN.load(tmp_path / "run")
+    assert ren.remains is not None
+    assert ren.remains.law.rate_khz == told["rate_khz"]
+    # without remains the noise is that of empty baselines
+    prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
+    assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
+
+
+def test_data_without_remains_are_given_none(run: Run) -> None:
+    assert run.info["fit"]["remains"]["rate_khz"] == 0
+    assert not any("remains" in note for note in run.monitor.notes)
+    remains = REN.load(run.folder).remains
+    assert remains is not None
+    assert remains.law.rate_khz == 0
 
 
 def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:

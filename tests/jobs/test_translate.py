@@ -22,6 +22,7 @@ from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, Wavefor
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.errors import CpunetError
 from cpunet.jobs import translate as translate_job
 from cpunet.jobs.file_workers import in_processes
@@ -83,6 +84,27 @@ def write_chain(folder, info=INFO, **buffers):
 def run(tmp_path_factory):
     """A readout chain that was not fitted."""
     return write_chain(tmp_path_factory.mktemp("runs") / "run", INFO | {"data": DATA})
+
+
+REMAINS = {
+    "rate_khz": 1.0,
+    "drawn": {
+        "rate_khz": 1.0,
+        "decay_us": 50.0,
+        "energies_kev": [100.0, 2000.0],
+        "height": 0.9,
+        "lead_us": 0.0,
+        "dt_ns": DT_NS,
+        "passed": [float(kev < 30) for kev in SIZES_KEV],
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory):
+    """A chain of data with remains of earlier pulses."""
+    info = INFO | {"data": DATA, "fit": {"remains": REMAINS}}
+    return write_chain(tmp_path_factory.mktemp("runs") / "run", info)
 
 
 @pytest.fixture(scope="module")
@@ -501,6 +523,71 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     assert traces.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
     codes = [Rejection(code).label for code in table.rejection.nda]
     assert codes == ["accepted", "accepted", "energy_unknown", "constant"] + 2 * ["accepted"]
+
+
+def left_in(path, table="geds/ren"):
+    return lh5.read(f"{table}/remains_kev", path).nda
+
+
+def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    for folder, name in ((busy, "a.lh5"), (run, "b.lh5")):
+        translate_file(folder, source, tmp_path / name, device="cpu")
+        with h5py.File(tmp_path / name) as file:
+            assert "remains_kev" not in file["geds/ren"]
+    assert values(tmp_path / "a.lh5") == pytest.approx(values(tmp_path / "b.lh5"))
+
+
+def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    out, options = tmp_path / "out.lh5", {"realisations": 40, "device": "cpu"}
+    translate_file(busy, source, out, remains="learned", **options)
+    left = left_in(out)
+    assert len(left) == 40 * N
+    assert left.max() < 40
+    assert (left > 5).mean() == pytest.approx(0.13, abs=0.04)
+    # behind a baseline that falls tails lie lower, and are scaled up to the same level
+    higher = values(out)[:, 410:440].mean(axis=1)
+    share = left / lh5.read("geds/ren/energy", out).nda
+    assert np.corrcoef(share, higher)[0, 1] > 0.4
+    translate_file(busy, source, tmp_path / "rate.lh5", remains="1", **options)
+    assert left_in(tmp_path / "rate.lh5").max() > 100
+
+
+def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    for remains in ("none", "3"):
+        out = tmp_path / f"{remains}.lh5"
+        translate_file(busy, source, out, adc=ADC, remains=remains, seed=3, device="cpu")
+    left = left_in(tmp_path / "3.lh5")
+    none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
+    assert (left > 20).sum() > 5
+    # 9 ADC per keV of height 0.9
+    wanted = left * 0.9 * 26145.11 / 2614.511
+    begin = lifted[:, :300].mean(axis=1) - none[:, :300].mean(axis=1)
+    assert begin == pytest.approx(wanted * np.exp(-2.4 / 50), abs=25)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"remains": "many"}, "--remains many: expected learned, none, or a rate in kHz"),
+        ({"remains": "-1"}, "expected learned, none, or a rate"),
+        ({"remains": "learned", "noise": False}, "leave out --no-noise"),
+        ({"remains": "learned", "inverse": True}, "leave out --remains"),
+    ],
+)
+def test_remains_that_cannot_be(busy, tmp_path, options, said):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    with pytest.raises(CpunetError, match=said):
+        translate_file(busy, source, tmp_path / "out.lh5", device="cpu", **options)
+
+
+def test_runs_that_tell_of_no_remains(run, network, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    for folder in (run, network):
+        with pytest.raises(CpunetError, match="the run tells nothing of remains"):
+            translate_file(folder, source, tmp_path / "o.lh5", remains="1", device="cpu")
 
 
 def test_adc_needs_to_be_known(network, tmp_path):

@@ -46,6 +46,7 @@ def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsR
         slow_ns=(100, 400),
         decay_us=80,
         fast_decays_us=(4, 16),
+        free_decays=False,
         ringing_mhz=None if ringing is None else ringing["frequency_MHz"],
         ringing_ns=RINGING["damping_ns"],
     )
@@ -133,6 +134,23 @@ def test_every_parameter_has_a_gradient():
     for name, parameter in response.named_parameters():
         assert parameter.grad is not None, name
         assert bool((parameter.grad.abs() > 0).all()), name
+
+
+def test_decays_may_have_times_of_their_own():
+    fixed = layer((55.0, 35.0))
+    config = fixed.config.model_copy(update={"free_decays": True})
+    free = ElectronicsResponse(config, 16.0).requires_grad_(True)
+    free.load_state_dict(fixed.state_dict(), strict=False)
+    pulses = windows(fine_pulses(20))
+    assert torch.equal(free(pulses), fixed(pulses))
+    free.decay_weights.data.fill_(0.03)
+    free.log_fast_decays_us.data.copy_(torch.tensor([3.0, 30.0]).log())
+    free(pulses).square().sum().backward()
+    assert free.log_fast_decays_us.grad is not None
+    assert bool((free.log_fast_decays_us.grad.abs() > 0).all())
+    told = free.describe()
+    assert told["fast_decay_1_us"] == pytest.approx(3)
+    assert told["fast_decay_2_share"] == pytest.approx(0.03)
 
 
 def test_the_numbers_have_names_with_units_and_poles_are_sorted():

@@ -11,9 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run_folder import (
     WEIGHTS,
@@ -62,6 +64,15 @@ def test_everything_comes_back(run, model, recipe):
         assert not loaded.training
         saved = getattr(model, name).state_dict()
         assert all(torch.equal(saved[k], v) for k, v in loaded.state_dict().items())
+
+
+def test_recipes_of_earlier_versions_are_read(tmp_path):
+    recipe = load_recipe("fast")
+    write_run(tmp_path, nn.ModuleDict({"ren": nn.Linear(2, 2)}), recipe, INFO)
+    text = (tmp_path / "recipe.yaml").read_text()
+    assert "free_decays: false" in text
+    (tmp_path / "recipe.yaml").write_text(text.replace("  free_decays: false\n", ""))
+    assert read_recipe(tmp_path) == recipe
 
 
 def test_ren_and_iren_are_not_confused(run, recipe):

@@ -40,6 +40,12 @@ Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulat
 Noise = Annotated[
     bool, typer.Option("--noise/--no-noise", help="Add noise as the data have it, or none.")
 ]
+Remains = Annotated[
+    str,
+    typer.Option(
+        "--remains", help="Remains of earlier pulses: learned, none, or a rate in kHz."
+    ),
+]
 Realisations = Annotated[
     int | None,
     typer.Option(
@@ -111,6 +117,7 @@ def translate(
     out_name: Out,
     inverse: Inverse = False,
     noise: Noise = True,
+    remains: Remains = "none",
     seed: options.Seed = 0,
     realisations: Realisations = None,
     table: Table = None,
@@ -146,7 +153,7 @@ def translate(
     place = Path(out_name)
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
         form = TranslateOptions(
-            inverse, noise, seed, out_table, append_column, realisations, adc
+            inverse, noise, seed, out_table, append_column, realisations, adc, remains
         )
         told = translate_files(
             run,
@@ -171,6 +178,7 @@ def translate(
             append_column=append_column,
             realisations=realisations,
             adc=adc,
+            remains=remains,
             device=device,
             resume=resume,
             force=force,

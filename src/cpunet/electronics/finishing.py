@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, prepare
@@ -26,7 +27,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | None = None,
+    noise: BaselineNoise | TraceNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
 ) -> FloatArray:
@@ -47,7 +48,7 @@ def finish(
     dt_ns
         Sampling period in ns.
     noise
-        What to add; None for noise-free windows.
+        What to add, with remains of earlier pulses or without; None for noise-free windows.
     energy_kev
         Energy of each pulse, shape ``(n,)``; needed for the noise.
     seed
@@ -75,12 +76,16 @@ def finish_with_codes(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | None = None,
+    noise: BaselineNoise | TraceNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
+    added: npt.NDArray[np.float64] | None = None,
 ) -> tuple[FloatArray, Codes]:
-    """As `finish`, with a `cpunet.pulses.preparation.Rejection` for each record."""
-    clean, noisy, codes = _finished(records, config, dt_ns, noise, energy_kev, seed)
+    """As `finish`, with a `cpunet.pulses.preparation.Rejection` for each record.
+
+    What is `added` comes with the noise, in prepared units, shape ``(n, samples)``.
+    """
+    clean, noisy, codes = _finished(records, config, dt_ns, noise, energy_kev, seed, added)
     return clean if noise is None else noisy, codes
 
 
@@ -89,7 +94,7 @@ def finish_both(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise,
+    noise: BaselineNoise | TraceNoise,
     energy_kev: npt.NDArray[np.float64],
     seed: int | np.random.Generator = 0,
 ) -> tuple[FloatArray, FloatArray]:
@@ -102,9 +107,10 @@ def _finished(
     records: FloatArray,
     config: PreparationConfig,
     dt_ns: float,
-    noise: BaselineNoise | None,
+    noise: BaselineNoise | TraceNoise | None,
     energy_kev: npt.NDArray[np.float64] | None,
     seed: int | np.random.Generator,
+    added: npt.NDArray[np.float64] | None = None,
 ) -> tuple[FloatArray, FloatArray, Codes]:
     """Windows without noise, with it (none if there is none), and the codes of the last."""
     if records.ndim != 2:
@@ -129,6 +135,8 @@ def _finished(
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
+            if added is not None:
+                drawn += added[kept]
             raw = Pulses.of(np.asarray(level + drawn, np.float32), dt_ns=dt_ns)
             prepared = prepare(raw, config, "measured")
             codes[kept] = prepared.codes
@@ -137,7 +145,10 @@ def _finished(
 
 
 def _check_noise(
-    noise: BaselineNoise, dt_ns: float, energy_kev: npt.NDArray[np.float64] | None, n: int
+    noise: BaselineNoise | TraceNoise,
+    dt_ns: float,
+    energy_kev: npt.NDArray[np.float64] | None,
+    n: int,
 ) -> None:
     if not np.isclose(noise.dt_ns, dt_ns):
         raise CpunetError(

@@ -99,6 +99,7 @@ def evaluate(
         data,
         parse_selection(str(info["peak"]), recipe.peaks),
         recipe,
+        remains=ren.remains,
         fitted=rivals,
         monitor=monitor,
     )

@@ -9,10 +9,13 @@ from typing import Any
 
 from torch import nn
 
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import measured_noise
+from cpunet.jobs.remains import drawn_like, measured_remains, told_of
 from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
@@ -29,11 +32,15 @@ from cpunet.training.run_folder import load_network, read_recipe
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Prepared pulses of both sides, and the file of the measured ones."""
+    """Prepared pulses of both sides, the file of the measured ones, and what was read of it.
+
+    Without the latter, `data_set`, remains of earlier pulses are not looked for.
+    """
 
     sim: Pulses
     data: Pulses
     data_file: InputFile
+    data_set: InputSet | None = None
 
 
 def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
@@ -100,7 +107,8 @@ def match(
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation)
+    remains, drawn, told_of_remains = _remains(sides, recipe, monitor)
+    noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
     if note is not None:
         monitor.note(f"warning: {note}")
 
@@ -116,6 +124,7 @@ def match(
         recipe,
         seed=seed,
         known=known,
+        remains=drawn,
         listener=tell,
     )
     compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
@@ -139,6 +148,7 @@ def match(
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
     ren.response = response
     ren.set_noise(noise)
+    ren.remains = drawn
     chain, parts, more = ren, {}, {}
     if isinstance(recipe.generator, HybridConfig):
         residual, kept = fit_residual(
@@ -170,6 +180,30 @@ def match(
             "rms_error": noise.rms_error,
         },
     }
+    if told_of_remains is not None:
+        told["remains"] = told_of_remains
     if more:
         told["residual"] = more
     return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
+
+
+def _remains(
+    sides: Sides, recipe: Recipe, monitor: Monitor
+) -> tuple[Remains | None, DrawnRemains | None, dict[str, Any] | None]:
+    """Remains under the data, those to be drawn if there surely are any, and what to tell."""
+    if sides.data_set is None:
+        return None, None, None
+    found, reason = measured_remains(sides.data_file, recipe.preparation)
+    if found is None:
+        monitor.note(f"remains of earlier pulses are not looked for: {reason}")
+        return None, None, told_of(None, None, reason)
+    drawn = drawn_like(found, sides.data_file, sides.data_set, recipe.preparation)
+    told = told_of(found, drawn, None)
+    if found.law is None:
+        return found, None, told
+    tenth = told["percent_above"]["10_kev"]["law"]
+    monitor.note(
+        f"remains of earlier pulses: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+        f"kHz, {tenth:.0f} % of the traces on more than 10 keV; translations are given them"
+    )
+    return found, drawn, told

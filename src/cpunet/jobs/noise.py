@@ -5,16 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 NOISE_TRACES = 4096  # from whose baselines the noise is measured
+FEWEST_LOW = 200  # of them, if those with remains are to be left out
 
 
 def measured_noise(
-    data_file: InputFile, windows: Pulses, config: PreparationConfig
+    data_file: InputFile,
+    windows: Pulses,
+    config: PreparationConfig,
+    remains: Remains | None = None,
 ) -> tuple[BaselineNoise, str | None]:
     """Measure the noise of a file of measured pulses.
 
@@ -26,6 +31,8 @@ def measured_noise(
         Its prepared pulses, used if its traces have no long baselines.
     config
         How they were prepared.
+    remains
+        Of earlier pulses under the traces: baselines with them are no noise.
 
     Returns
     -------
@@ -38,15 +45,20 @@ def measured_noise(
         If neither traces nor windows have enough flat baselines.
     """
     try:
-        return noise_of_traces(data_file, config), None
+        return noise_of_traces(data_file, config, remains), None
     except CpunetError as error:
         half = config.baseline_samples // 2
         noise = BaselineNoise.from_windows(windows, half)
         return noise, f"noise is taken from {half} samples a pulse: {error}"
 
 
-def noise_of_traces(data_file: InputFile, config: PreparationConfig) -> BaselineNoise:
+def noise_of_traces(
+    data_file: InputFile, config: PreparationConfig, remains: Remains | None = None
+) -> BaselineNoise:
     """Measure the noise from the raw samples before the pulses.
+
+    Where traces have remains of earlier pulses, from those whose level is below that of an
+    empty baseline: they have none to speak of, and nothing was asked of their slopes.
 
     Raises
     ------
@@ -57,4 +69,8 @@ def noise_of_traces(data_file: InputFile, config: PreparationConfig) -> Baseline
     if block is None:
         raise CpunetError(f"{data_file.path}: holds no traces to measure the noise from")
     known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
+    if remains is not None and remains.law is not None and remains.coupled:
+        low = block.waveforms[:, : remains.samples].mean(axis=1) < remains.baseline_adc
+        if (known & low).sum() >= FEWEST_LOW:
+            known &= low
     return BaselineNoise.from_traces(block[known], config)

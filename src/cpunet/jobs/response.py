@@ -165,7 +165,7 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
     slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     fast = dict(
-        zip(response.fast_decays_us.tolist(), response.decay_weights.tolist(), strict=True)
+        zip(response.fast_times_us.tolist(), response.decay_weights.tolist(), strict=True)
     )
     taus = moved_apart([*poles, *slow, 1e3 * main, *(1e3 * tau for tau in fast)])
     n, n_slow = len(poles), len(slow)
@@ -311,8 +311,12 @@ def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) 
         sources[name] = (f"log_ringing.{i + 1}", value)
     for i, tau in enumerate(response.slow_ns.tolist()):
         sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
-    for i, tau in enumerate(response.fast_decays_us.tolist()):
-        sources[f"decay_{tau:g}_us"] = (f"decay_weights.{i + 1}", 1.0)
+    free = response.config.free_decays
+    for i, tau in enumerate(response.fast_times_us.tolist()):
+        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
+        sources[name] = (f"decay_weights.{i + 1}", 1.0)
+        if free:
+            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
     return {
         name: scale * float(errors[source])
         for name, (source, scale) in sources.items()

@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.electronics.rivals.base import Rival
 from cpunet.electronics.rivals.registry import RIVALS
 from cpunet.errors import CpunetError
 from cpunet.jobs.inputs import InputFile, InputSet
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import noise_of_traces
+from cpunet.jobs.remains import measured_remains
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
 
@@ -28,13 +30,14 @@ class FittedRivals:
     methods
         Fitted rivals by name.
     noise
-        Drawn from the data's baselines; None if there are none to draw from.
+        Drawn from the data's baselines, with remains of earlier pulses if these have some; None
+        if there are none to draw from.
     missing
         Why a method, or the noise, is not there.
     """
 
     methods: dict[str, Rival] = field(default_factory=dict)
-    noise: BaselineNoise | None = None
+    noise: BaselineNoise | TraceNoise | None = None
     missing: dict[str, str] = field(default_factory=dict)
 
 
@@ -45,6 +48,7 @@ def fit_rivals(
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
+    remains: DrawnRemains | None = None,
     fitted: bool,
     monitor: Monitor,
 ) -> FittedRivals:
@@ -60,6 +64,8 @@ def fit_rivals(
         Energies that the rivals are fitted to: those of the training.
     recipe
         The run's settings.
+    remains
+        Of earlier pulses, as the run has learned them.
     fitted
         Whether there are to be any; there is noise in any case, for the truth.
     monitor
@@ -73,9 +79,13 @@ def fit_rivals(
     config, result = recipe.preparation, FittedRivals()
     # all rivals here; the untranslated simulation stands in the scores anyway
     kinds = {name: kind for name, kind in RIVALS.items() if fitted and name != "raw"}
-    result.noise = _or_reason(
-        result.missing, "noise", lambda: noise_of_traces(data_file, config)
+    there = remains is not None and remains.law.rate_khz > 0
+    found = measured_remains(data_file, config)[0] if there else None
+    noise = _or_reason(
+        result.missing, "noise", lambda: noise_of_traces(data_file, config, found)
     )
+    if noise is not None:
+        result.noise = TraceNoise(noise, remains) if there else noise
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)

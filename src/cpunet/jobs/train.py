@@ -205,7 +205,9 @@ class TrainingJob:
             It, the content of ``run.json``, and its recipe.
         """
         started, clock = datetime.now(UTC), time.perf_counter()
-        sides = Sides(self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file)
+        sides = Sides(
+            self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
+        )
         if self.init is not None:
             known = known_response(self.init, self.data.dt_ns)
         with (

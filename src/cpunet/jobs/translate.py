@@ -37,6 +37,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
+from cpunet.translation.learned_remains import NONE, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
@@ -124,12 +125,13 @@ class FileTranslation:
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
+        remains = wanted_remains(self.translator, self.options.remains, raw=adc is not None)
         if adc is None or not isinstance(self.translator, REN):
-            return Normalised(self.translator)
+            return Normalised(self.translator, remains)
         scale = adc_scale(
             self.run, self.translator, adc_per_kev=adc.adc_per_kev, baseline=adc.baseline
         )
-        return AdcForm(self.translator, scale, adc.length, adc.n_pre)
+        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains)
 
     def _require_sampling(self, source: InputFile, pulses: PulseSource) -> None:
         if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
@@ -168,6 +170,8 @@ class FileTranslation:
         for number, block in enumerate(regrouped(_read(pulses, advance), NOISE_ROWS)):
             formed = self._formed(block, number, noise_key)
             columns: dict[str, Any] = {"rejection": (formed.codes, "")}
+            if formed.remains_kev is not None:
+                columns["remains_kev"] = (formed.remains_kev, "keV")
             if times is not None:
                 columns["realisation"] = (np.tile(np.arange(times), len(block)), "")
             writer.append(formed.pulses, columns, others.read(start, len(block), times or 1))
@@ -207,6 +211,7 @@ def translate_file(
     append_column: str | None = None,
     realisations: int | None = None,
     adc: Adc | None = None,
+    remains: str = NONE,
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
@@ -238,6 +243,9 @@ def translate_file(
         ``realisation`` counts.
     adc
         Raw traces in ADC counts instead of normalised windows.
+    remains
+        Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
+        behind the data's quality cuts), ``"none"``, or a rate in kHz.
     resume
         Leave an output as it is that was made of this source with this run and these options.
     device, force, monitor
@@ -255,7 +263,9 @@ def translate_file(
         If run, source or output cannot be used, options contradict each other, no pulse can be
         translated, the source changes meanwhile, or another process writes the same output.
     """
-    options = TranslateOptions(inverse, noise, seed, table, append_column, realisations, adc)
+    options = TranslateOptions(
+        inverse, noise, seed, table, append_column, realisations, adc, remains
+    )
     translation = FileTranslation(run, options, device)
     for note in translation.notes:
         monitor.note(note)

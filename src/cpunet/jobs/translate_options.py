@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from cpunet.errors import CpunetError
+from cpunet.translation.learned_remains import NONE
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class TranslateOptions:
     append_column: str | None = None
     realisations: int | None = None
     adc: Adc | None = None
+    remains: str = NONE
 
     def __post_init__(self) -> None:
         if self.realisations is not None and self.realisations < 1:
@@ -43,5 +45,9 @@ class TranslateOptions:
             raise CpunetError(
                 "a column is appended to the table that is read; leave out --out-table"
             )
+        if self.remains != NONE and self.inverse:
+            raise CpunetError("the inverse gives charge, without remains; leave out --remains")
+        if self.remains != NONE and not self.noise:
+            raise CpunetError("remains are drawn with the noise; leave out --no-noise")
         if self.adc is not None and self.inverse:
             raise CpunetError("the inverse gives charge, no ADC counts; leave out --output adc")

@@ -15,7 +15,9 @@ from cpunet.translation.output_form import OutputForm
 
 Writer = PulseWriter | ColumnAppender
 
-OWN_COLUMNS = frozenset({"waveform", "energy", "event_number", "rejection", "realisation"})
+OWN_COLUMNS = frozenset(
+    {"waveform", "energy", "event_number", "rejection", "realisation", "remains_kev"}
+)
 
 
 def writer_of(

@@ -22,6 +22,8 @@ from cpunet.jobs.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
+from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 
 Flags = npt.NDArray[np.bool_]
@@ -115,6 +117,8 @@ def translate_all(
     truth = None if responses is None else np.empty(shape, np.float32)
     true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
+    # as the data that they are compared with have them
+    remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
     with monitor.stage("Translating", len(pulses)) as advance:
@@ -132,7 +136,10 @@ def translate_all(
                     noisy[name][rows] = drawn
             clean["ren"] = ren.apply(block.waveforms, noise=False)
             noisy["ren"][rows] = ren.apply(
-                block.waveforms, energy_kev=block.energy_kev, generator=generator
+                block.waveforms,
+                energy_kev=block.energy_kev,
+                generator=generator,
+                remains_kev=drawn_kev(remains, len(block), generator),
             )
             if truth is not None:
                 truth[rows] = clean["truth"]

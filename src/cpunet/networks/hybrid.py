@@ -124,7 +124,7 @@ class HybridGenerator(ResponseGenerator):
 
     def __init__(self, chain: ResponseGenerator, residual: EdgeResidual) -> None:
         nn.Module.__init__(self)  # not the base's: all that it would make is there
-        self.response = chain.response
+        self.response, self.remains = chain.response, chain.remains
         for name, values in chain.named_buffers(recurse=False):
             self.register_buffer(name, values)
         self.residual = residual

@@ -38,6 +38,8 @@ class ElectronicsResponse(nn.Module):
     dt_ns: Tensor
     slow_ns: Tensor
     fast_decays_us: Tensor
+    decay_known: float | None = None
+    """Relative error of the main decay, if baselines have told it."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__()
@@ -60,6 +62,8 @@ class ElectronicsResponse(nn.Module):
         self.register_buffer(
             "fast_decays_us", torch.tensor(config.fast_decays_us, dtype=torch.float64)
         )
+        if config.free_decays:
+            self.log_fast_decays_us = log(list(config.fast_decays_us))
         rings = [] if config.ringing_mhz is None else [config.ringing_mhz, config.ringing_ns]
         # weights of sine and cosine; frequency in MHz and damping in ns
         self.ringing = nn.Parameter(torch.zeros(len(rings), dtype=torch.float64))
@@ -106,6 +110,11 @@ class ElectronicsResponse(nn.Module):
         whole: Tensor = fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
         return whole
 
+    @property
+    def fast_times_us(self) -> Tensor:
+        """Times of the faster decays, fixed or free."""
+        return self.log_fast_decays_us.exp() if self.config.free_decays else self.fast_decays_us
+
     def bandwidth(self, s: Tensor) -> Tensor:
         """Transfer function of all but the decays at `s` in 1/ns."""
         transfer = torch.ones_like(s)
@@ -126,7 +135,7 @@ class ElectronicsResponse(nn.Module):
         """The decays alone: a step of 1 at time 0, at times of 0 and later in µs."""
         main = torch.exp(-time_us / self.log_decay_us.exp())
         step = main
-        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
+        for weight, tau in zip(self.decay_weights, self.fast_times_us, strict=True):
             step = step + weight * (torch.exp(-time_us / tau) - main)
         return step
 
@@ -141,12 +150,17 @@ class ElectronicsResponse(nn.Module):
                 for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True)
             }
             | {"decay_us": float(self.log_decay_us.exp())}
-            | {
-                f"decay_{tau:g}_us": float(weight)
-                for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True)
-            }
+            | self._fast_decays()
             | self._ringing()
         )
+
+    def _fast_decays(self) -> dict[str, float]:
+        times, weights = self.fast_times_us.tolist(), self.decay_weights.tolist()
+        if not self.config.free_decays:
+            return {f"decay_{tau:g}_us": w for tau, w in zip(times, weights, strict=True)}
+        return {f"fast_decay_{i + 1}_us": tau for i, tau in enumerate(times)} | {
+            f"fast_decay_{i + 1}_share": weight for i, weight in enumerate(weights)
+        }
 
     def _ringing(self) -> dict[str, float]:
         if not len(self.ringing):

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
+from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 
@@ -28,6 +29,8 @@ class ResponseGenerator(nn.Module):
     noise_lines: Tensor
     noise_shares: Tensor
     n_baselines: Tensor
+    remains: DrawnRemains | None = None
+    """Of earlier pulses, that records are given beside the noise."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__()
@@ -70,6 +73,11 @@ class ResponseGenerator(nn.Module):
             lines,
             shares,
         )
+
+    @property
+    def trace_noise(self) -> TraceNoise:
+        """The noise, and remains if there are any."""
+        return TraceNoise(self.noise, self.remains)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Noise-free records of prepared simulated windows, as `ElectronicsResponse`."""

@@ -29,6 +29,7 @@ class ResponseConfig(Config):
     ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
     times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
     ``ringing_ns`` are where the frequency and the damping of a ringing start; none if null.
+    With ``free_decays`` the ``fast_decays_us`` are free, too, and start there.
     """
 
     name: Literal["response"]
@@ -36,6 +37,7 @@ class ResponseConfig(Config):
     slow_ns: Annotated[tuple[Positive, ...], Field(max_length=100)]
     decay_us: Positive
     fast_decays_us: Annotated[tuple[Positive, ...], Field(max_length=100)]
+    free_decays: bool
     ringing_mhz: Positive | None
     ringing_ns: Positive
 

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import ResponseConfig
@@ -43,6 +44,11 @@ RINGS, PROMISES = 0.7, 0.9
 # Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
 # deviations from which on that is not as it is simulated.
 ONSET, OFF = -15, 4.0
+# Where a fast decay of free time starts, in us, and its share.
+FAST_DECAY_US, FAST_SHARE = 3.0, 0.02
+# The main decay that remains of earlier pulses tell is known no better than this: it is that of
+# one exponential, and a readout may have more.
+LEAST_DECAY_ERROR = 0.01
 # Pulses of each side with which a poor fit is looked at.
 CHECKED = 4096
 # Rounds of optimal weights: those of the second are of where the first has led.
@@ -129,6 +135,7 @@ def fit_response(
     *,
     seed: int,
     known: ElectronicsResponse | None = None,
+    remains: DrawnRemains | None = None,
     listener: Listener | None = None,
 ) -> tuple[ElectronicsResponse, Fit]:
     """Fit a response to unpaired prepared pulses.
@@ -147,6 +154,8 @@ def fit_response(
     known
         The response of a similar readout, of the recipe's configuration, to start from.  Only
         if that leads nowhere the recipe's own starts are tried.
+    remains
+        Of earlier pulses, that the data have and the translations are to be given.
     listener
         Told step and chi-square.
 
@@ -157,13 +166,14 @@ def fit_response(
     """
     config, training = recipe.matching
     rng = np.random.default_rng(seed)
-    sets = PulseSets(sim, data, noise, recipe, rng)
+    sets = PulseSets(sim, data, noise, recipe, rng, remains)
     some = sets.bands(training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
     if listener is not None:
         listener = _counted(listener)
+    told = None if remains is None else remains.law.decay_us
     near = None if known is None else _from_known(first, known, training, listener)
-    problem, found = near or _best_start(first, config, training, listener)
+    problem, found = near or _best_start(first, config, training, told, listener)
     everything = sets.bands()
     if not _poor(problem, found):
         fit = _refined(problem, found, everything, training, listener)
@@ -279,20 +289,50 @@ def _best_start(
     first: ResponseProblem,
     config: ResponseConfig,
     training: MatchingConfig,
+    decay_us: float | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
-    """Fit from start after start, until one is good or all are done."""
+    """Fit from start after start, until one is good or all are done.
+
+    If the first is poor, a decay whose time is free is tried before other starts.
+    """
     best: tuple[ResponseProblem, Minimum] | None = None
     dt_ns = float(first.response.dt_ns)
     for factor in training.start_factors:
-        problem = first.of(start_response(config, dt_ns, factor, first.slope))
+        start = start_response(config, dt_ns, factor, first.slope, decay_us)
+        problem = first.of(start)
         found = levenberg_marquardt(problem, training.steps, listener)
+        if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
+            problem, found = free_decay_if_better(problem, found, training, decay_us, listener)
         if best is None or found.cost < best[1].cost:
             best = problem, found
         if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
             break  # no other valley is to be looked for
     assert best is not None  # the recipe has one start at least
     return best
+
+
+def free_decay_if_better(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    decay_us: float | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Let a fast decay have a time of its own, if that explains much of what is left."""
+    config = problem.response.config
+    if config.free_decays or not config.fast_decays_us:
+        return problem, found
+    free = config.model_copy(update={"free_decays": True, "fast_decays_us": (FAST_DECAY_US,)})
+    dt_ns = float(problem.response.dt_ns)
+    response = start_response(free, dt_ns, 1.0, problem.slope, decay_us)
+    response.decay_weights.data.fill_(FAST_SHARE)  # of a share of 0 no time is told
+    again = problem.of(response)
+    fitted = levenberg_marquardt(again, training.steps, listener)
+    steps = found.steps + fitted.steps
+    if fitted.cost < RINGS * found.cost:
+        return again, fitted._replace(steps=steps)
+    return problem, found._replace(steps=steps)
 
 
 def ringing_if_better(
@@ -328,12 +368,22 @@ def _counted(listener: Listener) -> Listener:
 
 
 def start_response(
-    config: ResponseConfig, dt_ns: float, factor: float, slope: float
+    config: ResponseConfig,
+    dt_ns: float,
+    factor: float,
+    slope: float,
+    decay_us: float | None = None,
 ) -> ElectronicsResponse:
-    """A response with the recipe's poles times a factor, and the data's own decay."""
+    """A response with the recipe's poles times a factor, and the data's own decay.
+
+    That is known as `decay_us`, or it follows from the slope of the tails.
+    """
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
     set_decay(response, slope)
+    if decay_us is not None:
+        response.log_decay_us.data.fill_(math.log(decay_us))
+        response.decay_known = LEAST_DECAY_ERROR
     return response
 
 

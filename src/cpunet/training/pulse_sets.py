@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import record_length
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
@@ -32,6 +33,8 @@ class PulseSets:
         With a response to be matched.
     rng
         Chooses the parts, and draws the noise.
+    remains
+        Of earlier pulses, that the data have.
 
     Raises
     ------
@@ -46,8 +49,10 @@ class PulseSets:
         noise: BaselineNoise,
         recipe: Recipe,
         rng: np.random.Generator,
+        remains: DrawnRemains | None = None,
     ) -> None:
         self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
+        self.remains = remains
         require_energies(sim.energy_kev)
         parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
         # in an order of which any beginning is a fair part
@@ -79,6 +84,6 @@ class PulseSets:
         rows = band.sim[sim]
         pulses, energy_kev = self.sim.waveforms[rows], self.sim.energy_kev[rows]
         length, draws = record_length(pulses.shape[1]), training.noise_sets
-        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng)
+        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng, self.remains)
         translated = Translated(pulses, drawn, moments, band.weights[sim])
         return Band(band.name, translated, rows)

@@ -225,7 +225,10 @@ def fit_residual(
     records = _records(generator, sim, recipe)
     noise = torch.from_numpy(
         np.concatenate(
-            [generator.noise.draw(energy_kev, records.shape[1], rng) for _ in range(DRAWS)]
+            [
+                generator.trace_noise.draw(energy_kev, records.shape[1], rng)
+                for _ in range(DRAWS)
+            ]
         )
     )
     features = Features(data[own_data], recipe)

@@ -41,6 +41,8 @@ class Parameters:
             "slow_weights": WEIGHT_WIDTH,
         }
         self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
+        if response.decay_known is not None:
+            self.widths[self.labels.index("log_decay_us")] = response.decay_known
         times = [label.startswith("log") for label in self.labels]
         self.steps = np.where(times, TIME_STEP, WEIGHT_STEP)
 

@@ -100,11 +100,20 @@ def read_recipe(run: Path) -> Recipe:
     """Return the resolved recipe of a run."""
     path = Path(run) / RECIPE
     try:
-        return recipe_from(parsed(read_text(path, MOST_BYTES)), source=str(path))
+        settings = parsed(read_text(path, MOST_BYTES))
+        return recipe_from(_completed(settings), source=str(path))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
     except yaml.YAMLError as error:
         raise CpunetError(f"{path}: damaged; train again") from error
+
+
+def _completed(settings: Any) -> Any:
+    """Settings with what recipes of earlier versions did not have yet."""
+    generator = settings.get("generator") if isinstance(settings, dict) else None
+    if not isinstance(generator, dict) or "fast_decays_us" not in generator:
+        return settings
+    return settings | {"generator": {"free_decays": False} | generator}
 
 
 def read_losses(run: Path) -> list[Record]:

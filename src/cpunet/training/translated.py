@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ import scipy.fft
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import (
     ROOM_AFTER,
     ROOM_BEFORE,
@@ -48,12 +49,17 @@ class Noise:
     trace, start, factor
         Of each draw and pulse: which trace, from which sample on, and its sign over the energy;
         each of shape (draws, pulses).
+    left, decay
+        Remains of earlier pulses at the beginning of each record, shape (draws, pulses), and
+        what becomes of 1 over it, shape (samples,); None for none.
     """
 
     traces: FloatArray
     trace: npt.NDArray[np.intp]
     start: npt.NDArray[np.intp]
     factor: FloatArray
+    left: FloatArray | None = None
+    decay: FloatArray | None = None
 
     @classmethod
     def draw(
@@ -63,6 +69,7 @@ class Noise:
         length: int,
         draws: int,
         rng: np.random.Generator,
+        remains: DrawnRemains | None = None,
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
@@ -81,7 +88,7 @@ class Noise:
         # each trace before any is used again
         trace = np.concatenate([rng.permutation(kept) for _ in range(-(-n * pairs // kept))])
         sign = rng.choice((-1.0, 1.0), (pairs, n))
-        return cls(
+        drawn = cls(
             traces,
             np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)[:draws],
             np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)[:draws],
@@ -89,6 +96,20 @@ class Noise:
                 np.stack([sign, -sign], axis=1).reshape(2 * pairs, n)[:draws] / energy_kev,
                 np.float32,
             ),
+        )
+        if remains is None:
+            return drawn
+        left = np.stack([remains.factors(energy_kev, rng)[0] for _ in range(draws)])
+        return replace(drawn, left=left, decay=np.asarray(remains.decay(length), np.float32))
+
+    def first(self, n: int) -> Noise:
+        """That of the first `n` pulses."""
+        return replace(
+            self,
+            trace=self.trace[:, :n],
+            start=self.start[:, :n],
+            factor=self.factor[:, :n],
+            left=None if self.left is None else self.left[:, :n],
         )
 
     def add(self, records: FloatArray, draw: int, first: int) -> FloatArray:
@@ -99,6 +120,8 @@ class Noise:
             each[draw, rows] for each in (self.trace, self.start, self.factor)
         )
         add_noise(records, self.traces, trace, start, factor, noisy)
+        if self.left is not None and self.decay is not None:
+            noisy += self.left[draw, rows, np.newaxis] * self.decay
         return noisy
 
 
@@ -136,13 +159,7 @@ class Translated:
 
     def first(self, n: int) -> Translated:
         """The first `n` pulses, with their noise."""
-        noise = Noise(
-            self.noise.traces,
-            self.noise.trace[:, :n],
-            self.noise.start[:, :n],
-            self.noise.factor[:, :n],
-        )
-        return Translated(self.sim[:n], noise, self.moments, self.weights[:n])
+        return Translated(self.sim[:n], self.noise.first(n), self.moments, self.weights[:n])
 
     def sums(
         self,

@@ -40,6 +40,7 @@ class Backend(ABC):
         energy_kev: Energies | None,
         noise: bool,
         generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Return windows, rows of NaN where there is none, and a `Rejection` for each."""
 
@@ -58,8 +59,14 @@ class NetworkBackend(Backend):
         energy_kev: Energies | None,
         noise: bool,
         generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Run the network; its output is a prepared window as it is."""
+        if remains_kev is not None:
+            raise CpunetError(
+                "a network has what it was shown; remains of earlier pulses belong to readout "
+                "chains, so leave out remains_kev"
+            )
         del energy_kev
         batch = torch.from_numpy(windows).to(self.device)
         out = self._translate(batch[:, None], generator, mean=not noise)
@@ -90,6 +97,7 @@ class ResponseBackend(Backend):
         energy_kev: Energies | None,
         noise: bool,
         generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Respond, add noise in proportion to 1/energy, and prepare like data.
 
@@ -106,6 +114,8 @@ class ResponseBackend(Backend):
         drawn = self.chain.noise if noise else None
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
+        if remains_kev is not None:
+            return self._with_remains(records, energy_kev, noise, int(seed), remains_kev)
         return finish_with_codes(
             records,
             self.config,
@@ -113,6 +123,32 @@ class ResponseBackend(Backend):
             noise=drawn,
             energy_kev=energy_kev if noise else None,
             seed=int(seed),
+        )
+
+    def _with_remains(
+        self,
+        records: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        seed: int,
+        remains_kev: Energies,
+    ) -> tuple[FloatArray, Codes]:
+        """The same, each record on what earlier pulses have left."""
+        remains = self.chain.remains
+        if remains is None or energy_kev is None or not noise:
+            raise CpunetError(
+                "remains of earlier pulses are drawn with the noise, by energies, and by a run "
+                "that tells of them; leave out remains_kev"
+            )
+        left = remains_kev * remains.height / energy_kev
+        return finish_with_codes(
+            records,
+            self.config,
+            dt_ns=float(self.chain.response.dt_ns),
+            noise=self.chain.noise,
+            energy_kev=energy_kev,
+            seed=seed,
+            added=left[:, np.newaxis] * remains.decay(records.shape[1]),
         )
 
 
@@ -130,9 +166,10 @@ class InverseBackend(Backend):
         energy_kev: Energies | None,
         noise: bool,
         generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Undo the response and the noise; nothing is drawn."""
-        del energy_kev, noise, generator
+        del energy_kev, noise, generator, remains_kev
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
         result = np.full_like(windows, np.nan)

@@ -116,6 +116,7 @@ class _Draw(Backend):
         energy_kev: Energies | None,
         noise: bool,
         generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Share the pulses out, and translate each by its own."""
         device = self.device if generator is None else generator.device
@@ -127,7 +128,10 @@ class _Draw(Backend):
             rows = np.flatnonzero(chosen == number)
             if rows.size:
                 energies = None if energy_kev is None else energy_kev[rows]
-                result[rows], codes[rows] = backend(windows[rows], energies, noise, generator)
+                left = None if remains_kev is None else remains_kev[rows]
+                result[rows], codes[rows] = backend(
+                    windows[rows], energies, noise, generator, left
+                )
         return result, codes
 
 

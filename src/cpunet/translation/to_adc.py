@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import ResponseBackend
-from cpunet.translation.output_form import Formed
+from cpunet.translation.output_form import Formed, drawn_kev
 from cpunet.translation.translator import BATCH, REN
 
 HIGHEST = int(np.iinfo(np.uint16).max)
@@ -132,6 +133,8 @@ class AdcForm:
     length, n_pre
         Samples of a trace, and those before a pulse reaches 99.9 % of its maximum (without
         noise); the window's own if None.
+    remains
+        Of earlier pulses, to be drawn: they lift the baseline at the beginning of a trace.
 
     Raises
     ------
@@ -143,9 +146,14 @@ class AdcForm:
     units = "ADC"
 
     def __init__(
-        self, ren: REN, scale: AdcScale, length: int | None = None, n_pre: int | None = None
+        self,
+        ren: REN,
+        scale: AdcScale,
+        length: int | None = None,
+        n_pre: int | None = None,
+        remains: DrawnRemains | None = None,
     ) -> None:
-        self.ren, self.scale = ren, scale
+        self.ren, self.scale, self.remains = ren, scale, remains
         self.config = ren.recipe.preparation
         self.length = self.config.length if length is None else length
         self.n_pre = self.config.samples_before if n_pre is None else n_pre
@@ -167,7 +175,7 @@ class AdcForm:
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
         """Translate pulses, keeping their rows; those without energy are rejected."""
-        backend = self.ren.backend
+        backend, left = self.ren.backend, drawn_kev(self.remains, len(pulses), generator)
         if isinstance(backend, ResponseBackend):
             windows, codes = self._of_chain(backend, pulses, noise, generator)
         else:
@@ -178,11 +186,16 @@ class AdcForm:
             )
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
+        if left is not None and self.remains is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                heights = left * self.remains.height / pulses.energy_kev
+            decay = self.remains.decay(self.length, lead_us=0.0)
+            windows += heights[:, np.newaxis] * decay
         windows[codes != Rejection.ACCEPTED] = np.nan
         scale = np.where(unknown, 0.0, self.scale.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.scale.baseline)
         # 16 bits are exact in single precision
-        return Formed(pulses.with_waveforms(traces.astype(np.float32)), codes, saturated)
+        return Formed(pulses.with_waveforms(traces.astype(np.float32)), codes, saturated, left)
 
     def _of_chain(
         self,

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
@@ -35,6 +36,7 @@ from cpunet.translation.backends import (
     NetworkBackend,
     ResponseBackend,
 )
+from cpunet.translation.learned_remains import remains_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
@@ -115,6 +117,7 @@ class Translator:
                 residual = EdgeResidual(generator.residual)
                 load_network(run, RESIDUAL, residual, device)
                 response = HybridGenerator(response, residual)
+            response.remains = remains_of(read_info(run))
             return ResponseBackend(response, recipe.preparation)
         inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
         load_network(run, cls.part, inverse, device)
@@ -127,6 +130,7 @@ class Translator:
         energy_kev: npt.ArrayLike | None = None,
         noise: bool = True,
         seed: int | None = None,
+        remains_kev: npt.ArrayLike | None = None,
     ) -> Waveforms:
         """Translate waveforms, given as a NumPy array or a torch tensor.
 
@@ -142,6 +146,8 @@ class Translator:
             Add noise; off, the same pulses come out every time.
         seed
             Of the noise; None for a fresh draw.
+        remains_kev
+            What earlier pulses have left under each pulse, in keV; `remains` draws some.
 
         Returns
         -------
@@ -161,9 +167,11 @@ class Translator:
         """
         if isinstance(waveforms, torch.Tensor):
             array = waveforms.detach().cpu().numpy()
-            result = self._translate_array(array, energy_kev, noise, seed)
+            result = self._translate_array(array, energy_kev, noise, seed, remains_kev)
             return torch.from_numpy(result).to(waveforms.device)
-        return self._translate_array(np.asarray(waveforms), energy_kev, noise, seed)
+        return self._translate_array(
+            np.asarray(waveforms), energy_kev, noise, seed, remains_kev
+        )
 
     def translate_pulses(
         self,
@@ -172,6 +180,7 @@ class Translator:
         noise: bool = True,
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
+        remains_kev: Energies | None = None,
     ) -> Translated:
         """Translate a set, keeping its rows: those rejected become NaN and have a code.
 
@@ -186,6 +195,8 @@ class Translator:
             Source of the noise.
         progress
             Called with the number of pulses done since the last call.
+        remains_kev
+            What earlier pulses have left under each of them, in keV, shape ``(n,)``.
 
         Raises
         ------
@@ -212,8 +223,15 @@ class Translator:
             noise=noise,
             generator=generator,
             progress=progress,
+            remains_kev=None if remains_kev is None else remains_kev[index],
         )
         return Translated(pulses.with_waveforms(waveforms), codes)
+
+    @property
+    def remains(self) -> DrawnRemains | None:
+        """Of earlier pulses, as the run has learned them; None if it does not tell of any."""
+        backend = self.backend
+        return backend.chain.remains if isinstance(backend, ResponseBackend) else None
 
     @property
     def needs_energies(self) -> bool:
@@ -228,6 +246,7 @@ class Translator:
         noise: bool = True,
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
+        remains_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); NaN where it cannot be done."""
         result, _ = self.apply_with_codes(
@@ -236,6 +255,7 @@ class Translator:
             noise=noise,
             generator=generator,
             progress=progress,
+            remains_kev=remains_kev,
         )
         return result
 
@@ -247,6 +267,7 @@ class Translator:
         noise: bool = True,
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
+        remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
         """As `apply`, with a `Rejection` for each row."""
         result = np.empty_like(windows)
@@ -255,8 +276,9 @@ class Translator:
             for first in range(0, len(windows), BATCH):
                 rows = slice(first, first + BATCH)
                 energies = None if energy_kev is None else energy_kev[rows]
+                left = None if remains_kev is None else remains_kev[rows]
                 result[rows], codes[rows] = self.backend(
-                    windows[rows], energies, noise, generator
+                    windows[rows], energies, noise, generator, left
                 )
                 if progress is not None:
                     progress(len(windows[rows]))
@@ -277,6 +299,7 @@ class Translator:
         energy_kev: npt.ArrayLike | None,
         noise: bool,
         seed: int | None,
+        remains_kev: npt.ArrayLike | None,
     ) -> FloatArray:
         if not waveforms.ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
@@ -288,7 +311,10 @@ class Translator:
         pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
         if energy_kev is not None:
             pulses = replace(pulses, energy_kev=_one_each(energy_kev, len(pulses)))
-        done = self.translate_pulses(pulses, noise=noise, generator=self.seeded(seed))
+        left = None if remains_kev is None else _one_each(remains_kev, len(pulses))
+        done = self.translate_pulses(
+            pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
+        )
         if single and not done.valid[0]:
             raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
         if not done.valid.all():

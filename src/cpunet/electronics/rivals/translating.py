@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.finishing import blocks, finish
 from cpunet.electronics.rivals.base import Rival
 from cpunet.errors import CpunetError
@@ -17,7 +18,7 @@ def translate_like_data(
     pulses: Pulses,
     config: PreparationConfig,
     *,
-    noise: BaselineNoise | None = None,
+    noise: BaselineNoise | TraceNoise | None = None,
     seed: int | np.random.Generator = 0,
 ) -> Pulses:
     """Translate prepared simulated pulses and finish them like data.

@@ -1,0 +1,73 @@
+"""Remains of earlier pulses as a run has learned them, or at a rate that is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.errors import CpunetError
+
+if TYPE_CHECKING:
+    from cpunet.translation.translator import Translator
+
+NONE, LEARNED = "none", "learned"
+
+
+def remains_of(info: Mapping[str, Any]) -> DrawnRemains | None:
+    """What ``run.json`` tells of remains; of rate 0 if the data surely have none."""
+    told = (info.get("fit") or {}).get("remains") or {}
+    if "drawn" not in told:
+        return None
+    drawn = DrawnRemains.of(told["drawn"])
+    sure = float(told["rate_khz"]) > 0
+    return drawn if sure else replace(drawn, law=replace(drawn.law, rate_khz=0.0))
+
+
+def wanted_remains(
+    translator: Translator, wanted: str | float, *, raw: bool = False
+) -> DrawnRemains | None:
+    """Remains to be added to translations.
+
+    Parameters
+    ----------
+    translator
+        A trained run.
+    wanted
+        ``"learned"``: as the data have them; ``"none"``; or a rate in kHz.
+    raw
+        For raw traces, which have not passed any cuts.
+
+    Raises
+    ------
+    CpunetError
+        If it is none of these, or the run does not tell what it takes.
+    """
+    if wanted == NONE:
+        return None
+    rate = None if wanted == LEARNED else _rate(wanted)
+    known = translator.remains
+    if known is None:
+        raise CpunetError(
+            f"--remains {wanted}: the run tells nothing of remains of earlier pulses (a "
+            "network, trained before they were told, or without raw traces); train a readout "
+            "chain on raw traces, or leave it out"
+        )
+    if rate is not None:
+        known = known.uncut(rate)
+    elif raw:
+        known = known.uncut()
+    return known if known.law.rate_khz > 0 else None
+
+
+def _rate(wanted: str | float) -> float:
+    try:
+        rate = float(wanted)
+    except ValueError:
+        rate = np.nan
+    if not (np.isfinite(rate) and rate >= 0):
+        raise CpunetError(f"--remains {wanted}: expected learned, none, or a rate in kHz")
+    return rate
