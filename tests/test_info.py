@@ -6,10 +6,12 @@ import json
 import tracemalloc
 from pathlib import Path
 
+import h5py
 import lh5
 import numpy as np
 import pytest
 
+from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.info import describe
 from cpunet.pulses.container import Pulses
@@ -124,3 +126,47 @@ def test_reference_pulses(reference_data: Path):
     assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
     assert min(told["peaks"].values()) > 500
     assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
+
+
+def test_every_table_of_a_file(tmp_path, capsys, monkeypatch):
+    file = tmp_path / "channels.h5"
+    with h5py.File(file, "w") as made:
+        for channel in (3, 7):
+            group = made.create_group(f"ch{channel}/raw")
+            group["waveform"] = np.zeros((channel, 50), np.float32)
+            group["waveform"].attrs["dt"] = 16.0
+    told = describe(file, dt_ns=16)
+    assert told["kind"] == "tables"
+    found = {name: (one["n_pulses"], one["length"]) for name, one in told["tables"].items()}
+    assert found == {"ch3/raw": (3, 50), "ch7/raw": (7, 50)}
+    assert describe(file, dt_ns=16, table="ch7/raw")["n_pulses"] == 7
+    monkeypatch.setattr("sys.argv", ["cpunet", "info", str(file), "--dt", "16"])
+    with pytest.raises(SystemExit):
+        main()
+    printed = capsys.readouterr().out
+    assert "ch3/raw" in printed
+    assert "--table NAME" in printed
+
+
+def test_amplitudes_suggest_a_calibration(tmp_path):
+    rng = np.random.default_rng(2)
+    lines = np.repeat([2614.5, 583.2, 1592.5, 2103.5, 727.3], [400, 700, 100, 90, 150])
+    kev = np.append(rng.uniform(100, 2600, 2000), rng.normal(lines, 1.2))
+    traces = np.zeros((len(kev), 40), np.float32)
+    traces[:, 20:] = 15 * kev[:, np.newaxis]
+    file = tmp_path / "raw.npy"
+    np.save(file, traces)
+    told = describe(file, dt_ns=16)
+    assert "Th-228" in told["amplitudes"]
+    assert float(told["amplitudes"].split()[-1]) == pytest.approx(1 / 15, rel=1e-3)
+    noise = rng.uniform(100, 2600, (3000, 1)).astype(np.float32) * np.ones((1, 40), np.float32)
+    noise[:, :20] = 0
+    np.save(file, noise)
+    assert describe(file, dt_ns=16)["amplitudes"] == "no lines that stand out"
+
+
+def test_the_measured_spectrum_suggests_its_calibration(reference_data):
+    told = describe(reference_data / "real" / "th228.fcio")
+    assert "Th-228" in told["amplitudes"]
+    # as found from its lines by hand
+    assert float(told["amplitudes"].split()[-1]) == pytest.approx(0.06493, rel=0.01)

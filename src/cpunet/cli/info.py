@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, warn
+from cpunet.cli.messages import out, print_table, warn
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
@@ -61,9 +64,27 @@ def info(
     )
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is damaged ({wrong}); train again")
+    if told["kind"] == "tables":
+        print_table(_tables(told))
+        out.print("one of them: --table NAME", highlight=False)
+        return
     width = max(len(name) for name, _ in _lines(told))
     for name, value in _lines(told):
         out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _tables(told: Mapping[str, Any]) -> Table:
+    """The tables of a file, a row each."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("table", "traces", "samples", "ns", "energies"):
+        table.add_column(name, justify="left" if name in ("table", "energies") else "right")
+    for name, one in told["tables"].items():
+        if isinstance(one, str):
+            table.add_row(escape(name), "", "", "", escape(one))
+            continue
+        numbers = (_text(one.get(key)) for key in ("n_pulses", "length", "dt_ns"))
+        table.add_row(escape(name), *numbers, escape(_text(one.get("energy"))))
+    return table
 
 
 def _lines(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

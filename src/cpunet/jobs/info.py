@@ -16,9 +16,11 @@ from cpunet.outputs import refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
-from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading import open_pulses, tables_of
+from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
+from cpunet.pulses.spectrum import Values, suggested_calibration
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, PreparationConfig
 from cpunet.regular_files import read_text
@@ -64,10 +66,14 @@ def describe(
     -------
     dict
         For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``.
+        For a file with several tables of which none was chosen, ``kind`` (``"tables"``),
+        ``path`` and ``tables``: by name what `PulseSource.describe` gives, or
+        why it cannot be read.
         For a file, ``kind`` (``"pulses"``), ``path``, what
         `PulseSource.describe` gives, and: ``n_pulses``; ``energy_kev`` (lowest and
         highest, None if not known) and ``n_without_energy``; ``peaks`` (pulses by
-        line); ``samples`` (lowest and highest, of traces all finite);
+        line); ``amplitudes``, if no energy is known: what calibration they look like;
+        ``samples`` (lowest and highest, of traces all finite);
         ``n_not_finite`` and ``n_constant`` traces; of measured traces with `preparation`,
         ``remains``: what `Remains.describe` gives, or why there is none.
 
@@ -89,6 +95,9 @@ def describe(
     path = Path(path)
     if path.is_dir():
         return {"kind": "run", "path": str(path), **_run(path)}
+    tables = tables_of(path) if table is None else []
+    if len(tables) > 1 and without_remains is None:
+        return {"kind": "tables", "path": str(path), "tables": _told_of(path, tables, dt_ns)}
     source = open_pulses(path, table=table, energy=energy, kev_per_adc=kev_per_adc, dt_ns=dt_ns)
     counts = _Counts(dict.fromkeys(peaks or {}, 0))
     for block in source.blocks():
@@ -108,6 +117,19 @@ def describe(
         refuse_inputs(without_remains, path, energy)
         _write_without(source, remains, without_remains, force=force)
     return told | {"remains": remains.describe()}
+
+
+def _told_of(path: Path, tables: list[str], dt_ns: float | None) -> dict[str, Any]:
+    """What each table of a file holds, without reading its traces; or why it cannot be read."""
+    told: dict[str, Any] = {}
+    for table in tables:
+        try:
+            source = open_pulses(path, table=table, dt_ns=dt_ns)
+        except CpunetError as error:
+            told[table] = str(error)
+        else:
+            told[table] = source.describe()
+    return told
 
 
 def _side(source: PulseSource) -> Kind | None:
@@ -142,6 +164,7 @@ class _Counts:
     n_without_energy: int = 0
     n_not_finite: int = 0
     n_constant: int = 0
+    amplitudes: list[Values] = field(default_factory=list)
     energy_kev: list[float] = field(default_factory=list)
     samples: list[float] = field(default_factory=list)
 
@@ -149,6 +172,8 @@ class _Counts:
         self.n_pulses += len(block)
         known = block.energy_kev[np.isfinite(block.energy_kev)]
         self.n_without_energy += len(block) - len(known)
+        if not len(known):
+            self.amplitudes.append(amplitude(block.waveforms))
         self.energy_kev = _range([*self.energy_kev, *_extremes(known)])
         names, counts = np.unique(label_peaks(known, peaks), return_counts=True)
         for name, count in zip(names, counts, strict=True):
@@ -163,12 +188,20 @@ class _Counts:
         self.n_constant += int((low == high).sum())
         self.samples = _range([*self.samples, *_extremes(low), *_extremes(high)])
 
+    def _likely_calibration(self) -> dict[str, str]:
+        """Where no energy is known, what the lines in the amplitudes look like."""
+        if self.n_without_energy < self.n_pulses or not self.amplitudes:
+            return {}
+        found = suggested_calibration(np.concatenate(self.amplitudes))
+        return {"amplitudes": "no lines that stand out" if found is None else f"like {found}"}
+
     def summary(self) -> dict[str, Any]:
         return {
             "n_pulses": self.n_pulses,
             "energy_kev": self.energy_kev or None,
             "n_without_energy": self.n_without_energy,
             "peaks": self.peaks,
+            **self._likely_calibration(),
             "samples": self.samples or None,
             "n_not_finite": self.n_not_finite,
             "n_constant": self.n_constant,

@@ -16,10 +16,12 @@ from cpunet.jobs.monitor import Monitor
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
+from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import require_side
+from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
 
 _READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
@@ -203,7 +205,8 @@ def _load(
                 progress=advance,
             )
         except CpunetError as error:
-            raise CpunetError(f"{error}{_where_energies_are(seen, selection)}") from error
+            hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
+            raise CpunetError(f"{error}{hint}") from error
     cuts = None
     if measured:
         cuts = fit_cuts(prepared, recipe.cuts)
@@ -241,6 +244,16 @@ def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str
     if not n:
         return there
     return f"{there}; --peak {from_kev:.0f}- takes {n} pulses"
+
+
+def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
+    """The calibration that lines in the amplitudes ask for, if no energy is known."""
+    if any(map(len, seen)):
+        return ""
+    found = suggested_calibration(
+        np.concatenate([amplitude(block.waveforms) for block in source.blocks()])
+    )
+    return "" if found is None else f"; their amplitudes look like {found}"
 
 
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:

@@ -74,6 +74,11 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     return _only(path, found)
 
 
+def waveform_tables(file: h5py.File) -> list[str]:
+    """Tables that hold waveforms, in the order of their names."""
+    return sorted({column.table for column in _walk(file, set())})
+
+
 def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     tables = sorted({column.table for column in found})
     if len(tables) > 1:

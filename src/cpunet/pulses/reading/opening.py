@@ -72,3 +72,20 @@ def open_pulses(
             from cpunet.pulses.reading.siggen import TextSource
 
             return TextSource(options)
+
+
+def tables_of(path: str | Path) -> list[str]:
+    """Tables of waveforms in an LH5 or other HDF5 file; none in files of other formats.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing or cannot be read.
+    """
+    if recognise(Path(path)) != "hdf5":
+        return []
+    from cpunet.pulses.reading.hdf5 import opened
+    from cpunet.pulses.reading.hdf5_tables import waveform_tables
+
+    with opened(Path(path)) as file:
+        return waveform_tables(file)
