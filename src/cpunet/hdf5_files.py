@@ -15,6 +15,7 @@ import h5py
 from lh5.io.exceptions import LH5DecodeError
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_probe import fate_of_reader
 from cpunet.regular_files import require_file
 
 _LIBRARIES = re.compile(r"(^|[/\\])(h5py|lh5|lgdo|awkward|numpy)[/\\]")
@@ -31,7 +32,12 @@ def opened(path: Path) -> Iterator[h5py.File]:
     CpunetError
         If the file is missing, foreign or damaged.
     """
-    with reading(path), h5py.File(require_file(path), "r", locking=False) as file:
+    require_file(path)
+    if fate := fate_of_reader(path):
+        raise CpunetError(
+            f"{path}: is damaged (the HDF5 library {fate} on it); copy or write it again"
+        )
+    with reading(path), h5py.File(path, "r", locking=False) as file:
         yield file
 
 

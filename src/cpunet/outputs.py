@@ -73,8 +73,13 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
 
 
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
-    """Raise a `CpunetError` if `target` is there and `force` is off, or as `refuse_inputs`."""
+    """Raise a `CpunetError` if `target` is there and `force` is off, or as `refuse_inputs`.
+
+    A link that leads nowhere is never written through, nor replaced.
+    """
     refuse_inputs(target, *inputs)
+    if target.is_symlink() and not target.exists():
+        raise CpunetError(f"{target}: is a link that leads nowhere; remove it")
     if target.exists() and not force:
         raise CpunetError(f"{target}: exists already; choose another name or give --force")
 

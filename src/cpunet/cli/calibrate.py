@@ -209,7 +209,7 @@ def _start(
         raise CpunetError(f"--set {of_detector[0]}: give the --detector that it is of")
     source = None
     if hits is not None:
-        x, y, z = parse_numbers(origin or "0,0,0", 3, "--origin")
+        x, y, z = parse_numbers("0,0,0" if origin is None else origin, 3, "--origin")
         source = HitFile(
             hits, hits_detector, Transform((x, y, z), flip_z), length_unit, energy_unit
         )

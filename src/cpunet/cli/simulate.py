@@ -237,7 +237,7 @@ def simulate(
     source: HitSource
     if hits is not None:
         chosen = energy_windows(peak, peaks, window_kev) if peak else []
-        x, y, z = parse_numbers(origin or "0,0,0", 3, "--origin")
+        x, y, z = parse_numbers("0,0,0" if origin is None else origin, 3, "--origin")
         transform = Transform((x, y, z), flip_z)
         source = HitFile(
             hits, hits_detector, transform, length_unit, energy_unit, tuple(chosen)

@@ -156,8 +156,8 @@ def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
         asked = wanted.replace("_", " ").casefold()
         fits = [n for n, p in plain.items() if p == asked]
         fits = fits or [n for n, p in plain.items() if asked in p]
-        if not fits:
-            raise CpunetError(f"no figure {wanted!r}; there are: {', '.join(known)}")
+        if not fits or not asked.strip():
+            raise CpunetError(f"no figure {wanted[:60]!r}; there are: {', '.join(known)}")
         found += fits
     return list(dict.fromkeys(found))
 

@@ -13,6 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.outputs import refuse_existing
+from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import SimulationSettings
@@ -88,10 +89,10 @@ def write_library(
     total = len(angles_deg) * len(r_mm) * len(z_mm)
     with (
         written_aside(out) as aside,
-        h5py.File(aside, "w") as file,
+        FileInTheMaking(aside, out) as made,
         monitor.stage("Templates", total) as advance,
     ):
-        library = file.create_group(detector.name or "detector")
+        library = made.h5.create_group(detector.name or "detector")
         _describe(library, r_mm, z_mm, settings)
         for angle in angles_deg:
             _fill(library, angle, fields, settings, energy_kev, counts, advance)

@@ -14,13 +14,16 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
 from cpunet.jobs.devices import resolve_device
 from cpunet.jobs.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.monitor import Advance, Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.pulses.reading.source import BLOCK_BYTES, MOST_SAMPLES
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 
@@ -111,7 +114,8 @@ def translate_library(
     refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))
     tally = _Tally()
-    with _opened(source) as given, written_aside(out) as aside:
+    with opened(source) as given:
+        _require_whole(given, source, set())
         paths = _libraries(given)
         if not paths:
             raise CpunetError(
@@ -119,8 +123,9 @@ def translate_library(
                 "give a struct{r, z, dt, t0, waveform_000_deg}"
             )
         total = sum(_n_templates(given, path, source) for path in paths)
-        with h5py.File(aside, "w") as made, monitor.stage("Templates", total) as advance:
-            _copy(given, made, _Job(ren, tally, source, currents, advance))
+    with opened(source) as given, written_aside(out) as aside:
+        with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
+            _copy(given, made.h5, _Job(ren, tally, source, currents, advance))
         _check(tally, source)
         assert tally.translate is not None
         apart = linearity(tally.translate, np.concatenate(tally.kept)[-KEPT:])
@@ -135,11 +140,20 @@ def translate_library(
     }
 
 
-def _opened(source: Path) -> h5py.File:
-    try:
-        return h5py.File(source, "r")
-    except OSError as error:
-        raise CpunetError(f"{source}: cannot be read as LH5 ({error})") from error
+def _require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
+    """Refuse links that lead nowhere or in circles, and arrays that are mere claims."""
+    info = h5py.h5o.get_info(group.id)
+    if (info.fileno, info.addr) in seen:
+        raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
+    seen.add((info.fileno, info.addr))
+    for name in group:
+        item = group.get(name)
+        if item is None:
+            raise CpunetError(f"{source}: {group.name}: link {name} leads nowhere; remove it")
+        if isinstance(item, h5py.Group):
+            _require_whole(item, source, seen)
+        elif isinstance(item, h5py.Dataset):
+            require_stored(source, item)
 
 
 def _libraries(file: h5py.File) -> list[str]:
@@ -163,11 +177,16 @@ def _n_templates(file: h5py.File, path: str, source: Path) -> int:
         raise CpunetError(
             f"{where}: no {missing[0]} beside the waveforms; complete the library"
         )
+    for name in ("r", "z"):
+        if not is_column(library[name]) or library[name].ndim != 1:
+            raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
     total = 0
     for name in filter(WAVEFORM.fullmatch, library):
         shape = library[name].shape
         expected = (len(library["r"]), len(library["z"]))
-        if len(shape) != 3 or shape[:2] != expected or shape[2] < 2:
+        if library[name].dtype.kind not in "iuf":
+            raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
+        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MOST_SAMPLES:
             raise CpunetError(
                 f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
                 "(r, z, samples)"
@@ -179,14 +198,16 @@ def _n_templates(file: h5py.File, path: str, source: Path) -> int:
 
 def _dt_ns(library: h5py.Group, where: str) -> float:
     dt = library["dt"]
-    units = dt.attrs.get("units", "")
+    if not is_column(dt) or dt.size != 1:
+        raise CpunetError(f"{where}: dt is no number; complete the library")
+    units = text_attribute(dt, "units")
     if units not in TIME_UNITS:
         raise CpunetError(
             f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
         )
-    value = float(dt[()]) * TIME_UNITS[units]
-    if not (np.isfinite(value) and value > 0):
-        raise CpunetError(f"{where}: dt is {value:g} ns; expected more than 0")
+    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
+    if not 1e-3 <= value <= 1e9:
+        raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
     return value
 
 
@@ -229,6 +250,7 @@ def _translate(given: h5py.Dataset, made: Arrays, job: _Job) -> None:
     assert translate is not None
     n_r, n_z, n_samples = given.shape
     step = max(TEMPLATES_AT_A_TIME // n_z, given.chunks[0] if given.chunks else 1)
+    step = min(step, max(1, BLOCK_BYTES // (4 * n_z * n_samples)))
     for first in range(0, n_r, step):
         rows = slice(first, min(first + step, n_r))
         templates = given[rows].reshape(-1, n_samples)

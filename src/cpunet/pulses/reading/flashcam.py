@@ -66,7 +66,7 @@ class FlashCamSource(PulseSource):
         # only when the next record, or the regular end, has been met.
         last: tuple[npt.NDArray[np.uint16], int] | None = None
         any_record = False
-        while stream.get_record():
+        while self._next(stream):
             any_record = True
             if last is not None:
                 yield last
@@ -77,6 +77,13 @@ class FlashCamSource(PulseSource):
             raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
         if last is not None:
             yield last
+
+    def _next(self, stream: FCIO) -> bool:
+        try:
+            return bool(stream.get_record())
+        except Exception as error:  # whatever the library makes of damaged records
+            said = " ".join(str(error).split())
+            raise CpunetError(f"{self.path}: damaged ({said}); copy it again") from error
 
     def _event(self, stream: FCIO) -> tuple[npt.NDArray[np.uint16], int] | None:
         if stream.tag not in (Tags.Event, Tags.SparseEvent):
@@ -118,7 +125,7 @@ def _opened(path: Path) -> Iterator[FCIO]:
     try:
         with _quiet():
             stream = fcio_open(str(path))
-    except OSError as error:
+    except Exception as error:  # whatever the library makes of damaged records
         raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
     try:
         yield stream
