@@ -18,6 +18,8 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_probe import fate_of_reader
 from cpunet.regular_files import require_file
 
+_HERE = str(Path(__file__).parent)
+MOST_CHUNK_BYTES = 1 << 30
 _LIBRARIES = re.compile(r"(^|[/\\])(h5py|lh5|lgdo|awkward|numpy)[/\\]")
 
 
@@ -86,6 +88,11 @@ def require_stored(path: Path, dataset: h5py.Dataset) -> None:
     Such a file of a few bytes would be read as any number of zeros.
     """
     n_bytes = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
+    if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MOST_CHUNK_BYTES:
+        raise CpunetError(
+            f"{path}: {dataset.name} is in chunks of {dataset.chunks}, which nobody can hold; "
+            "copy or write it again"
+        )
     if n_bytes == 0 or dataset.is_virtual or dataset.external:
         return
     missing = dataset.id.get_storage_size() == 0
@@ -112,8 +119,10 @@ def _damaged(path: Path, error: Exception) -> CpunetError:
 
 
 def _from_a_library(error: Exception) -> bool:
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and _LIBRARIES.search(frames[-1].filename) is not None
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    ours = [i for i, file in enumerate(files) if file.startswith(_HERE)]
+    beyond = files[ours[-1] + 1 :] if ours else files
+    return any(map(_LIBRARIES.search, beyond))
 
 
 def _one_line(error: Exception) -> str:

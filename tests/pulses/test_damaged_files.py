@@ -123,6 +123,7 @@ DEFECTS: dict[str, tuple[dict, Callable[[h5py.File], None]]] = {
     "unknown code": (VARLEN, lambda file: file[VALUES].attrs.__setitem__("codec", "x")),
     "no code": (VARLEN, lambda file: file[VALUES].attrs.__delitem__("codec")),
     "other size": (VARLEN, replaced(f"{VALUES}/decoded_size", 8)),
+    "sizes without end": (VARLEN, claimed(f"{VALUES}/decoded_size", (10**9,), "i8", (1000,))),
     "huge size": (VARLEN, replaced(f"{VALUES}/decoded_size", 10**12)),
     "negative size": (VARLEN, replaced(f"{VALUES}/decoded_size", -1)),
     "size as text": (VARLEN, replaced(f"{VALUES}/decoded_size", "64")),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened, require_stored, text_attribute
+from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
 from cpunet.pulses.reading.hdf5 import columns_of
 from cpunet.pulses.reading.hdf5_tables import WaveformColumn, choose_waveforms
 from cpunet.pulses.reading.lh5_rows import read_rows
@@ -86,8 +86,9 @@ def _require_waveforms(path: Path, file: h5py.File, name: str) -> None:
     if isinstance(values, h5py.Dataset):
         fits, stored = values.ndim == 2 and values.dtype.kind in "iuf", [values]
     elif "encoded" in kind:
-        parts = [values.get(f"encoded_data/{one}") for one in _PARTS]
-        fits, stored = {"encoded_data", "decoded_size"} <= set(values), parts
+        size, data = values.get("decoded_size"), values.get("encoded_data")
+        fits, stored = is_column(size) and isinstance(data, h5py.Group), [size]
+        stored += [data.get(one) for one in _PARTS] if fits else []
     else:
         fits, stored = True, [values.get(one) for one in _PARTS]
     if not fits or not all(isinstance(one, h5py.Dataset) for one in stored):

@@ -58,11 +58,12 @@ def _check_vectors(item: h5py.Group | h5py.Dataset, start: int, n: int) -> None:
 
 def _check_lengths(vectors: h5py.Group, start: int, n: int) -> None:
     """Check that the vectors of some rows rise within the values there are."""
-    path, ends = Path(vectors.file.filename), vectors["cumulative_length"]
-    flat = vectors["flattened_data"]
+    path, ends = Path(vectors.file.filename), vectors.get("cumulative_length")
+    flat = vectors.get("flattened_data")
     while isinstance(flat, h5py.Group):  # vectors of vectors
-        flat = flat["cumulative_length"]
-    if ends.ndim != 1 or ends.dtype.kind not in "iu" or flat.ndim < 1:
+        flat = flat.get("cumulative_length")
+    known = isinstance(ends, h5py.Dataset) and isinstance(flat, h5py.Dataset)
+    if not known or ends.ndim != 1 or ends.dtype.kind not in "iu" or flat.ndim < 1:
         raise CpunetError(f"{path}: {vectors.name} holds no vectors; write the file again")
     there = ends[max(start - 1, 0) : start + n]
     if there.dtype.kind == "u" and there.size and int(there.max()) > np.iinfo(np.int64).max:

@@ -27,7 +27,10 @@ def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps
         if detector is not None:
             raise CpunetError(f"{path}: no column volID to pick detector {detector} by")
         return steps
-    return of_detector(path, steps, _column(path, ntuple, "volID"), detector)
+    volume = _column(path, ntuple, "volID")
+    if len(volume) != rows:
+        raise CpunetError(f"{path}: columns of {NTUPLE} differ in length; is it truncated?")
+    return of_detector(path, steps, volume, detector)
 
 
 def of_detector(
