@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,13 @@ SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
 TEMPLATES, FEWEST_TEMPLATES = 150, 20  # traces that remains are added to
 
 
+class KnownDecay(NamedTuple):
+    """A decay in us, and its relative error."""
+
+    us: float
+    relative_error: float
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnRemains:
     """Remains to be added to records.
@@ -45,6 +52,8 @@ class DrawnRemains:
         Sampling period.
     passed
         Probability to pass the data's cuts at `SIZES_KEV`; None if there are no cuts.
+    decay_error_us
+        Of the law's decay, if remains have told it themselves.
     """
 
     law: RemainsLaw
@@ -52,6 +61,14 @@ class DrawnRemains:
     lead_us: float
     dt_ns: float
     passed: tuple[float, ...] | None = None
+    decay_error_us: float | None = None
+
+    @property
+    def known_decay(self) -> KnownDecay | None:
+        """The decay, if remains have told it."""
+        if self.decay_error_us is None:
+            return None
+        return KnownDecay(self.law.decay_us, self.decay_error_us / self.law.decay_us)
 
     def uncut(self, rate_khz: float | None = None) -> Self:
         """The same without cuts, and at another rate if wanted."""

@@ -36,6 +36,7 @@ MOST = 16384  # traces that the law is fitted to
 LARGE, FEWEST_LARGE = 12.0, 20
 # What lies higher or lower than its tilt says, by this factor, is no remainder's level.
 COUPLED = 2.5
+LEVEL_TELLS = 0.2  # the weight of a level that tells which baselines are empty
 # Gaussian deviations of what is left of a baseline without its remainder: beyond, there is
 # another pulse in it.
 DISTURBED = 6.0
@@ -59,6 +60,8 @@ class Remains:
         Whether levels count, and not slopes alone.
     level_weight
         Of the remainder that the level tells; the rest is that of the slope.
+    level_error_kev
+        Error of what the level tells alone.
     decay_us, decay_error_us
         Of the remains; the latter None if it is that of the pulses' tails.
     baseline_adc, adc_per_kev
@@ -77,6 +80,7 @@ class Remains:
     error_kev: float
     coupled: bool
     level_weight: float
+    level_error_kev: float
     decay_us: float
     decay_error_us: float | None
     baseline_adc: float
@@ -85,6 +89,18 @@ class Remains:
     fit: RateFit
     samples: int
     dt_ns: float
+
+    def empty(self, raw: Pulses) -> npt.NDArray[np.bool_]:
+        """Which traces are about as low as an empty baseline; all if levels tell little.
+
+        Nothing is asked of their slopes, so that these stay what noise makes them.
+        """
+        if not self.coupled or self.level_weight < LEVEL_TELLS:
+            return np.ones(len(raw), bool)
+        level = raw.waveforms[:, : self.samples].mean(axis=1)
+        shape = _shape(self.samples, self.dt_ns, self.decay_us).mean()
+        highest = self.baseline_adc + self.level_error_kev * self.adc_per_kev * shape
+        return np.asarray(level < highest)
 
     @property
     def law(self) -> RemainsLaw | None:
@@ -148,6 +164,7 @@ class Remains:
             error_kev=fit.sigma_kev,
             coupled=coupled,
             level_weight=weight,
+            level_error_kev=level_error,
             decay_us=decay,
             decay_error_us=error,
             baseline_adc=level + (fit.level_kev / weight * height if coupled else 0.0),

@@ -2,9 +2,12 @@
 
 What is measured of each trace is its remainder and an error, about the level of a baseline
 without any.  The law's density, blurred by that error, is known, so that rate, level and error
-follow together.  The energies are those of the file, or, where these cannot be (as of a file
-that holds a few gamma lines only), a log-normal spectrum up to the highest of them, which the
-remains themselves tell.
+follow together.  Real noise is no Gaussian: the side below 0, which remains leave alone, shows
+its wings, which would be taken for small remains otherwise.
+
+The energies are those of the file, or, where these cannot be (as of a file that holds a few
+gamma lines only), a log-normal spectrum up to the highest of them, which the remains
+themselves tell.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ STEPS_OF_SIGMA = 4.0
 OUTLIERS = 2e-3  # share of traces that no law has to explain
 # A spectrum that is learned has two parameters more, so much must the likelihood gain.
 WORTH = 5.0
+# Of the noise at most, in wings that are wider than the rest, and traces to tell these.
+MOST_WINGS, FEWEST_BELOW = 0.5, 100
 # Start and width of the priors: of the median energy and the spectrum's width, in logarithms.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 
@@ -104,14 +109,18 @@ class _Likelihood:
         self.exponents = characteristic_exponents(self.u, energies)
         self.first = GRID // 4
         self.grid = (np.arange(GRID) - self.first) * self.step
+        self.wings, self.widths = _wings(kev, sigma_kev)
         self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
 
     def __call__(
         self, expected: float, level: float, sigma: float, weights: FloatArray
     ) -> float:
-        exponent = expected * (self.exponents @ weights) - 0.5 * (sigma * self.u) ** 2
+        exponent = expected * (self.exponents @ weights)
+        squares = -0.5 * (sigma * self.u) ** 2
+        noise = (1 - self.wings) * np.exp(squares)
+        noise += self.wings * np.exp(self.widths**2 * squares)
         shift = 1j * self.u * (level + self.first * self.step)
-        density = np.fft.irfft(np.conj(np.exp(exponent + shift)), GRID) / self.step
+        density = np.fft.irfft(np.conj(noise * np.exp(exponent + shift)), GRID) / self.step
         at = np.interp(self.kev, self.grid, np.maximum(density, 0.0), left=0.0, right=0.0)
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
@@ -122,6 +131,27 @@ class _Likelihood:
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
         found = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
         return -min(float(one.fun) for one in found)
+
+
+def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
+    """Share and relative width of a second, wider Gaussian that the side below 0 asks for."""
+    below = kev[kev < 0]
+
+    def cost(vector: FloatArray) -> float:
+        sigma = np.exp(vector[0])
+        share, width = MOST_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
+        core, wide = below / sigma, below / (width * sigma)
+        density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
+        return -float(np.log(density / sigma + 1e-30).sum())
+
+    if len(below) < FEWEST_BELOW:
+        return 0.0, 1.0
+    alone = _minimum(lambda v: cost(np.array([v[0], -50.0, 0.0])), (np.log(sigma_kev),))
+    found = _minimum(cost, (np.log(sigma_kev), -1.0, 0.0))
+    if float(found.fun) > float(alone.fun) - WORTH:
+        return 0.0, 1.0
+    _, share, width = found.x
+    return MOST_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 NOISE_TRACES = 4096  # from whose baselines the noise is measured
-FEWEST_LOW = 200  # of them, if those with remains are to be left out
+FEWEST_EMPTY = 200  # of them, if those with remains are to be left out
 
 
 def measured_noise(
@@ -57,8 +57,7 @@ def noise_of_traces(
 ) -> BaselineNoise:
     """Measure the noise from the raw samples before the pulses.
 
-    Where traces have remains of earlier pulses, from those whose level is below that of an
-    empty baseline: they have none to speak of, and nothing was asked of their slopes.
+    Where traces have remains of earlier pulses, from those that lie as low as empty baselines.
 
     Raises
     ------
@@ -69,8 +68,7 @@ def noise_of_traces(
     if block is None:
         raise CpunetError(f"{data_file.path}: holds no traces to measure the noise from")
     known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
-    if remains is not None and remains.law is not None and remains.coupled:
-        low = block.waveforms[:, : remains.samples].mean(axis=1) < remains.baseline_adc
-        if (known & low).sum() >= FEWEST_LOW:
-            known &= low
+    if remains is not None and remains.law is not None:
+        empty = known & remains.empty(block)
+        known = empty if empty.sum() >= FEWEST_EMPTY else known
     return BaselineNoise.from_traces(block[known], config)

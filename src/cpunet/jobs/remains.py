@@ -60,6 +60,7 @@ def drawn_like(
         lead_us=begins * data.dt_ns * 1e-3,
         dt_ns=data.dt_ns,
         passed=passed,
+        decay_error_us=remains.decay_error_us,
     )
 
 

@@ -19,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_remains import DrawnRemains, KnownDecay
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import ResponseConfig
@@ -171,7 +171,7 @@ def fit_response(
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
     if listener is not None:
         listener = _counted(listener)
-    told = None if remains is None else remains.law.decay_us
+    told = None if remains is None else remains.known_decay
     near = None if known is None else _from_known(first, known, training, listener)
     problem, found = near or _best_start(first, config, training, told, listener)
     everything = sets.bands()
@@ -181,7 +181,10 @@ def fit_response(
             return problem.response, fit
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
     if _poor(problem, found):
-        problem, found = ringing_if_better(problem, found, config, training, listener)
+        problem, found = free_decay_if_better(problem, found, training, told, listener)
+    if _poor(problem, found):
+        own = problem.response.config
+        problem, found = ringing_if_better(problem, found, own, training, listener)
     if _poor(problem, found) and _onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     return problem.response, _refined(problem, found, everything, training, listener)
@@ -289,7 +292,7 @@ def _best_start(
     first: ResponseProblem,
     config: ResponseConfig,
     training: MatchingConfig,
-    decay_us: float | None,
+    decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
     """Fit from start after start, until one is good or all are done.
@@ -299,11 +302,11 @@ def _best_start(
     best: tuple[ResponseProblem, Minimum] | None = None
     dt_ns = float(first.response.dt_ns)
     for factor in training.start_factors:
-        start = start_response(config, dt_ns, factor, first.slope, decay_us)
+        start = start_response(config, dt_ns, factor, first.slope, decay)
         problem = first.of(start)
         found = levenberg_marquardt(problem, training.steps, listener)
         if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
-            problem, found = free_decay_if_better(problem, found, training, decay_us, listener)
+            problem, found = free_decay_if_better(problem, found, training, decay, listener)
         if best is None or found.cost < best[1].cost:
             best = problem, found
         if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
@@ -316,7 +319,7 @@ def free_decay_if_better(
     problem: ResponseProblem,
     found: Minimum,
     training: MatchingConfig,
-    decay_us: float | None,
+    decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
     """Let a fast decay have a time of its own, if that explains much of what is left."""
@@ -325,7 +328,7 @@ def free_decay_if_better(
         return problem, found
     free = config.model_copy(update={"free_decays": True, "fast_decays_us": (FAST_DECAY_US,)})
     dt_ns = float(problem.response.dt_ns)
-    response = start_response(free, dt_ns, 1.0, problem.slope, decay_us)
+    response = start_response(free, dt_ns, 1.0, problem.slope, decay)
     response.decay_weights.data.fill_(FAST_SHARE)  # of a share of 0 no time is told
     again = problem.of(response)
     fitted = levenberg_marquardt(again, training.steps, listener)
@@ -372,18 +375,18 @@ def start_response(
     dt_ns: float,
     factor: float,
     slope: float,
-    decay_us: float | None = None,
+    decay: KnownDecay | None = None,
 ) -> ElectronicsResponse:
     """A response with the recipe's poles times a factor, and the data's own decay.
 
-    That is known as `decay_us`, or it follows from the slope of the tails.
+    That is known, or it follows from the slope of the tails.
     """
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
     set_decay(response, slope)
-    if decay_us is not None:
-        response.log_decay_us.data.fill_(math.log(decay_us))
-        response.decay_known = LEAST_DECAY_ERROR
+    if decay is not None:
+        response.log_decay_us.data.fill_(math.log(decay.us))
+        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
     return response
 
 

@@ -67,4 +67,5 @@ def _ringing_copy(
     )
     state = {n: v for n, v in response.state_dict().items() if "ringing" not in n}
     rings.load_state_dict(state, strict=False)
+    rings.decay_known = response.decay_known
     return rings
