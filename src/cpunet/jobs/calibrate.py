@@ -37,6 +37,7 @@ from cpunet.jobs.inputs import InputFile, load_simulated
 from cpunet.jobs.memory import keep_freed_memory
 from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.noise import measured_noise
+from cpunet.jobs.remains import drawn_like, measured_remains
 from cpunet.jobs.simulate import simulate_file
 from cpunet.jobs.train import TrainingJob
 from cpunet.outputs import FolderKind
@@ -224,7 +225,12 @@ class Calibration:
     def _search(self, sides: Sides, monitor: Monitor, simulated: Callable[[], None]) -> Search:
         """The search, ready to begin."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
-        noise, note = measured_noise(self.data, measured, self.recipe.preparation)
+        preparation = self.recipe.preparation
+        remains, _ = measured_remains(self.data, preparation)
+        drawn = None
+        if remains is not None and remains.law is not None:
+            drawn = drawn_like(remains, self.data, sides.data, preparation)
+        noise, note = measured_noise(self.data, measured, preparation, remains)
         if note is not None:
             monitor.note(f"warning: {note}")
         physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors
@@ -233,7 +239,7 @@ class Calibration:
         free = self.freedom.free
         return Search(
             simulator=Simulator(hits, physics, simulated),
-            sets=PulseSets(pulses, measured, noise, self.recipe, rng),
+            sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
             energy_kev=pulses.energy_kev,
             recipe=self.recipe,
             given={k: v for k, v in given.items() if k != DEPLETION},

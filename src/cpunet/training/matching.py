@@ -172,7 +172,7 @@ def fit_response(
     if listener is not None:
         listener = _counted(listener)
     told = None if remains is None else remains.known_decay
-    near = None if known is None else _from_known(first, known, training, listener)
+    near = None if known is None else _from_known(first, known, training, told, listener)
     problem, found = near or _best_start(first, config, training, told, listener)
     everything = sets.bands()
     if not _poor(problem, found):
@@ -274,11 +274,12 @@ def _from_known(
     first: ResponseProblem,
     known: ElectronicsResponse,
     training: MatchingConfig,
+    decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum] | None:
     """Fit from a response that is known, first as if the data were near; None if it is poor."""
     start = copy.deepcopy(known)
-    set_decay(start, first.slope)
+    set_decay(start, first.slope, decay)
     problem, steps = first.of(start), 0
     for coarse in (False, True):
         found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
@@ -383,14 +384,16 @@ def start_response(
     """
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
-    set_decay(response, slope)
-    if decay is not None:
-        response.log_decay_us.data.fill_(math.log(decay.us))
-        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
+    set_decay(response, slope, decay)
     return response
 
 
-def set_decay(response: ElectronicsResponse, slope: float) -> None:
-    """Take the data's own decay, if it has one."""
-    if slope < 0:
+def set_decay(
+    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
+) -> None:
+    """Take the data's own decay: that of remains if it is known, or else that of the tails."""
+    if decay is not None:
+        response.log_decay_us.data.fill_(math.log(decay.us))
+        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
+    elif slope < 0:
         response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))

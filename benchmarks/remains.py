@@ -1,0 +1,40 @@
+"""Remains of earlier pulses in a file of raw traces: rate, spreads of slopes, and a picture.
+
+Run with ``python benchmarks/remains.py FILE --kev-per-adc 0.0649 --picture remains.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+
+from cpunet.analysis.remains_figure import Slopes, remains_figure
+from cpunet.electronics.remains import Remains
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.recipes import load_recipe
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--kev-per-adc", type=float)
+    parser.add_argument("--decay-us", type=float)
+    parser.add_argument("--picture", type=Path)
+    arguments = parser.parse_args()
+    source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
+    preparation = load_recipe("fast").preparation
+    remains = Remains.of_traces(source.blocks(4096), preparation, arguments.decay_us)
+    raw = next(iter(source.blocks(4096)))
+    console = Console()
+    for name, value in remains.describe().items():
+        console.print(f"{name}: {value}")
+    after, noise = Slopes.of(raw, remains).spreads
+    console.print(f"slopes without remains {after:.2f} keV, of empty baselines {noise:.2f} keV")
+    if arguments.picture:
+        remains_figure(raw, remains).savefig(arguments.picture, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""The picture of remains, on a stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cpunet.analysis.remains_figure import Slopes, remains_figure
+from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.readout import read_out
+from cpunet.electronics.remains import Remains
+from cpunet.pulses.container import Pulses
+from cpunet.recipes import load_recipe
+
+
+def test_slopes_without_remains_are_those_of_empty_baselines():
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (1500, 1)), 0, 1)
+    steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(1500, 2614.5))
+    traces = read_out(steps, read_electronics("ornl").disturbed(2.0), seed=2)
+    raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
+    remains = Remains.of_traces([raw], load_recipe("fast").preparation)
+    slopes = Slopes.of(raw, remains)
+    after, noise = slopes.spreads
+    assert after == pytest.approx(noise, rel=0.5)
+    assert slopes.before.std() > 10 * after
+    sizes, _, shown = remains_figure(raw, remains).axes
+    measured, law = (line.get_ydata() for line in sizes.lines)
+    middle = slice(20, 40)
+    np.testing.assert_allclose(measured[middle], law[middle], rtol=0.3)
+    assert "keV" in shown.get_ylabel()
