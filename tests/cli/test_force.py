@@ -56,6 +56,7 @@ COMMANDS = {
         (f"RUN {TRAINING}", "RUN/report"),
         ("RUN --sim sim.lh5 --data data.lh5 --truth D/truth.npz", "D"),
     ],
+    "info": [("D/sim.lh5", "D/sim.lh5"), ("sim.lh5 --energy D/hits.lh5:energy", "D/hits.lh5")],
     "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
     "summary": [("REPORT", "REPORT/report.html")],
     "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
@@ -71,6 +72,7 @@ COMMANDS = {
     "import weights": [("--ren D/fep_REN.pt", "D")],
     "import pulses": [("D/my.pickle", "D/my.pickle")],
 }
+OUT = {"info": "--without-remains"}  # in place of --out
 CASES = [
     pytest.param(name, words, out, id=f"{name} {words} {out}")
     for name, cases in COMMANDS.items()
@@ -125,7 +127,8 @@ def contents(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize(("name", "words", "out"), CASES)
 def test_no_input_is_replaced(command, home, name, words, out):
     before = contents(home)
-    outcome = command(*name.split(), *words.split(), "--out", out, "--force")
+    option = OUT.get(name, "--out")
+    outcome = command(*name.split(), *words.split(), option, out, "--force")
     assert outcome.code == 2
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err

@@ -25,7 +25,7 @@ DT_NS, KEV, N = 16.0, 2614.5, 500
 RECIPE = load_recipe(
     "best",
     [
-        "generator.residual.iterations=60",
+        "generator.residual.iterations=80",
         "generator.residual.width=8",
         "generator.residual.batch_size=200",
         "generator.residual.rate=0.01",

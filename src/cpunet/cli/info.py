@@ -13,6 +13,7 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.messages import out, print_table, warn
+from cpunet.outputs import refuse_inputs
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
@@ -50,6 +51,8 @@ def info(
     from cpunet.recipes import load_recipe
     from cpunet.training.run_schema import problem
 
+    if without_remains is not None:
+        refuse_inputs(without_remains, source, energy)
     recipe = load_recipe("fast")
     told = describe(
         source,

@@ -47,8 +47,8 @@ class RemainsLaw:
     Examples
     --------
     >>> law = RemainsLaw(1.5, 84.6, (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615))
-    >>> law.share_above([10.0, 50.0]).round(2).tolist()  # 33 and 20 % of the traces
-    [0.33, 0.2]
+    >>> law.share_above([10.0, 50.0]).round(2).tolist()  # of the traces
+    [0.34, 0.2]
     """
 
     rate_khz: float

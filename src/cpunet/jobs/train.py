@@ -144,8 +144,7 @@ def train_run(
                 else:
                     job.help_train(stop)
                     return {}
-            write_run(folder, model, recipe, info)
-    return info
+            return write_run(folder, model, recipe, info)
 
 
 def _workplace(

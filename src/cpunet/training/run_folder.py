@@ -59,8 +59,10 @@ def append_losses(folder: Path, records: Iterable[Record]) -> None:
         stream.writelines(json.dumps(record) + "\n" for record in records)
 
 
-def write_run(folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, Any]) -> None:
-    """Write weights, recipe and provenance into an existing folder."""
+def write_run(
+    folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, Any]
+) -> dict[str, Any]:
+    """Write weights, recipe and provenance into an existing folder; return the provenance."""
     weights = {
         name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()
     }
@@ -70,6 +72,7 @@ def write_run(folder: Path, model: nn.Module, recipe: Recipe, info: dict[str, An
     )
     content = {"format": FORMAT} | info
     (folder / INFO).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return content
 
 
 def read_info(run: Path) -> dict[str, Any]:
