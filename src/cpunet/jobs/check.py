@@ -220,8 +220,10 @@ REMEDIES = {
         "padding (--set preparation.max_padding_before=…, max_padding_after)"
     ),
     Rejection.TAIL_SLOPE: "tails differ: pile-up, or remains of earlier pulses",
-    Rejection.BASELINE: "baselines differ: remains of earlier pulses at this rate",
-    Rejection.BASELINE_SLOPE: "baselines are not flat: remains of earlier pulses at this rate",
+    Rejection.BASELINE: "baselines differ: remains of earlier pulses (cpunet info tells them)",
+    Rejection.BASELINE_SLOPE: (
+        "baselines are not flat: remains of earlier pulses (cpunet info tells them)"
+    ),
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
 }

@@ -60,8 +60,9 @@ PARTS = {
     ),
     "tail": Part(
         "the tail",
-        "remains of earlier pulses, pile-up, or a decay that the recipe does not have",
-        "cpunet check tells how many traces are left out; --set generator.fast_decays_us=[…]",
+        "pile-up, remains of earlier pulses too few to be sure of, or a decay that the recipe "
+        "does not have",
+        "cpunet info tells remains; --set generator.fast_decays_us=[…]",
     ),
     "amplitude": Part(
         "the current amplitude",
