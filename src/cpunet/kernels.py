@@ -125,7 +125,14 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
             stream.write(hashlib.sha256(code).digest() + code)
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep code; another process may do so at the same time."""
+        """Keep code; another process may do so at the same time.
+
+        Where it cannot be kept, as on a full disk, it is compiled again the next time.
+        """
+        with suppress(OSError):
+            self._keep(key, data)
+
+    def _keep(self, key: Any, data: Any) -> None:
         # numba counts from 1, and two processes give different code the same name
         name = self._data_name_pattern.format(number=uuid.uuid4().int)
         self._save_data(name, data)  # first: what the index names is there

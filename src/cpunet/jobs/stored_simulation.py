@@ -90,6 +90,7 @@ def _record(path: Path) -> tuple[dict[str, Any], Any]:
             raise TypeError
     except (TypeError, ValueError, RecursionError) as error:
         raise CpunetError(
-            f"{path}: what {_PULSES} tells of its simulation is damaged; simulate it again"
+            f"{path}: what {_PULSES} tells of its simulation is damaged; is the file "
+            "truncated? simulate it again"
         ) from error
     return made, numbers.astype(np.int64)

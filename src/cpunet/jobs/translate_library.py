@@ -182,6 +182,8 @@ def _n_templates(file: h5py.File, path: str, source: Path) -> int:
             raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
     total = 0
     for name in filter(WAVEFORM.fullmatch, library):
+        if not isinstance(library[name], h5py.Dataset):
+            raise CpunetError(f"{where}/{name}: is no array; complete the library")
         shape = library[name].shape
         expected = (len(library["r"]), len(library["z"]))
         if library[name].dtype.kind not in "iuf":

@@ -1,0 +1,211 @@
+"""What the commands promise when the machine fails them, see docs/faults.md."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from torch import nn
+
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import write_run
+
+DETECTOR = {
+    "crystal_length": 20.0, "crystal_radius": 20.0, "point_contact_length": 1.6,
+    "point_contact_radius": 2.0, "li_thickness": 1.0, "impurity_z0_1e10_per_cm3": -0.8,
+    "bias_V": 2500, "temperature_K": 85, "grid_mm": 0.5,
+}  # fmt: skip
+SIMULATE = "simulate --hits hits.npz --detector detector.yaml --out"
+# Commands that write, by the kind of their output; what takes long writes by the same means.
+COMMANDS = {
+    "simulate": (SIMULATE, "out.lh5"),
+    "fields": ("fields detector.yaml --no-paths --out", "out.png"),
+    "stand": ("stand --preset legend200 --detector detector.yaml --events FEP=2 --out", "out"),
+    "translate": ("translate RUN sim.lh5 --insist --out", "out.lh5"),
+    "compare": ("compare REPORT REPORT2 --out", "out.html"),
+    "summary": ("summary REPORT --out", "out.html"),
+    "response": ("response LEARNED --out", "out"),
+    "figure": ("figure RUN losses --out", "out"),
+    "export": ("export RUN --format torchscript --out", "out.pt"),
+    "library make": (
+        "library make --detector detector.yaml --grid-mm 12 --dt-ns 16 --length-ns 3600 --out",
+        "out.lh5",
+    ),
+    "import pulses": ("import pulses pulses.pickle --out", "out.lh5"),
+    "train": ("train --sim sim.lh5 --data data.lh5 TINY --out", "out"),
+}
+SCORES = '{"peaks": {"FEP": {"parameters": {"drift_time": {"iou": {"ren": 80.0}}}}}}'
+
+
+@pytest.fixture
+def home(run: Path, stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with inputs of all commands."""
+    monkeypatch.chdir(tmp_path)
+    run.rename("RUN")
+    Path("sim.lh5").symlink_to(stand.sim)
+    Path("data.lh5").symlink_to(stand.data)
+    Path("detector.yaml").write_text(yaml.safe_dump(DETECTOR))
+    x = np.array([5.0, 6.0, 9.0])
+    hits = {"x_mm": x, "y_mm": 0 * x, "z_mm": x + 4, "edep_keV": 0 * x + 900}
+    np.savez("hits.npz", **hits, offsets=np.array([0, 1, 2, 3]))
+    pulse = {"wf": np.linspace(0, 1, 200), "tp0": 40, "energy": 2614.5, "event": 1}
+    Path("pulses.pickle").write_bytes(pickle.dumps([pulse] * 20))
+    for report in ("REPORT", "REPORT2"):
+        Path(report).mkdir()
+        Path(report, "metrics.json").write_text(SCORES)
+    recipe = load_recipe("fast")
+    info = {"recipe": "fast", "dt_ns": 16.0, "peak": "FEP", "seconds": 0, "seed": 0}
+    Path("LEARNED").mkdir()
+    model = nn.ModuleDict({"ren": ResponseGenerator(recipe.matching.generator, 16.0)})
+    write_run(Path("LEARNED"), model, recipe, info | {"device": "cpu"})
+    return tmp_path
+
+
+def words_of(name: str, tiny: list[str]) -> list[str]:
+    words, out = COMMANDS[name]
+    found = [*words.split(), out]
+    at = found.index("TINY") if "TINY" in found else None
+    return found if at is None else [*found[:at], *tiny, *found[at + 1 :]]
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file may become larger than 100 bytes: "File too large" in place of "No space"."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def refusing(number: int) -> Callable[..., None]:
+    def refuse(*_given: object, **_options: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return refuse
+
+
+def ended_by(number: int) -> Callable[..., None]:
+    return lambda *_given, **_options: signal.raise_signal(number)
+
+
+# fault → what fails with it; moving the output into its place is the last that happens
+FAULTS = {
+    "EIO as it is moved into place": ("pathlib.Path.replace", refusing(errno.EIO)),
+    "ESTALE as it is moved into place": ("pathlib.Path.replace", refusing(errno.ESTALE)),
+    "SIGTERM as it is moved into place": ("pathlib.Path.replace", ended_by(signal.SIGTERM)),
+    "read-only": ("tempfile._mkstemp_inner", refusing(errno.EROFS)),
+}
+FOLDER_FAULTS = {"read-only": ("tempfile.mkdtemp", refusing(errno.EROFS))}
+
+
+def require_failed(outcome, before: dict[str, bytes], folder: Path, status: int) -> None:
+    assert outcome.code == status, outcome.err
+    lines = outcome.err.splitlines()
+    assert [line for line in lines if line.startswith("error: ")] == lines[-1:]
+    assert "Traceback" not in outcome.err
+    after = listing(folder)
+    assert {name: after.get(name) for name in before} == before
+    # what a killed training would go on from has no output's name
+    assert all(name.startswith("out.unfinished/") for name in after.keys() - before.keys())
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_fault_leaves_one_line_and_nothing_else(
+    command, home, tiny, monkeypatch, name, fault
+):
+    words = words_of(name, tiny)
+    is_folder = not Path(words[-1]).suffix
+    what, instead = (FOLDER_FAULTS if is_folder else {}).get(fault, FAULTS[fault])
+    if name in ("train", "figure") and fault == "read-only":
+        pytest.skip("makes its folder first")
+    before = listing(home)
+    with monkeypatch.context() as patched:
+        patched.setattr(what, instead)
+        outcome = command(*words)
+    status = 128 + signal.SIGTERM if "SIGTERM" in fault else 2
+    require_failed(outcome, before, home, status)
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "train"])
+def test_a_full_disk_leaves_one_line_and_nothing_else(command, home, tiny, name):
+    before = listing(home)
+    with full_disk():
+        outcome = command(*words_of(name, tiny))
+    require_failed(outcome, before, home, 2)
+    assert "File too large" in outcome.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", ["simulate", "compare", "response", "stand"])
+def test_what_was_there_stays_if_its_replacement_fails(command, home, tiny, monkeypatch, name):
+    words = words_of(name, tiny)
+    assert command(*words).code == 0
+    before = listing(home)
+    for fault, (what, instead) in FAULTS.items():
+        if fault == "read-only" and not Path(words[-1]).suffix:
+            what, instead = FOLDER_FAULTS[fault]
+        with monkeypatch.context() as patched:
+            patched.setattr(what, instead)
+            outcome = command(*words, "--force")
+        require_failed(outcome, before, home, 143 if "SIGTERM" in fault else 2)
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from cpunet.cli.main import main
+pathlib.Path.replace = lambda *_given: os.kill(os.getpid(), signal.SIGKILL)
+sys.argv = ["cpunet", *sys.argv[1:]]
+main()
+"""
+
+
+def killed_at_the_move(words: list[str]) -> int:
+    """Run a command in a process that is killed as its output is moved into place."""
+    command = [sys.executable, "-c", KILLED, *words]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode < 0, ended.stderr
+    return ended.returncode
+
+
+@pytest.mark.parametrize("name", ["simulate", "translate", "compare", "library make"])
+def test_what_was_killed_has_left_no_output_and_can_be_done_again(command, home, tiny, name):
+    words = words_of(name, tiny)
+    before = set(listing(home))
+    if "detector.yaml" in words:  # its fields are moved into the cache, too
+        assert command("fields", "detector.yaml").code == 0
+    assert killed_at_the_move(words) == -signal.SIGKILL
+    left = set(listing(home)) - before
+    assert all(Path(path).name.startswith(f".{Path(words[-1]).stem}") for path in left)
+    assert command(*words).code == 0
+    assert Path(words[-1]).exists()
+    if name == "translate":  # which cleans up after the dead
+        assert set(listing(home)) - before == {words[-1]}
+
+
+@pytest.mark.parametrize("name", ["simulate", "translate", "train"])
+def test_a_clock_that_goes_backwards(command, home, tiny, monkeypatch, name):
+    now = time.time()
+    ticks = iter(range(10**9))
+    with monkeypatch.context() as patched:
+        patched.setattr("time.time", lambda: now - 3600 * next(ticks))
+        assert command(*words_of(name, tiny)).code == 0
