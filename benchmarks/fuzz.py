@@ -382,7 +382,12 @@ def option(_folder: Path, rng: np.random.Generator) -> Case:
     ]
     words, name, values = pick(rng, chances)
     value = pick(rng, values)
-    fine = {("--peak", "1e400-"), ("--out-table", "a/b/c/d/e"), ("--hits-detector", "x")}
+    fine = {
+        ("--table", "geds/sim/waveform/values"),
+        ("--peak", "1e400-"),
+        ("--out-table", "a/b/c/d/e"),
+        ("--hits-detector", "x"),
+    }
     must = (name, value) not in fine and not (name == "--length-ns" and value == "")
     return Case([*words, f"{name}={value}"], f"{words[0]} {name}={value}", must_fail=must)
 

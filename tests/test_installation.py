@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
@@ -87,3 +89,25 @@ def test_importing_looks_for_nothing():
     """`import cpunet` takes no time for it."""
     code = "import sys, cpunet; sys.exit('torch' in sys.modules or 'h5py' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_lock_holds_what_the_constraints_say():
+    """Every dependency, in the version that is known to work, with the digest of its file."""
+    root = Path(__file__).resolve().parents[1]
+    lines = (root / "requirements.lock").read_text().splitlines()
+    locked = {}
+    for line in lines:
+        if not line.startswith("#"):
+            match = re.fullmatch(r"([a-z0-9._-]+)==(\S+) --hash=sha256:[0-9a-f]{64}", line)
+            assert match, line
+            locked[re.sub(r"[._-]+", "-", match[1])] = match[2]
+    constraints = {}
+    for line in (root / "constraints.txt").read_text().splitlines():
+        name, pinned, version = line.partition("==")
+        if pinned:
+            constraints[re.sub(r"[._-]+", "-", name.lower())] = version
+    for name, version in locked.items():
+        assert constraints.get(name, version).partition("+")[0] == version.partition("+")[0]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    for dependency in project["dependencies"]:
+        assert re.split(r"[<>=]", dependency)[0].lower() in locked

@@ -61,15 +61,29 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
         Files and folders, as a user gives them: ``FILE:table`` and patterns are understood,
         and what is no file's name (a preset, None) is passed over.
     """
-    place = Path(out).resolve()
+    place = resolved(Path(out))
     for source in (found for given in inputs for found in _named(given)):
-        real = source.resolve()
+        real = resolved(source)
         if _same(place, real):
             raise CpunetError(f"{out}: is the input; choose another --out")
         if any(_same(place, above) for above in real.parents):
             raise CpunetError(f"{out}: holds the input {source}; choose another --out")
         if any(_same(above, real) for above in place.parents):
             raise CpunetError(f"{out}: lies in the input {source}; choose another --out")
+
+
+def resolved(path: Path) -> Path:
+    """A path without links.
+
+    Raises
+    ------
+    CpunetError
+        If links lead in a circle.
+    """
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError) as error:  # before Python 3.13, the latter
+        raise CpunetError(f"{path}: is a link that leads in a circle; remove it") from error
 
 
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:

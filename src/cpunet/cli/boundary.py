@@ -40,6 +40,7 @@ _ADVICE = {
     errno.EROFS: "choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ENOENT: "check the name",
+    errno.ELOOP: "remove the link",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.EIO: "check the disk or the network, and try again",
     errno.ESTALE: "check the network, and try again",
@@ -98,6 +99,8 @@ def _known(error: BaseException) -> str | None:
     if isinstance(error, UnicodeEncodeError) and _is_surrogate(error):
         name = ascii(error.object)[1:61]
         return f"{name}: a name that is no UTF-8 text; rename the file"
+    if isinstance(error, RuntimeError) and text.startswith("Symlink loop"):
+        return f"{text}; remove the link"  # as Python before 3.13 says ELOOP
     if (damaged := _damaged_code(error)) is not None:
         return f"{damaged}: damaged compiled code; remove it and try again"
     if isinstance(error, OSError) and error.errno is not None:
