@@ -83,6 +83,24 @@ def plain_hdf5(path: Path) -> None:
         file["waveform"], file["dt_ns"] = waveforms(), 16.0
 
 
+def flashcam(path: Path) -> None:
+    """One channel, as the tests of its reader write it."""
+
+    def frame(kind: str, *values: float) -> bytes:
+        content = struct.pack(f"<{len(values)}{kind}", *values)
+        return struct.pack("<i", len(content)) + content
+
+    made = b"\xff\x35\x65\xc4" + b"FlashCamV1".ljust(64, b"\0") + struct.pack("<i", -1)
+    made += b"".join(frame("i", v) for v in (1, 0, LENGTH, 1, 1, 16, 0, 0, 1, 0))
+    made += frame("i", 0)
+    for number, trace in enumerate(waveforms()):
+        row = frame("H", 0, 0, *trace.tolist())[4:]
+        made += struct.pack("<i", -3) + frame("i", 1) + frame("f", 0.0) + frame("i", *[0] * 10)
+        made += frame("i", number, *[0] * 9) + struct.pack("<i", len(row)) + row
+        made += frame("i", *[0] * 10)
+    path.write_bytes(made)
+
+
 def remage(path: Path) -> None:
     def vectors(units: str) -> VectorOfVectors:
         return VectorOfVectors([[1.0, 2], [3.0]], attrs={"units": units})
@@ -161,6 +179,7 @@ INPUTS: dict[str, tuple[Make, Read]] = {
     "pulses.npy": (lambda p: np.save(p, waveforms()), read_pulses),
     "pulses.spe": (spectrum, read_pulses),
     "pulses.txt": (lambda p: np.savetxt(p, waveforms(), fmt="%d"), read_pulses),
+    "run.fcio": (flashcam, lambda p: open_pulses(p).read()),
     "remage.lh5": (remage, read_hits),
     "hits.npz": (hits_npz, read_hits),
     "g4simple.h5": (g4simple, read_hits),

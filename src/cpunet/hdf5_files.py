@@ -15,7 +15,7 @@ import h5py
 from lh5.io.exceptions import LH5DecodeError
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_probe import fate_of_reader
+from cpunet.file_probe import require_survivable
 from cpunet.regular_files import require_file
 
 _HERE = str(Path(__file__).parent)
@@ -35,10 +35,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
         If the file is missing, foreign or damaged.
     """
     require_file(path)
-    if fate := fate_of_reader(path):
-        raise CpunetError(
-            f"{path}: is damaged (the HDF5 library {fate} on it); copy or write it again"
-        )
+    require_survivable(path)
     with reading(path), h5py.File(path, "r", locking=False) as file:
         yield file
 

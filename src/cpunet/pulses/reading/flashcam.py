@@ -13,6 +13,7 @@ import numpy.typing as npt
 from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
+from cpunet.file_probe import require_survivable
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
@@ -122,6 +123,7 @@ def _channel(options: ReadOptions, n_channels: int) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[FCIO]:
+    require_survivable(path, "FlashCam")
     try:
         with _quiet():
             stream = fcio_open(str(path))

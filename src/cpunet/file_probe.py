@@ -1,8 +1,9 @@
-"""Whether the HDF5 library survives the structure of a file.
+"""Whether the libraries of HDF5 and FlashCam survive a file.
 
-On damaged files it may run for ever or crash, and neither can be caught in the process that it
-happens in.  So another one, forked for it, walks through the structure first, with little
-processor time; samples are not read.
+On damaged files they may run for ever or crash, and neither can be caught in the process that
+it happens in.  So another one, forked for it, looks through the file first, with little
+processor time and memory: the structure of HDF5, without samples, and the first records of
+FlashCam.
 """
 
 from __future__ import annotations
@@ -16,30 +17,43 @@ import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 
+from cpunet.errors import CpunetError
+
+Kind = Literal["HDF5", "FlashCam"]
+
 MOST_CPU_S = 5
+_FAILS = "fails"
+MOST_BYTES = 1 << 30
+_MOST_RECORDS = 1000
 _MOST_OBJECTS = 20_000
 
 
-def fate_of_reader(path: Path) -> str:
-    """What would become of whoever looks through a file: nothing (``""``), hang or crash.
+def require_survivable(path: Path, kind: Kind = "HDF5") -> None:
+    """Raise a `CpunetError` if whoever looks through a file would hang or crash.
 
     A file is looked through once, and again if it changes.
     """
     if sys.platform != "linux":  # elsewhere a fork is not safe beside other libraries
-        return ""
+        return
     try:
         facts = path.stat()
     except OSError:
-        return ""
-    return _fate(str(path), (facts.st_ino, facts.st_size, facts.st_mtime_ns))
+        return
+    fate = _fate(str(path), kind, (facts.st_ino, facts.st_size, facts.st_mtime_ns))
+    if fate == _FAILS:
+        raise CpunetError(f"{path}: cannot be read as {kind} file; copy it again")
+    if fate:
+        raise CpunetError(
+            f"{path}: is damaged (the {kind} library {fate} on it); copy or write it again"
+        )
 
 
 @functools.lru_cache(maxsize=1024)
-def _fate(path: str, _facts: tuple[int, ...]) -> str:
+def _fate(path: str, kind: Kind, _facts: tuple[int, ...]) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of threads: the child uses none of their locks
@@ -47,27 +61,36 @@ def _fate(path: str, _facts: tuple[int, ...]) -> str:
     except OSError:  # no memory or processes to spare
         return ""
     if pid == 0:
-        _look_through_and_exit(path)
+        _look_through_and_exit(path, kind)
     _, status = os.waitpid(pid, 0)
     if not os.WIFSIGNALED(status):
-        return ""
+        return "" if os.waitstatus_to_exitcode(status) == 0 else _FAILS
     hung = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
     return "runs for ever" if hung else "crashes"
 
 
-def _look_through_and_exit(path: str) -> None:
+def _look_through_and_exit(path: str, kind: Kind) -> None:
     """In the child: end by itself, or by a signal."""
+    # of FlashCam, what fails for want of memory here would take all there is in the reader
+    ended = 0 if kind == "HDF5" else 1
     try:
         faulthandler.disable()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGXCPU):
             signal.signal(number, signal.SIG_DFL)
         resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with h5py.File(path, "r", locking=False) as file:
-            _look_through(file)
+        in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        most = in_use + MOST_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        if kind == "HDF5":
+            with h5py.File(path, "r", locking=False) as file:
+                _look_through(file)
+        else:
+            _look_at_records(path)
+            ended = 0
     finally:
         # whatever was raised, the reader meets it too, and can tell
-        os._exit(0)
+        os._exit(ended)
 
 
 def _look_through(file: h5py.File) -> None:
@@ -91,6 +114,17 @@ def _look_through(file: h5py.File) -> None:
             for key in _names(item):
                 with suppress(Exception):
                     ahead.append(item.get(key))
+
+
+def _look_at_records(path: str) -> None:
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)  # where the library complains
+    from fcio import fcio_open
+
+    stream = fcio_open(path)
+    for _ in range(_MOST_RECORDS):
+        if not stream.get_record():
+            break
 
 
 def _names(of: Any) -> list[str]:
