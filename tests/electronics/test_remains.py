@@ -130,6 +130,18 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     assert ratio == pytest.approx(1, abs=0.1)
 
 
+def test_traces_that_all_lie_on_remains_are_told():
+    with pytest.raises(CpunetError, match="nearly all traces lie on remains"):
+        Remains.of_traces([as_pulses(traces_of(3.0, "legend200"))], PREPARATION)
+
+
+def test_slow_decays_are_told_by_their_levels():
+    found = Remains.of_traces([as_pulses(traces_of(0.3, "legend200"))], PREPARATION)
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
+    assert found.decay_us == pytest.approx(570, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

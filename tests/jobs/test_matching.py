@@ -23,7 +23,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.matching import GOOD_FIT
+from cpunet.training.response_starts import GOOD_FIT
 from cpunet.translation.translator import IREN, REN
 
 DT_NS, FINE = 16.0, 16

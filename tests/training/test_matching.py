@@ -28,9 +28,10 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import matching, translated
 from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.matching import GOOD_FIT, Fit, fit_response
+from cpunet.training.matching import Fit, fit_response
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.translated import Noise, Translated
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8

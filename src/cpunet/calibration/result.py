@@ -10,7 +10,7 @@ from cpunet.calibration.identifiability import Direction
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values, priors
 from cpunet.calibration.search import Calibrated
-from cpunet.training.matching import GOOD_FIT
+from cpunet.training.response_starts import GOOD_FIT
 
 # Offsets of a profile in errors, and steps with which all else follows.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2

@@ -22,9 +22,9 @@ from cpunet.errors import CpunetError
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
-from cpunet.training.matching import GOOD_FIT, ringing_if_better, start_response
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, start_response
 
 Note = Callable[[str], None]
 

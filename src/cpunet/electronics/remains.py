@@ -42,6 +42,8 @@ LEVEL_TELLS = 0.2  # the weight of a level that tells which baselines are empty
 DISTURBED = 6.0
 # The rate is known if the likelihood says so, and if it is this many times its error.
 SURE, SURE_GAIN = 4.0, 12.0
+MOST_FULL = 0.97  # of the traces may have remains of more than an error
+LEAST_EXPECTED = 1e-3  # pulses in a decay time, below which there is no rate
 SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # sizes whose shares are told
 
 
@@ -159,6 +161,7 @@ class Remains:
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, seen.energy_kev)
+        _require_empty(fit)
         return cls(
             kev=np.where(quiet, kev - fit.level_kev, np.nan),
             error_kev=fit.sigma_kev,
@@ -261,6 +264,17 @@ def _gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) ->
         _tail_decay_us(slope[scale >= np.median(scale)]),
         float(dt_ns),
     )
+
+
+def _require_empty(fit: RateFit) -> None:
+    """Raise a `CpunetError` if there is no empty baseline to tell anything from."""
+    # no curvature where there is a rate: the fit has not found the level of empty baselines
+    blind = fit.law.expected > LEAST_EXPECTED and not fit.rate_error_khz > 0
+    if blind or float(fit.law.share_above(fit.sigma_kev)) > MOST_FULL:
+        raise CpunetError(
+            "nearly all traces lie on remains of earlier pulses, so that the level of an empty "
+            "baseline is not seen and nothing is told of them; measure at a lower rate"
+        )
 
 
 def _length(raw: Pulses, prepared: Prepared, config: PreparationConfig) -> int:

@@ -146,6 +146,7 @@ def evaluate(
         },
         "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
         | {"peak": info["peak"]},
+        "remains": (info.get("fit") or {}).get("remains"),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,

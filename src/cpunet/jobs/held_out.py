@@ -30,6 +30,8 @@ from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import Deck
 from cpunet.training.statistics import refresh_batch_statistics
 from cpunet.translation.backends import NetworkBackend
+from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 
 SHARE = 0.3  # of the pulses of each side
@@ -88,7 +90,7 @@ class HeldOut:
         n_sim, n_data = len(held_sim), len(held_data)
         draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
         nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
-        fit = Sides(fit_sim, fit_data, data_file)
+        fit = Sides(fit_sim, fit_data, data_file, data)
         return cls(fit, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
@@ -101,10 +103,13 @@ class HeldOut:
         CpunetError
             If pulses cannot be translated.
         """
+        generator = ren.seeded(self.seed)
+        remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
         windows = ren.apply(
             self.sim.waveforms,
             energy_kev=self.sim.energy_kev,
-            generator=ren.seeded(self.seed),
+            generator=generator,
+            remains_kev=drawn_kev(remains, len(self.sim), generator),
         )
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MOST_LOST:

@@ -93,6 +93,23 @@ def validate_run(
     return found.metrics
 
 
+def _of_remains(info: Mapping[str, Any]) -> list[str]:
+    """What earlier pulses have left under the data, if anything surely."""
+    told = (info.get("fit") or {}).get("remains") or {}
+    if not told.get("rate_khz"):
+        return []
+    shares = ", ".join(
+        f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
+        for size, share in told["percent_above"].items()
+    )
+    return [
+        f"Traces of the training lie on remains of earlier pulses, {told['rate_khz']:.2f} ± "
+        f"{told['rate_error_khz']:.2f} kHz decaying with {told['decay_us']:.1f} µs: percent of "
+        f"the traces, measured (by the law), {shares}. Translations, rivals and the truth have "
+        "remains drawn by this law, as likely as they pass the quality cuts."
+    ]
+
+
 def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
     """Draw a figure, and tell of it."""
     figure = drawing.draw()
@@ -109,6 +126,7 @@ def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
     ]
+    notes += _of_remains(info)
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
     return notes

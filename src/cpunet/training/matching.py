@@ -9,9 +9,7 @@ optimally weighted, say where in it the response is.
 
 from __future__ import annotations
 
-import copy
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -19,10 +17,9 @@ from itertools import pairwise
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains, KnownDecay
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
@@ -31,24 +28,18 @@ from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
-from cpunet.training.ringing import most_promising_ringing
+from cpunet.training.response_starts import (
+    GOOD_FIT,
+    best_start,
+    free_decay_if_better,
+    from_known,
+    is_poor,
+    ringing_if_better,
+)
 
-# Chi-square per moment, with as many pulses as valleys are searched with, at which a fit has
-# found its own.  The data's own outliers and the ridge keep it from 1.
-GOOD_FIT = 1.6
-# A wrong valley gives three per moment; this is another detector.
-HOPELESS_FIT = 20.0
-# A ringing must lower chi-square to this part of it, or there is none; derivatives far from
-# where it would be promise less.
-RINGS, PROMISES = 0.7, 0.9
 # Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
 # deviations from which on that is not as it is simulated.
 ONSET, OFF = -15, 4.0
-# Where a fast decay of free time starts, in us, and its share.
-FAST_DECAY_US, FAST_SHARE = 3.0, 0.02
-# The main decay that remains of earlier pulses tell is known no better than this: it is that of
-# one exponential, and a readout may have more.
-LEAST_DECAY_ERROR = 0.01
 # Pulses of each side with which a poor fit is looked at.
 CHECKED = 4096
 # Rounds of optimal weights: those of the second are of where the first has led.
@@ -172,20 +163,20 @@ def fit_response(
     if listener is not None:
         listener = _counted(listener)
     told = None if remains is None else remains.known_decay
-    near = None if known is None else _from_known(first, known, training, told, listener)
-    problem, found = near or _best_start(first, config, training, told, listener)
+    near = None if known is None else from_known(first, known, training, told, listener)
+    problem, found = near or best_start(first, config, training, told, listener)
     everything = sets.bands()
-    if not _poor(problem, found):
+    if not is_poor(problem, found):
         fit = _refined(problem, found, everything, training, listener)
         if not fit.poor:
             return problem.response, fit
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
-    if _poor(problem, found):
+    if is_poor(problem, found):
         problem, found = free_decay_if_better(problem, found, training, told, listener)
-    if _poor(problem, found):
+    if is_poor(problem, found):
         own = problem.response.config
         problem, found = ringing_if_better(problem, found, own, training, listener)
-    if _poor(problem, found) and _onset_is_off(problem, training):
+    if is_poor(problem, found) and _onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     return problem.response, _refined(problem, found, everything, training, listener)
 
@@ -254,10 +245,6 @@ def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
     )
 
 
-def _poor(problem: ResponseProblem, found: Minimum) -> bool:
-    return found.cost >= GOOD_FIT * problem.moments
-
-
 def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
     """Whether pulses begin otherwise than simulated: no readout does that, physics do.
 
@@ -270,130 +257,7 @@ def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
     return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
 
 
-def _from_known(
-    first: ResponseProblem,
-    known: ElectronicsResponse,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum] | None:
-    """Fit from a response that is known, first as if the data were near; None if it is poor."""
-    start = copy.deepcopy(known)
-    set_decay(start, first.slope, decay)
-    problem, steps = first.of(start), 0
-    for coarse in (False, True):
-        found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
-        steps += found.steps
-        if not _poor(problem, found):
-            return problem, found._replace(steps=steps)
-    return None
-
-
-def _best_start(
-    first: ResponseProblem,
-    config: ResponseConfig,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
-    """Fit from start after start, until one is good or all are done.
-
-    If the first is poor, a decay whose time is free is tried before other starts.
-    """
-    best: tuple[ResponseProblem, Minimum] | None = None
-    dt_ns = float(first.response.dt_ns)
-    for factor in training.start_factors:
-        start = start_response(config, dt_ns, factor, first.slope, decay)
-        problem = first.of(start)
-        found = levenberg_marquardt(problem, training.steps, listener)
-        if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
-            problem, found = free_decay_if_better(problem, found, training, decay, listener)
-        if best is None or found.cost < best[1].cost:
-            best = problem, found
-        if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
-            break  # no other valley is to be looked for
-    assert best is not None  # the recipe has one start at least
-    return best
-
-
-def free_decay_if_better(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
-    """Let a fast decay have a time of its own, if that explains much of what is left."""
-    config = problem.response.config
-    if config.free_decays or not config.fast_decays_us:
-        return problem, found
-    free = config.model_copy(update={"free_decays": True, "fast_decays_us": (FAST_DECAY_US,)})
-    dt_ns = float(problem.response.dt_ns)
-    response = start_response(free, dt_ns, 1.0, problem.slope, decay)
-    response.decay_weights.data.fill_(FAST_SHARE)  # of a share of 0 no time is told
-    again = problem.of(response)
-    fitted = levenberg_marquardt(again, training.steps, listener)
-    steps = found.steps + fitted.steps
-    if fitted.cost < RINGS * found.cost:
-        return again, fitted._replace(steps=steps)
-    return problem, found._replace(steps=steps)
-
-
-def ringing_if_better(
-    problem: ResponseProblem,
-    found: Minimum,
-    config: ResponseConfig,
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
-    """Let the response ring, if that promises to explain much of what it leaves."""
-    if config.ringing_mhz is not None:
-        return problem, found
-    response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
-    if response is None or promised > PROMISES * found.cost:
-        return problem, found
-    best, steps = (problem, found), found.steps
-    # from where the fit without ringing ended, first as if that were near, then as if far
-    for coarse in (False, True):
-        rings = problem.of(copy.deepcopy(response))
-        again = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
-        steps += again.steps
-        if again.cost < RINGS * best[1].cost:
-            best = rings, again
-        if not _poor(*best):
-            break
-    return best[0], best[1]._replace(steps=steps)
-
-
 def _counted(listener: Listener) -> Listener:
     """A listener told the steps of all fits as one count."""
     steps = itertools.count(1)
     return lambda _, chi_square: listener(next(steps), chi_square)
-
-
-def start_response(
-    config: ResponseConfig,
-    dt_ns: float,
-    factor: float,
-    slope: float,
-    decay: KnownDecay | None = None,
-) -> ElectronicsResponse:
-    """A response with the recipe's poles times a factor, and the data's own decay.
-
-    That is known, or it follows from the slope of the tails.
-    """
-    response = ElectronicsResponse(config, dt_ns)
-    response.log_poles_ns.data.add_(math.log(factor))
-    set_decay(response, slope, decay)
-    return response
-
-
-def set_decay(
-    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
-) -> None:
-    """Take the data's own decay: that of remains if it is known, or else that of the tails."""
-    if decay is not None:
-        response.log_decay_us.data.fill_(math.log(decay.us))
-        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
-    elif slope < 0:
-        response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))

@@ -1,0 +1,184 @@
+"""Where a fit of a response starts, and what else it may need to follow the data.
+
+A fit finds the valley that it starts in.  So there are several starts, and, where the fit is
+poor, a fast decay with a time of its own and a ringing.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+
+from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
+from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.ringing import most_promising_ringing
+
+# Chi-square per moment, with as many pulses as valleys are searched with, at which a fit has
+# found its own.  The data's own outliers and the ridge keep it from 1.
+GOOD_FIT = 1.6
+# A wrong valley gives three per moment; this is another detector.
+HOPELESS_FIT = 20.0
+# A ringing must lower chi-square to this part of it, or there is none; derivatives far from
+# where it would be promise less.
+RINGS, PROMISES = 0.7, 0.9
+# Where a fast decay of free time starts, in us, and its share.
+FAST_DECAY_US, FAST_SHARE = 3.0, 0.02
+LEAST_SHARE, MOST_SHARE = 0.005, 0.2
+# An overshoot of more than this is much like a fast decay, and would be a valley beside it.
+SLOWEST_NS = 800.0
+# The main decay that remains of earlier pulses tell is known no better than this: it is that of
+# one exponential, and a readout may have more.
+LEAST_DECAY_ERROR = 0.01
+
+
+def is_poor(problem: ResponseProblem, found: Minimum) -> bool:
+    """Whether a fit has not found its valley."""
+    return found.cost >= GOOD_FIT * problem.moments
+
+
+def from_known(
+    first: ResponseProblem,
+    known: ElectronicsResponse,
+    training: MatchingConfig,
+    decay: KnownDecay | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum] | None:
+    """Fit from a response that is known, first as if the data were near; None if it is poor."""
+    start = copy.deepcopy(known)
+    set_decay(start, first.slope, decay)
+    problem, steps = first.of(start), 0
+    for coarse in (False, True):
+        found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
+        steps += found.steps
+        if not is_poor(problem, found):
+            return problem, found._replace(steps=steps)
+    return None
+
+
+def best_start(
+    first: ResponseProblem,
+    config: ResponseConfig,
+    training: MatchingConfig,
+    decay: KnownDecay | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Fit from start after start, until one is good or all are done.
+
+    If the first is poor, a decay whose time is free is tried before other starts, with the
+    main decay held to what is known of it.
+    """
+    best: tuple[ResponseProblem, Minimum] | None = None
+    dt_ns = float(first.response.dt_ns)
+    for factor in training.start_factors:
+        start = start_response(config, dt_ns, factor, first.slope)
+        problem = first.of(start)
+        found = levenberg_marquardt(problem, training.steps, listener)
+        if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
+            problem, found = free_decay_if_better(problem, found, training, decay, listener)
+        if best is None or found.cost < best[1].cost:
+            best = problem, found
+        if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
+            break  # no other valley is to be looked for
+    assert best is not None  # the recipe has one start at least
+    return best
+
+
+def free_decay_if_better(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    decay: KnownDecay | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Let a fast decay have a time of its own, if that explains much of what is left."""
+    config = problem.response.config
+    if config.free_decays or not config.fast_decays_us:
+        return problem, found
+    slow = tuple(tau for tau in config.slow_ns if tau <= SLOWEST_NS)
+    free = config.model_copy(
+        update={"free_decays": True, "fast_decays_us": (FAST_DECAY_US,), "slow_ns": slow}
+    )
+    dt_ns = float(problem.response.dt_ns)
+    response = start_response(free, dt_ns, 1.0, problem.slope, decay)
+    # where the fit without it has ended, the bandwidth is about right
+    response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
+    response.decay_weights.data.fill_(_fast_share(problem, decay))
+    again = problem.of(response)
+    fitted = levenberg_marquardt(again, training.steps, listener)
+    steps = found.steps + fitted.steps
+    if fitted.cost < RINGS * found.cost:
+        return again, fitted._replace(steps=steps)
+    return problem, found._replace(steps=steps)
+
+
+def _fast_share(problem: ResponseProblem, decay: KnownDecay | None) -> float:
+    """Of a fast decay beside a known one, by how much steeper the tails are; never 0.
+
+    Of a share of 0 no time is told, and from tails of another slope fits get lost.
+    """
+    if decay is None:
+        return FAST_SHARE
+    preparation = problem.bands[0].moments.preparation
+    us = float(problem.response.dt_ns) * 1e-3
+    middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
+    steeper = -problem.slope / us - 1 / decay.us
+    share = steeper * FAST_DECAY_US * math.exp(middle_us / FAST_DECAY_US)
+    return min(max(share, LEAST_SHARE), MOST_SHARE)
+
+
+def ringing_if_better(
+    problem: ResponseProblem,
+    found: Minimum,
+    config: ResponseConfig,
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Let the response ring, if that promises to explain much of what it leaves."""
+    if config.ringing_mhz is not None:
+        return problem, found
+    response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
+    if response is None or promised > PROMISES * found.cost:
+        return problem, found
+    best, steps = (problem, found), found.steps
+    # from where the fit without ringing ended, first as if that were near, then as if far
+    for coarse in (False, True):
+        rings = problem.of(copy.deepcopy(response))
+        again = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
+        steps += again.steps
+        if again.cost < RINGS * best[1].cost:
+            best = rings, again
+        if not is_poor(*best):
+            break
+    return best[0], best[1]._replace(steps=steps)
+
+
+def start_response(
+    config: ResponseConfig,
+    dt_ns: float,
+    factor: float,
+    slope: float,
+    decay: KnownDecay | None = None,
+) -> ElectronicsResponse:
+    """A response with the recipe's poles times a factor, and the data's own decay.
+
+    That is known, or it follows from the slope of the tails.
+    """
+    response = ElectronicsResponse(config, dt_ns)
+    response.log_poles_ns.data.add_(math.log(factor))
+    set_decay(response, slope, decay)
+    return response
+
+
+def set_decay(
+    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
+) -> None:
+    """Take the data's own decay: that of remains if it is known, or else that of the tails."""
+    if decay is not None:
+        response.log_decay_us.data.fill_(math.log(decay.us))
+        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
+    elif slope < 0:
+        response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))
