@@ -104,8 +104,9 @@ def free_decay_if_better(
     )
     dt_ns = float(problem.response.dt_ns)
     response = start_response(free, dt_ns, 1.0, problem.slope, decay)
-    # where the fit without it has ended, the bandwidth is about right
-    response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
+    if decay is not None:
+        # with the tails right, so is about the bandwidth that the fit without it has found
+        response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
     response.decay_weights.data.fill_(_fast_share(problem, decay))
     again = problem.of(response)
     fitted = levenberg_marquardt(again, training.steps, listener)
