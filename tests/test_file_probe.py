@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +38,18 @@ def test_what_would_hang_or_crash_is_refused(
     message = rf"damaged.lh5: is damaged \(the HDF5 library {told} on it\); copy or"
     with pytest.raises(CpunetError, match=message), opened(path):
         pass
+
+
+def test_a_process_that_waits_for_ever_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a lock that a thread held when it was forked: nothing is learned of the file."""
+    path = tmp_path / "whole.lh5"
+    h5py.File(path, "w").close()
+    monkeypatch.setattr(file_probe, "_look_through", lambda _of: signal.pause())
+    monkeypatch.setattr(file_probe, "MOST_WAIT_S", 0.1)
+    with opened(path) as file:
+        assert not list(file)
 
 
 def test_a_file_is_looked_through_again_if_it_changes(
