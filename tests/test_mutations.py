@@ -35,7 +35,7 @@ from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import load_network, read_info, read_losses
 
-FEW, MANY = 25, 2500
+FEW, MANY = 10, 2500
 
 
 def load_mutations() -> ModuleType:
