@@ -15,7 +15,10 @@ from cpunet import file_probe
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only")
+pytestmark = [
+    pytest.mark.probed,
+    pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only"),
+]
 
 
 def hang(_of: object) -> None:

@@ -35,6 +35,7 @@ from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import load_network, read_info, read_losses
 
+pytestmark = pytest.mark.probed
 FEW, MANY = 10, 2500
 
 

@@ -92,6 +92,7 @@ def with_bytes(name: str, at: int, value: int) -> Callable[[h5py.File], None]:
     return change
 
 
+pytestmark = pytest.mark.probed
 VALUES = "raw/waveform/values"
 ENDS, FLAT = f"{VALUES}/cumulative_length", f"{VALUES}/flattened_data"
 CODES = f"{VALUES}/encoded_data/flattened_data"
