@@ -12,7 +12,7 @@ themselves tell.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ import scipy.optimize
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import RemainsLaw, characteristic_exponents
+
+Function = Callable[[FloatArray], float]
 
 # Energies that a spectrum is made of, from the lowest that leave anything to be seen.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
@@ -221,16 +223,15 @@ def _weights(energies: FloatArray, fixed: FloatArray | None, vector: FloatArray)
     return np.asarray(weights / weights.sum(), float)
 
 
-def _minimum(function: object, start: Sequence[float]) -> scipy.optimize.OptimizeResult:
+def _minimum(function: Function, start: Sequence[float]) -> scipy.optimize.OptimizeResult:
     steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
     simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}
     return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
 
 
-def _curvature(function: object, at: FloatArray, likelihood: _Likelihood) -> FloatArray:
+def _curvature(function: Function, at: FloatArray, likelihood: _Likelihood) -> FloatArray:
     """Second derivatives by finite differences."""
-    assert callable(function)
     steps = np.array([0.1, 0.2 * likelihood.sigma, 0.05, 0.1, 0.1])[: len(at)]
     moves = np.diag(steps)
     n = len(at)
