@@ -37,17 +37,20 @@ class AngleArrays:
     times: h5py.Dataset
     basis: Floats | None
 
-    def put(self, rows: slice, currents: Floats, times_ns: Floats | Values, loss: Loss) -> None:
+    def put(self, rows: slice, currents: Floats, loss: Loss) -> None:
         """Write rows of r: currents (rows, z, samples), as they are or as coefficients."""
-        self.times[rows] = times_ns
         if self.basis is None:
             self.values[rows] = currents
             return
-        there = np.isfinite(times_ns)
+        there = ~np.isnan(currents[:, :, 0])
         coefficients = np.full((*there.shape, len(self.basis)), np.nan, np.float32)
         coefficients[there] = currents[there] @ self.basis.T
         loss.add(currents[there], coefficients[there], self.basis)
         self.values[rows] = coefficients
+
+    def put_times(self, times_ns: Floats | Values) -> None:
+        """Write the drift times of all places."""
+        self.times[...] = times_ns
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,9 +335,9 @@ def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]
             group = made.h5.create_group(name)
             arrays = Made.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
             for angle, times in library.drift_time_ns.items():
-                arrays.angle(f"{angle:03d}_deg").put(
-                    slice(0, len(times)), library.currents(angle), times, Loss()
-                )
+                whole = arrays.angle(f"{angle:03d}_deg")
+                whole.put(slice(0, len(times)), library.currents(angle), Loss())
+                whole.put_times(times)
             describe(group, json.dumps(library.told))
             done.append(name)
         if not done:

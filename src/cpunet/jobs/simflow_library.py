@@ -35,8 +35,13 @@ from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.low_rank import MOST, Loss, components
-from cpunet.translation.peak_currents import currents_about_peak, heights, most_frequent
-from cpunet.translation.ring_padding import RINGS, with_rings
+from cpunet.translation.peak_currents import (
+    LENGTH,
+    currents_about_peak,
+    heights,
+    most_frequent,
+)
+from cpunet.translation.ring_padding import RINGS, continued, with_rings
 from cpunet.translation.translator import REN
 
 QUIET = Monitor()
@@ -66,7 +71,8 @@ def translate_for_simflow(
     three times over 48 ns and moved to have its maximum at sample 1,000 of 4,001; all are
     divided by the mode of A/E over the library, written as float32, with the times of the
     maxima, less the delay of the electronics alone, as ``drift_time_*_deg``.  Around the
-    crystal stand rings of nodes with the mean of their neighbours' charge.
+    crystal stand rings of nodes: their currents are means of their neighbours', drift times go
+    on as they did before.
 
     Parameters
     ----------
@@ -209,12 +215,16 @@ class _Writing:
         for angle in library.angles:
             arrays = made.angle(angle)
             mask = looked.inside[angle]
+            times = np.full((len(r_mm), len(z_mm)), np.nan)
             with monitor.stage(f"{library.path}, {angle}", len(r_mm)) as advance:
-                for rows, currents, times in self._rows(given[f"waveform_{angle}"], advance):
-                    arrays.put(rows, currents, times, loss)
-                    n_new, n_inside = _new_places(times, mask, rows, self.rings)
-                    padded += n_new
-                    healed += n_inside
+                for rows, currents, when in self._rows(given[f"waveform_{angle}"], advance):
+                    arrays.put(rows, currents, loss)
+                    times[rows] = when
+            times = continued(times, self.rings)
+            arrays.put_times(times)
+            padded += int(np.isfinite(times).sum() - mask.sum())
+            inner = np.isfinite(times[: len(mask), self.rings :][:, : mask.shape[1]])
+            healed += int((inner & ~mask & enclosed(mask)).sum())
         numbers: dict[str, Any] = {
             "templates": library.n_templates,
             "translated": sum(int(mask.sum()) for mask in looked.inside.values()),
@@ -233,26 +243,25 @@ class _Writing:
     def _rows(
         self, given: h5py.Dataset, advance: Advance
     ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
-        """Rows of the padded grid: normalised currents and drift times."""
-        n_r, n_z, n_samples = given.shape
+        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
+        n_r, n_z, _ = given.shape
         rings, looked = self.rings, self.looked
         for first in range(0, n_r + rings, ROWS):
             last = min(first + ROWS, n_r + rings)
             # what a node becomes depends on rows no further away than the rings
             low, high = max(0, first - rings), min(last + rings, n_r)
-            shape = (last + rings - low, n_z + 2 * rings, n_samples)
-            block = np.full(shape, np.nan, np.float32)
+            shape = (last + rings - low, n_z + 2 * rings)
+            currents = np.full((*shape, LENGTH), np.nan, np.float32)
+            times = np.full(shape, np.nan)
             if high > low:
-                block[: high - low, rings : rings + n_z] = _charge(given[low:high])
-            block = with_rings(block, rings)[first - low : last - low]
-            there = ~np.isnan(block[:, :, 0])
-            currents = np.full((*there.shape, looked.kept.shape[1]), np.nan, np.float32)
-            times = np.full(there.shape, np.nan)
-            if there.any():
-                of_these, when = currents_about_peak(looked.translate(block[there])[0])
-                currents[there] = of_these / np.float32(looked.mode)
-                times[there] = when - looked.delay_ns
-            yield slice(first, last), currents, times
+                charge = _charge(given[low:high])
+                there = ~np.isnan(charge[:, :, 0])
+                of_these, when = currents_about_peak(looked.translate(charge[there])[0])
+                inner = (slice(0, high - low), slice(rings, rings + n_z))
+                currents[inner][there] = of_these / np.float32(looked.mode)
+                times[inner][there] = when - looked.delay_ns
+            own = slice(first - low, last - low)
+            yield slice(first, last), with_rings(currents, rings)[own], times[own]
             advance(last - first)
 
 
@@ -280,20 +289,6 @@ def _charge(values: npt.NDArray[Any]) -> Floats:
     charge = np.array(values, np.float32)
     charge[~charge.any(axis=2)] = np.nan
     return charge
-
-
-def _new_places(
-    times: npt.NDArray[np.float64],
-    mask: npt.NDArray[np.bool_],
-    rows: slice,
-    rings: int,
-) -> tuple[int, int]:
-    """How many of these rows' places are new, and how many of them lie between others."""
-    n_r, n_z = mask.shape
-    inner = np.isfinite(times[: max(0, n_r - rows.start), rings : rings + n_z])
-    before = mask[rows.start : rows.start + len(inner)]
-    n_new = int(np.isfinite(times).sum()) - int(before.sum())
-    return n_new, int((inner & ~before & enclosed(mask)[rows.start :][: len(inner)]).sum())
 
 
 def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -1,8 +1,8 @@
-"""Rings of templates beyond the crystal's surface, each the mean of its neighbours.
+"""Rings of nodes beyond the crystal's surface: templates and drift times that go on there.
 
 Whoever reads a library takes drift times between nodes and the template of the nearest one.
-At the surface a node of the cell lies outside: without a template there, hits just inside get
-no number.
+At the surface a node of the cell lies outside: without a number there, hits just inside get
+none.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ def with_rings(
     templates: npt.NDArray[np.float32], rings: int = RINGS
 ) -> npt.NDArray[np.float32]:
     """Fill nodes without a template with the mean of those around, ring after ring.
+
+    Of currents that are aligned at their maxima, the mean has the mean A/E.
 
     Parameters
     ----------
@@ -53,6 +55,41 @@ def with_rings(
     return templates
 
 
+def continued(times: Axis, rings: int = RINGS) -> Axis:
+    """Fill places without a drift time, ring after ring, as its slope goes on.
+
+    Parameters
+    ----------
+    times
+        Shape (r, z); NaN where there is none.
+    rings
+        How often.
+
+    Returns
+    -------
+    numpy.ndarray
+        Each new one is the mean of what two places in a row tell, over the eight directions;
+        or that of its neighbours, where there are no two.
+
+    Examples
+    --------
+    >>> continued(np.array([[4.0, 6.0, np.nan, np.nan]]), 2).tolist()
+    [[4.0, 6.0, 8.0, 10.0]]
+    """
+    made = np.pad(times, 2, constant_values=np.nan)
+    n_r, n_z = times.shape
+    for _ in range(rings):
+        near, far = (
+            np.stack([_seen(made, n * i, n * j, n_r, n_z) for i, j in _NEIGHBOURS])
+            for n in (1, 2)
+        )
+        inner = made[2 : 2 + n_r, 2 : 2 + n_z]
+        best = _mean(2 * near - far)
+        best = np.where(np.isnan(best), _mean(near), best)
+        inner[...] = np.where(np.isnan(inner), best, inner)
+    return made[2 : 2 + n_r, 2 : 2 + n_z].copy()
+
+
 def padded_axis(axis: Axis, before: int, after: int) -> Axis:
     """Continue an ascending axis by its widest step on both sides.
 
@@ -65,6 +102,19 @@ def padded_axis(axis: Axis, before: int, after: int) -> Axis:
     low = axis[0] - step * np.arange(before, 0, -1)
     high = axis[-1] + step * np.arange(1, after + 1)
     return np.concatenate([low, axis, high])
+
+
+def _seen(made: Axis, i: int, j: int, n_r: int, n_z: int) -> Axis:
+    """The inner part of an array with two places of room, seen from elsewhere."""
+    return made[2 + i : 2 + i + n_r, 2 + j : 2 + j + n_z]
+
+
+def _mean(values: Axis) -> Axis:
+    """Mean over the first axis of what is a number; NaN where nothing is."""
+    known = np.isfinite(values)
+    n = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.where(n > 0, total / np.maximum(n, 1), np.nan)
 
 
 def _moved(held: npt.NDArray[np.bool_], i: int, j: int) -> npt.NDArray[np.bool_]:
