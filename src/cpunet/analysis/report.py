@@ -23,6 +23,8 @@ from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
+from cpunet.analysis.ae_energy_figure import ae_energy_html
 from cpunet.analysis.nested_tables import nested_html
 from cpunet.analysis.report_tables import (
     gap,
@@ -105,7 +107,8 @@ def write_report(
         quantity its ``sigma`` and ``words``; ``ae_survival``; ``ae_details``,
         ``drift_slices``, ``linearity``, ``noise``: any nesting, shown as tables;
         ``training``: how the network was trained; ``rejections``: counts by reason,
-        possibly nested.  Numbers that are not finite are written as ``null``.
+        possibly nested; ``ae_energy``: the result of `ae_energy.against_energy`.  Numbers
+        that are not finite are written as ``null``.
     figures
         Figures by name; the names become file names and captions.
     notes
@@ -118,11 +121,11 @@ def write_report(
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
     (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-    drawn = []
+    drawn = {}
     for name, figure in figures.items():
         png = _png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
-        drawn.append(_figure_html(name, figure, png))
+        drawn[name] = _figure_html(name, figure, png)
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
     html = Template(_asset("page.html")).substitute(
@@ -137,7 +140,8 @@ def write_report(
         views=_views_html(views),
         survival=survival_html(metrics.get("ae_survival", {})),
         details=_details_html(metrics),
-        figures=_gallery(drawn),
+        ae_energy=ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, "")),
+        figures=_gallery(list(drawn.values())),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=_script(views),

@@ -32,6 +32,7 @@ def validate_run(
     truth: Path | None = None,
     rivals: bool = True,
     seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
     device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -56,6 +57,8 @@ def validate_run(
         Fit the rival methods too, which takes most of the time.
     seed
         Of noise and bootstraps.
+    ae_range_kev
+        More energies to read on both sides, for A/E against energy: such as 900 to 2350.
     device, force, monitor
         As for `cpunet.jobs.train.train_run`.
 
@@ -82,6 +85,7 @@ def validate_run(
             seed=seed,
             device=device,
             monitor=monitor,
+            ae_range_kev=ae_range_kev,
         )
         to_draw = drawings(found)
         made = made_of(run, sim, data, truth, rivals, seed)
