@@ -230,9 +230,13 @@ def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:
 
 def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, Any]:
     """A and b of sqrt(a + (b/E)^2), neither below 0, by least squares of the squares."""
-    weight = 1 / (2 * relative * error)
-    design = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1) * weight[:, None]
-    a, b2 = scipy.optimize.nnls(design, relative**2 * weight)[0]
+    terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
+    squares = relative**2
+    for _ in range(3):
+        # errors of the law's widths: with their own, widths that came out small weigh most
+        weight = relative / (2 * squares * error)
+        a, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
+        squares = terms @ np.array([a, b2])
     return {
         "a": float(a),
         "b": float(1e3 * np.sqrt(b2)),

@@ -44,7 +44,7 @@ def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
         above.plot(along, 100 * (line["a"] * along + line["b"] - 1), color=colour, label=told)
         width = np.sqrt(law["a"] + (law["b"] / along) ** law["c"])
         below.plot(along, 100 * width, color=colour)
-    above.set_ylabel(f"A/E, 1 at {REFERENCE_KEV:g} keV [% − 100]")
+    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
     below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
     above.legend()
     return figure
