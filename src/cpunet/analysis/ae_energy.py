@@ -276,8 +276,10 @@ def _nll(parameters: Values, x: Values) -> float:
     ]
     norm = max(float(inside[0] - inside[1]), 1e-12)
     density = ((1 - p) * gauss + p * tailed) / norm
-    # weakly held where nothing is known: a tail of some widths, a share of about a third
+    # weakly held where nothing is known: a tail of some widths, a share of about a third; and
+    # a width near that elsewhere, or else a chance cluster of a few events is taken for a peak
     held = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
+    held += 0.5 * (log_sigma / 0.4) ** 2
     return float(-np.log(np.maximum(density, 1e-300)).sum() + held)
 
 
