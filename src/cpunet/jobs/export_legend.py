@@ -6,7 +6,7 @@ The files are those of legend-simflow: electronics (``elecmod``), the mean of A/
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import yaml
 import cpunet
 from cpunet.electronics.equivalent import Equivalent, ae_ratios, current_delay_ns
 from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
+from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
@@ -102,9 +103,8 @@ def export_legend_pars(
         nearest = fitted_kernel(undecayed)
         equivalent: dict[str, Any] = asdict(nearest)
         if library is not None:
-            equivalent["of_library"] = _of_library(
-                library, detector or known, undecayed, nearest
-            )
+            wanted = () if detector is None else (detector,)
+            equivalent["of_library"] = _of_library(library, wanted, known, undecayed, nearest)
     whole = {
         "made_of": {
             "cpunet": cpunet.__version__,
@@ -191,12 +191,16 @@ def _ae_pars(ae: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_library(
-    source: Path, name: str | None, undecayed: Any, nearest: Equivalent
+    source: Path,
+    wanted: Sequence[str],
+    known: str | None,
+    undecayed: Exponentials,
+    nearest: Equivalent,
 ) -> dict[str, Any]:
     """What two numbers do to A/E of a detector's places, against the chain."""
     with opened(source) as file:
         require_whole(file, source, set())
-        held = chosen_libraries(file, source, (), name)
+        held = chosen_libraries(file, source, wanted, known)
         library = IdealLibrary.of(file, held[0], source)
         values = file[f"{library.path}/waveform_{library.angles[0]}"]
         charge = _some(values)
