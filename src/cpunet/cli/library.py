@@ -96,6 +96,36 @@ Names = Annotated[
         "--detector", help="With simflow: library of the file to translate (repeatable)."
     ),
 ]
+Thickness = Annotated[
+    float,
+    typer.Option(
+        "--thickness-mm",
+        help="From the surface to where all charge is collected.",
+        callback=options.within(0, 10, above=True),
+    ),
+]
+Recombination = Annotated[
+    float,
+    typer.Option(
+        "--recombination-mm", help="How deep charge recombines.", callback=options.within(0, 10)
+    ),
+]
+Lifetime = Annotated[
+    float,
+    typer.Option(
+        "--lifetime-ns",
+        help="Of charge where it recombines.",
+        callback=options.within(1, 1e9),
+    ),
+]
+Diffusion = Annotated[
+    float,
+    typer.Option(
+        "--diffusion-cm2-per-s",
+        help="Constant of the holes' diffusion.",
+        callback=options.within(1, 1e5),
+    ),
+]
 SettingsFile = Annotated[
     Path | None, typer.Option("--settings", help="Settings of the simulation, a YAML file.")
 ]
@@ -219,6 +249,31 @@ def expand(source: Source, out_file: Out, force: options.Force = False) -> None:
 
     names = expand_library(source, out_file, force=force)
     tell(f"{out_file}: whole templates of {', '.join(names)}", soft_wrap=True)
+
+
+@library.command()
+def lithium(
+    out_file: Out,
+    thickness_mm: Thickness = 1.0,
+    recombination_mm: Recombination = 0.5,
+    lifetime_ns: Lifetime = 500.0,
+    diffusion: Diffusion = 290.0,
+    force: options.Force = False,
+) -> None:
+    """Tabulate the delayed charge of a lithium layer, for reboost's surface model.
+
+    Example: cpunet library lithium --thickness-mm 1.0 --out lithium.lh5
+    """
+    from cpunet.jobs.lithium_library import write_lithium_library
+    from cpunet.simulation.lithium import LithiumLayer
+
+    layer = LithiumLayer(thickness_mm, recombination_mm, lifetime_ns, diffusion)
+    told = write_lithium_library(layer, out_file, force=force)
+    tell(
+        f"{out_file}: half of the charge from {told['dead_mm']:.2f} mm arrives, half of that "
+        f"within {told['half_ns']:.0f} ns",
+        soft_wrap=True,
+    )
 
 
 def _for_simflow(
