@@ -158,6 +158,20 @@ def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Pa
     assert json.loads(h5py.File(tmp_path / "psl.lh5")["V01"].attrs["cpunet"])["rings"] == 3
 
 
+def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
+    # as SolidStateDetectors.jl writes it: two nodes about the axis, and a step beyond the end
+    nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
+    source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
+    translate_for_simflow(chain, source, tmp_path / "psl.lh5", rings=0)
+    library = read_library(tmp_path / "psl.lh5")
+    np.testing.assert_allclose(library.r_mm, 1000 * nodes)
+    np.testing.assert_array_equal(
+        np.isfinite(library.drift_time_ns[0]), np.isfinite(charge()[..., 0])
+    )
+    with pytest.raises(CpunetError, match="-1 rings"):
+        translate_for_simflow(chain, source, tmp_path / "x.lh5", rings=-1)
+
+
 def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: Path) -> None:
     translate_for_simflow(chain, ideal, tmp_path / "whole.lh5")
     told = translate_for_simflow(chain, ideal, tmp_path / "few.lh5", rank=8)["V01"]
@@ -212,6 +226,7 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
         ({"r": Array(np.arange(4.0), attrs={"units": "mm"})}, "expected (r, z, samples)"),
         ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
+        ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
         (
             {"waveform_045_deg": Array(without(charge(), np.s_[2, 1, 2000:]))},
             "1 templates hold NaN among their samples, the first at r 2, z 1 mm",

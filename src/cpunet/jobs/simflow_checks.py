@@ -172,9 +172,15 @@ def require_complete(
     Raises
     ------
     CpunetError
-        If a row of r or of z has no template although rows on both sides of it have.
+        If an azimuth has no template, or a row of r or of z has none although rows on both
+        sides of it have.
     """
     for angle, mask in inside.items():
+        if not mask.any():
+            raise CpunetError(
+                f"{source}: {library.path}: no template of {angle} can be translated; simulate "
+                "this azimuth again, or leave it out"
+            )
         for name, axis, rows in (
             ("r", library.r_mm, mask.any(axis=1)),
             ("z", library.z_mm, mask.any(axis=0)),
