@@ -16,7 +16,7 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.pulse_shape_library import write_library
-from cpunet.jobs.simflow_checks import chosen_libraries
+from cpunet.jobs.simflow_checks import chosen_libraries, known_detector
 from cpunet.jobs.simflow_files import expand_library, merge_libraries, read_library
 from cpunet.jobs.simflow_library import enclosed, translate_for_simflow
 from cpunet.networks.response_generator import ResponseGenerator
@@ -260,6 +260,22 @@ def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path)
             chosen_libraries(file, ideal, (), "B02")
         with pytest.raises(CpunetError, match="no library of V03; the file has V01"):
             chosen_libraries(file, ideal, ("V03",), None)
+
+
+def test_what_a_run_tells_of_its_detector(tmp_path: Path) -> None:
+    run, sim = tmp_path / "run", tmp_path / "sim.lh5"
+    run.mkdir()
+    info = {"sim": {"file": str(sim)}}
+    assert known_detector(run, info) is None
+    with h5py.File(sim, "w") as file:
+        file.create_group("geds/sim").attrs["simulation"] = "no JSON"
+    assert known_detector(run, info) is None
+    with h5py.File(sim, "a") as file:
+        file["geds/sim"].attrs["simulation"] = json.dumps({"detector": {"name": "V01"}})
+    assert known_detector(run, info) == "V01"
+    (run / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
+    assert known_detector(run, info) == "V02"
+    assert known_detector(tmp_path, {}) is None
 
 
 def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:

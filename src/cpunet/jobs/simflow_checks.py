@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import text_attribute
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.jobs.library_file import WAVEFORM, libraries, n_templates, sampling_period_ns
-from cpunet.jobs.stored_simulation import StoredSimulation
 from cpunet.regular_files import read_text
 from cpunet.translation.ring_padding import padded_axis
-from cpunet.yaml_files import MOST_BYTES, parsed
+from cpunet.yaml_files import MOST_BYTES, parsed, plain_json
 
 PERIOD_NS = 1.0
+PULSES = "geds/sim"  # of an output of `cpunet simulate`, which tells how it was made
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # of any crystal
 
@@ -159,8 +159,12 @@ def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
     if file is None or not file.is_file():
         return None
     try:
-        return StoredSimulation.read(file).detector.name or None
-    except CpunetError:
+        with opened(file) as content:
+            pulses = content.get(PULSES)
+            told = pulses.attrs.get("simulation") if pulses is not None else None
+        made = plain_json(str(told)) if told else {}
+        return str(made["detector"]["name"]) or None
+    except (CpunetError, ValueError, KeyError, TypeError):
         return None
 
 
