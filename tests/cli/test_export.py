@@ -153,6 +153,18 @@ def test_what_production_cannot_use_is_refused(command, trained, tmp_path, words
     assert not (tmp_path / "out").exists()
 
 
+def test_a_lithium_layer_is_tabulated(command, tmp_path):
+    out = tmp_path / "lithium.lh5"
+    done = command("library", "lithium", "--thickness-mm", "0.8", "--out", out)
+    assert done.code == 0, done.err
+    assert "mm arrives, half of that within" in done.out
+    assert lh5.read("lithium", str(out))["arrived"].nda.shape == (10_000, 80)
+    for wrong in (["--thickness-mm", "0"], ["--recombination-mm", "2"]):
+        refused = command("library", "lithium", *wrong, "--out", tmp_path / "x.lh5")
+        assert refused.code == 2
+        assert not (tmp_path / "x.lh5").exists()
+
+
 @pytest.mark.parametrize("name", ["export", "import", "library"])
 def test_help(command, name):
     assert command(name, "--help").code == 0
