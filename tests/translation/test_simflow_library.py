@@ -364,7 +364,7 @@ def test_a_over_e_of_geant4_events_at_the_nodes(
     apart = 100 * (found / full - 1)
     assert np.isfinite(apart).all()
     assert np.median(np.abs(apart)) < 0.01
-    # reboost looks every 20 ns first, and takes the wrong one of two maxima now and then
+    # reboost looks every 20 ns first, and may take the lower one of two maxima
     assert (np.abs(apart) < 0.2).mean() > 0.99
 
 
