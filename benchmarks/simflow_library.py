@@ -25,7 +25,7 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.jobs.simflow_files import read_library
+from cpunet.jobs.translation.simflow_files import read_library
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume

@@ -12,8 +12,8 @@ import yaml
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.export_legend import export_legend_pars
-from cpunet.jobs.pulse_shape_library import write_library
+from cpunet.jobs.simulation.pulse_shape_library import write_library
+from cpunet.jobs.translation.export_legend import export_legend_pars
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector

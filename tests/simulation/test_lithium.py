@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.lithium_library import write_lithium_library
+from cpunet.jobs.translation.lithium_library import write_lithium_library
 from cpunet.simulation.lithium import LithiumLayer, arrived, delayed
 
 

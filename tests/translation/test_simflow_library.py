@@ -15,10 +15,10 @@ from lgdo import Array, Scalar, Struct
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.pulse_shape_library import write_library
-from cpunet.jobs.simflow_checks import chosen_libraries, known_detector
-from cpunet.jobs.simflow_files import expand_library, merge_libraries, read_library
-from cpunet.jobs.simflow_library import enclosed, translate_for_simflow
+from cpunet.jobs.simulation.pulse_shape_library import write_library
+from cpunet.jobs.translation.simflow_checks import chosen_libraries, known_detector
+from cpunet.jobs.translation.simflow_files import expand_library, merge_libraries, read_library
+from cpunet.jobs.translation.simflow_library import enclosed, translate_for_simflow
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import cluster_hits

@@ -77,7 +77,7 @@ def export(
         return
     if detector is not None or library is not None:
         raise CpunetError("--detector and --library are those of --to legend-pars; add it")
-    from cpunet.jobs.export import export_run
+    from cpunet.jobs.translation.export import export_run
 
     done = export_run(
         run,
@@ -104,7 +104,7 @@ def _legend_pars(
     *,
     force: bool,
 ) -> None:
-    from cpunet.jobs.export_legend import export_legend_pars
+    from cpunet.jobs.translation.export_legend import export_legend_pars
 
     told = export_legend_pars(
         run,

@@ -148,8 +148,8 @@ def make(
 
     Example: cpunet library make --detector icpc --out psl.lh5
     """
-    from cpunet.jobs.pulse_shape_library import DT_NS, LENGTH_NS, write_library
-    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.jobs.simulation.pulse_shape_library import DT_NS, LENGTH_NS, write_library
+    from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
     refuse_inputs(out_file, detector, settings)
@@ -202,7 +202,7 @@ def translate(
         raise CpunetError(
             "--low-rank, --rings and --detector are those of --format simflow; add it"
         )
-    from cpunet.jobs.translate_library import translate_library
+    from cpunet.jobs.translation.translate_library import translate_library
 
     told = translate_library(
         run,
@@ -233,7 +233,7 @@ def merge(sources: Sources, out_file: Out, force: options.Force = False) -> None
 
     Example: cpunet library merge V01.lh5 V02.lh5 --out psl.lh5
     """
-    from cpunet.jobs.simflow_files import merge_libraries
+    from cpunet.jobs.translation.simflow_files import merge_libraries
 
     names = merge_libraries(sources, out_file, force=force)
     tell(f"{out_file}: {len(names)} libraries: {', '.join(names)}", soft_wrap=True)
@@ -245,7 +245,7 @@ def expand(source: Source, out_file: Out, force: options.Force = False) -> None:
 
     Example: cpunet library expand psl_small.lh5 --out psl.lh5
     """
-    from cpunet.jobs.simflow_files import expand_library
+    from cpunet.jobs.translation.simflow_files import expand_library
 
     names = expand_library(source, out_file, force=force)
     tell(f"{out_file}: whole templates of {', '.join(names)}", soft_wrap=True)
@@ -264,7 +264,7 @@ def lithium(
 
     Example: cpunet library lithium --thickness-mm 1.0 --out lithium.lh5
     """
-    from cpunet.jobs.lithium_library import write_lithium_library
+    from cpunet.jobs.translation.lithium_library import write_lithium_library
     from cpunet.simulation.lithium import LithiumLayer
 
     layer = LithiumLayer(thickness_mm, recombination_mm, lifetime_ns, diffusion)
@@ -285,7 +285,7 @@ def _for_simflow(
     detectors: list[str] | None,
     **more: Any,
 ) -> None:
-    from cpunet.jobs.simflow_library import translate_for_simflow
+    from cpunet.jobs.translation.simflow_library import translate_for_simflow
 
     told = translate_for_simflow(
         run,
