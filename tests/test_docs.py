@@ -16,8 +16,8 @@ import yaml
 
 import cpunet
 from cpunet.cli.main import app
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.training.train import train_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe

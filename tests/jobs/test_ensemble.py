@@ -15,9 +15,9 @@ from torch import nn
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.seed_scores import failed_seeds, seed_table
 from cpunet.errors import CpunetError
-from cpunet.jobs.ensemble import train_ensemble
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.studies.ensemble import train_ensemble
+from cpunet.jobs.training.train import train_run
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses

@@ -15,10 +15,10 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Advance, Monitor
-from cpunet.jobs.train import train_run
-from cpunet.jobs.translate import translate_file
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.translation.translate import translate_file
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import write_pulses

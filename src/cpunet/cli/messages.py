@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cpunet.cli.streams import Notes, OutputError, Results
-from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.jobs.common.monitor import Advance, Monitor
 
 out = Results()
 err = Notes(stderr=True)
