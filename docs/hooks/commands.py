@@ -52,10 +52,18 @@ def kind_of(annotation: Any) -> str:
     if origin in (Union, UnionType, list, tuple):
         return kind_of(next(kind for kind in inner if kind is not type(None)))
     if origin is Literal:
-        return " | ".join(map(str, inner))
+        return " or ".join(map(str, inner))
     if isinstance(annotation, type) and issubclass(annotation, Enum):
-        return " | ".join(str(choice.value) for choice in annotation)
+        return " or ".join(str(choice.value) for choice in annotation)
     return "TEXT" if annotation is str else annotation.__name__.upper()
+
+
+def default_of(option: Any) -> str:
+    if isinstance(option.show_default, str):  # what the code finds out by itself
+        return f"`{option.show_default}`"
+    return (
+        "" if option.is_flag or option.default in (None, (), [], "") else f"`{option.default}`"
+    )
 
 
 def option_row(option: Any, kind: str) -> str:
@@ -65,10 +73,7 @@ def option_row(option: Any, kind: str) -> str:
         spelled = ", ".join(f"`{word}`" for word in (*option.opts, *option.secondary_opts))
         if not option.is_flag:
             spelled += f" `{kind}`"
-    default = option.default
-    shown = "required" if option.required else ""
-    if not option.required and not option.is_flag and default not in (None, (), []):
-        shown = f"`{default}`"
+    shown = "required" if option.required else default_of(option)
     note = " Repeatable." if option.multiple and "repeatable" not in (option.help or "") else ""
     return f"| {spelled} | {cell(option.help or '')}{note} | {shown} |"
 
@@ -79,14 +84,15 @@ def command_page(name: str, command: Any) -> str:
     lines = [f"# {name}", "", summary, ""]
     if examples:
         lines += ["```sh", *examples, "```", ""]
-    for title, kind in (("Arguments", "argument"), ("Options", "option")):
-        rows = [
-            option_row(option, kind_of(kinds.get(option.name, str)))
-            for option in command.params
-            if option.param_type_name == kind and not getattr(option, "hidden", False)
-        ]
-        if rows:
-            lines += [f"## {title}", "", "| | | default |", "|---|---|---|", *rows, ""]
+    tables: dict[str, list[str]] = {}
+    for option in command.params:
+        if not getattr(option, "hidden", False):
+            usual = f"{option.param_type_name.title()}s"
+            title = getattr(option, "rich_help_panel", None) or usual
+            row = option_row(option, kind_of(kinds.get(option.name, str)))
+            tables.setdefault(title, []).append(row)
+    for title, rows in tables.items():
+        lines += [f"## {title}", "", "| | | default |", "|---|---|---|", *rows, ""]
     return "\n".join(lines)
 
 
