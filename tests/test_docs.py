@@ -9,6 +9,7 @@ import tomllib
 import warnings
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import typer
@@ -16,24 +17,26 @@ import yaml
 
 import cpunet
 from cpunet.cli.main import app
+from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
-from cpunet.recipes import load_recipe
+from cpunet.recipes import load_recipe, recipe_names
 from cpunet.translation.translator import RejectionWarning
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Seconds of simulation each: their imports are tried only.
 TOO_LONG = {"simulation.md", "explorer.md"}
+MADE_BY_THE_SITE = ("reference/", "../reference/")
 KEV = 2614.511
 
 
 def blocks(*languages: str) -> list:
     return [
-        pytest.param(page, code, id=f"{page.name}-{i}")
+        pytest.param(page, code, id=f"{page.relative_to(ROOT)}-{i}")
         for page in PAGES
         for i, (language, code) in enumerate(BLOCK.findall(page.read_text()))
         if language in languages
@@ -48,13 +51,18 @@ def commands(code: str) -> list[list[str]]:
 
 
 def require_parsed(words: list[str]) -> None:
-    """Have the command line's own parser read the words; nothing is run."""
+    """Have the command line's own parser read the words; nothing is run.
+
+    What is set of a recipe must be one of its settings.
+    """
     command, name = typer.main.get_command(app), "cpunet"
     while words and words[0] in getattr(command, "commands", {}):
         name, *words = words
         command = command.commands[name]
     assert not hasattr(command, "commands"), f"no command {words[:1]}"
-    command.make_context(name, list(words))
+    given = command.make_context(name, list(words)).params
+    if given.get("recipe") in recipe_names():
+        load_recipe(given["recipe"], given.get("set_values") or ())
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("", "sh", "console"))
@@ -70,6 +78,50 @@ def test_the_commands(page, code):
 def test_a_wrong_option_would_be_found():
     with pytest.raises(Exception, match="No such option"):
         require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
+
+
+def test_a_wrong_setting_would_be_found():
+    with pytest.raises(CpunetError, match="the recipe has no"):
+        require_parsed(
+            ["train", "--sim", "a", "--data", "b", "--out", "c", "--set", "training.nonsense=1"]
+        )
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("yaml"))
+def test_the_yaml(page, code):
+    content = yaml.safe_load(code)
+    if "periods" in content:
+        schema = yaml.safe_load((ROOT / "workflow" / "config" / "schema.yaml").read_text())
+        jsonschema.validate(content, schema)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_links(page):
+    """Files that a page links to or shows are there, and so are the headings."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        name, _, heading = target.partition("#")
+        if "://" in target or name.startswith(MADE_BY_THE_SITE):
+            continue
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
+            assert heading in map(slugify, titles), f"{page.name}: {target}"
+
+
+def test_the_files_to_copy_are_there():
+    for path in re.findall(
+        r"`((?:src|tests|docs)/[\w./-]+)`", (ROOT / "CONTRIBUTING.md").read_text()
+    ):
+        assert (ROOT / path).exists(), path
+    for path in re.findall(r"`((?:\w+/)+\w+\.py)`", (ROOT / "CONTRIBUTING.md").read_text()):
+        assert (ROOT / path).exists() or (ROOT / "src" / "cpunet" / path).exists(), path
+
+
+def slugify(title: str) -> str:
+    """The anchor of a heading."""
+    words = re.sub(r"[^\w\s-]", "", title.lower()).strip()
+    return re.sub(r"[-\s]+", "-", words)
 
 
 def edges(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
