@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 import warnings
 from pathlib import Path
@@ -129,6 +131,10 @@ def edges(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
     return 1 / (1 + np.exp(-(np.arange(length) - 550 - rng.uniform(0, 1, (n, 1))) / width))
 
 
+SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
+"""A fit that ends at once, whatever it has found."""
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
     """The files that the pages speak of, sim.lh5 as `cpunet simulate` may write it."""
@@ -144,8 +150,7 @@ def home(tmp_path_factory) -> Path:
     write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
     fine = Pulses.of(edges(4, 3000, rng), dt_ns=1, energy_kev=np.full(4, KEV))
     write_pulses(folder / "fine.lh5", fine)
-    short = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
-    recipe = load_recipe("fast", [f"training.{value}" for value in (*short, "noise_sets=1")])
+    recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")
     train_run(*sides, folder / "run", recipe, device="cpu")
     for seed in ("seed_000", "seed_001"):
@@ -167,6 +172,36 @@ def test_the_python(page, code, home, monkeypatch):
         lost = np.isnan(names["measured_like"]).any(axis=1)
         assert lost[7]  # and the one of 1 keV, if its noise is too high
         assert set(np.flatnonzero(lost)) <= {3, 7}
+
+
+@pytest.mark.slow
+def test_the_first_tutorial_from_end_to_end(tmp_path):
+    """Every command of it in turn, with fewer events and a fit that ends at once."""
+    page = ROOT / "docs" / "tutorials" / "first-ren.md"
+    lines = [
+        words
+        for language, code in BLOCK.findall(page.read_text())
+        if language == ""
+        for words in commands(code)
+        if words[0] == "cpunet"
+    ]
+    assert lines[0][1] == "stand"
+    for words in lines:
+        if "--events" in words:
+            words[words.index("--events") + 1] = "FEP=500,SEP=120,DEP=120"
+        if words[1] == "train":
+            words += [w for value in SHORT for w in ("--set", f"training.{value}")]
+            words += ["--set", "scores.bootstraps=10"]
+        code = "from cpunet.cli.main import main; main()"
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words[1:]],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, (words, done.stderr)
+    for made in ("check.png", "run/run.json", "translated.lh5", "report/report.html"):
+        assert (tmp_path / made).exists()
 
 
 def test_the_readmes_files_are_told_of(home):
