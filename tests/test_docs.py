@@ -77,6 +77,22 @@ def test_the_commands(page, code):
                 assert (ROOT / word).exists(), f"{page.name}: {word}"
 
 
+def test_the_commands_within_sentences():
+    """What stands in a sentence may lack arguments, but its command and options are there."""
+    for page in PAGES:
+        for inline in re.findall(r"(?<!`)`cpunet ([^`]+)`(?!`)", page.read_text()):
+            command, words = typer.main.get_command(app), inline.split()
+            while words and words[0] in getattr(command, "commands", {}):
+                command = command.commands[words.pop(0)]
+            known = {name for option in command.params for name in option.opts}
+            known |= {name for option in command.params for name in option.secondary_opts}
+            options = {word.strip("[]").partition("=")[0] for word in words if word[:2] == "--"}
+            assert options <= known | {"--help"}, f"{page.name}: cpunet {inline}"
+            first = words[0] if words else ""
+            if hasattr(command, "commands"):
+                assert not first.isalpha() or first.isupper(), f"{page.name}: cpunet {inline}"
+
+
 def test_a_wrong_option_would_be_found():
     with pytest.raises(Exception, match="No such option"):
         require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
