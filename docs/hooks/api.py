@@ -12,6 +12,11 @@ from mkdocs.structure.files import File, Files
 SOURCE = Path(__file__).parents[2] / "src" / "cpunet"
 FOLDER = "reference/python"
 LEFT_OUT = {"cli"}  # has a reference of its own
+# As data flow; a room that is not named here comes last.
+ORDER = (
+    "recipes pulses simulation electronics networks training calibration translation "
+    "analysis jobs"
+).split()
 OPTIONS = (
     "options:",
     "  heading_level: 3",
@@ -55,9 +60,17 @@ def first_line(path: Path) -> str:
     return text.partition("\n")[0]
 
 
+def place(folder: Path) -> tuple[int, tuple[str, ...]]:
+    """Where a folder stands in the order of the rooms."""
+    parts = folder.relative_to(SOURCE).parts
+    if not parts:
+        return -1, parts
+    return (ORDER.index(parts[0]) if parts[0] in ORDER else len(ORDER)), parts
+
+
 def rooms() -> Iterator[Path]:
     """Folders of the package that hold modules to show, the package's own first."""
-    for folder in sorted(path.parent for path in SOURCE.rglob("__init__.py")):
+    for folder in sorted((path.parent for path in SOURCE.rglob("__init__.py")), key=place):
         parts = folder.relative_to(SOURCE).parts
         if not LEFT_OUT.intersection(parts) and public_modules(folder):
             yield folder
