@@ -36,7 +36,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import load_network, read_info, read_losses
 
 pytestmark = pytest.mark.probed
-FEW, MANY = 10, 2500
+FEW, MANY = 4, 2500
 
 
 def load_mutations() -> ModuleType:

@@ -104,10 +104,9 @@ def weights(run: Path) -> bytes:
 
 
 def test_a_seed_is_what_a_single_training_gives(files, made, tmp_path):
-    for seed in (0, 1):
-        train_run(*files, tmp_path / str(seed), RECIPE, seed=seed, device="cpu")
-        assert weights(made.folder / f"seed_00{seed}") == weights(tmp_path / str(seed))
-    assert weights(tmp_path / "0") != weights(tmp_path / "1")
+    train_run(*files, tmp_path / "1", RECIPE, seed=1, device="cpu")
+    assert weights(made.folder / "seed_001") == weights(tmp_path / "1")
+    assert weights(made.folder / "seed_000") != weights(tmp_path / "1")
 
 
 def test_the_ensemble_tells_of_its_seeds(made):

@@ -16,5 +16,8 @@ class Monitor:
         """Enter a stage of `total` steps (None if not known); call what it gives with steps."""
         yield lambda _steps: None
 
+    def state(self, text: str) -> None:
+        """Take what is to be shown beside the progress of the stage, until there is news."""
+
     def note(self, message: str) -> None:
         """Take a line of information for the user."""

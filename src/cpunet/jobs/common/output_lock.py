@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from cpunet.errors import CpunetError
+from cpunet.file_locks import lock
 from cpunet.files import remove_partial
 
 
@@ -17,8 +17,7 @@ def only_writer(target: Path) -> Iterator[None]:
     """Hold the right to write `target`, until the block or the process ends.
 
     What a process that was killed has left of it is removed first.
-    The lock is a hidden file beside `target`, locked by the system, so that none is left
-    behind that counts.  On file systems without locks it keeps nobody out; then the last
+    The lock is a hidden file beside `target`, see `cpunet.file_locks`; without locks the last
     output to be moved into place stays.
 
     Raises
@@ -46,17 +45,13 @@ def only_writer(target: Path) -> Iterator[None]:
 
 def _lock(handle: int, path: Path, target: Path) -> bool:
     """Lock the file; return whether the file system has locks."""
-    busy = CpunetError(f"{target}: another process is writing it; wait for that one")
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise busy from None
-    except OSError:
+    busy = f"{target}: another process is writing it; wait for that one"
+    if not lock(handle, busy):
         return False
     try:
         same = os.fstat(handle).st_ino == path.stat().st_ino
     except FileNotFoundError:
         same = False
     if not same:  # its holder was done and removed it while this one was opening it
-        raise busy
+        raise CpunetError(busy)
     return True

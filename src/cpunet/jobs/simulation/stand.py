@@ -92,9 +92,9 @@ def make_stand(
 
     The folder holds ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
     digitiser's period; ``geds/hits``: their hits; the attribute ``simulation`` of the
-    former: detector and settings, as `cpunet.jobs.simulation.simulate` keeps them), ``data.lh5``
-    (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the noise-free
-    trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
+    former: detector and settings, as `cpunet.jobs.simulation.simulate` keeps them),
+    ``data.lh5`` (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the
+    noise-free trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
     ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
     included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
     baseline, 2 pile-up, 4 saturated; ``remains_kev``, ``n_piled``, ``piled_kev``,

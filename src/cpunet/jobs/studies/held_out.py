@@ -139,7 +139,7 @@ class HeldOut:
         """
         model: nn.Module
         if isinstance(recipe.training, MatchingConfig):
-            model, _, recipe = match(self.fit, recipe, seed, lambda _records: None, Monitor())
+            model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, Monitor())
         else:
             model = train(
                 self.fit.sim.waveforms,

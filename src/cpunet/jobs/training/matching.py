@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.loop import Record
+from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.matching import fit_response
 from cpunet.training.residual import fit_residual
 from cpunet.training.run_folder import load_network, read_recipe
@@ -75,7 +74,7 @@ def match(
     sides: Sides,
     recipe: Recipe,
     seed: int,
-    listen: Callable[[list[Record]], None],
+    listen: Listener,
     monitor: Monitor,
     known: ElectronicsResponse | None = None,
 ) -> tuple[nn.Module, dict[str, Any], Recipe]:
@@ -90,7 +89,7 @@ def match(
     seed
         Of everything random.
     listen
-        Given a record for each step of the fit.
+        Told step and chi-square.
     monitor
         Told of what is to be noted.
     known
@@ -112,9 +111,6 @@ def match(
     if note is not None:
         monitor.note(f"warning: {note}")
 
-    def tell(step: int, chi_square: float) -> None:
-        listen([{"iteration": step, "rate": 0.0, "losses": {"chi_square": chi_square}}])
-
     if known is not None:
         recipe = _with_config(recipe, known.config)
     response, fit = fit_response(
@@ -125,7 +121,7 @@ def match(
         seed=seed,
         known=known,
         remains=drawn,
-        listener=tell,
+        listener=listen,
     )
     compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
     monitor.note(f"compared (simulated/measured pulses): {compared}")

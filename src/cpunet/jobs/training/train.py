@@ -211,13 +211,17 @@ class TrainingJob:
             known = known_response(self.init, self.data.dt_ns)
         with (
             _losses_shown(self.folder, wanted=tensorboard) as show,
-            self.monitor.stage("Matching") as advance,
+            # most fits need fewer steps than one start may take
+            self.monitor.stage("Matching", self.recipe.matching.training.steps) as advance,
         ):
 
-            def listen(records: list[Record]) -> None:
-                append_losses(self.folder, records)
-                show(records)
-                advance(len(records))
+            def listen(step: int, chi_square: float) -> None:
+                losses = {"chi_square": chi_square}
+                record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
+                append_losses(self.folder, [record])
+                show([record])
+                advance(1)
+                self.monitor.state(f"chi-square {chi_square:.4g}")
 
             model, more, recipe = match(
                 sides, self.recipe, self.seed, listen, self.monitor, known

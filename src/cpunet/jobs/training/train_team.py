@@ -26,7 +26,8 @@ def team_for(recipe: Recipe, device: str) -> Iterator[tuple[Team, str]]:
     recipe
         What is to be trained.
     device
-        As for `cpunet.jobs.training.train.train_run`; each process has the GPU of its local rank.
+        As for `cpunet.jobs.training.train.train_run`; each process has the GPU of its local
+        rank.
 
     Raises
     ------

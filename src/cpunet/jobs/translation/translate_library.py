@@ -82,9 +82,10 @@ def translate_library(
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
-    `cpunet.jobs.simulation.pulse_shape_library.write_library` make them; a file may hold several, at
-    any depth.  Names, units, shapes, types and the time axis stay; a missing ``t0``, without
-    which reboost cannot read a library, becomes 0.  Templates with NaN stay as they are.
+    `cpunet.jobs.simulation.pulse_shape_library.write_library` make them; a file may hold
+    several, at any depth.  Names, units, shapes, types and the time axis stay; a missing
+    ``t0``, without which reboost cannot read a library, becomes 0.  Templates with NaN stay
+    as they are.
     Files are streamed.
 
     Parameters

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+import cpunet
 from cpunet.analysis.linearity import linearity_residual
 from cpunet.analysis.verdicts import summaries, verdict_table
 from cpunet.errors import CpunetError
@@ -133,6 +134,7 @@ def evaluate(
             advance(1)
     kept = survivals(values, seed)
     metrics = {
+        "compared": _compared(run, info, sim_set, data_set),
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
@@ -184,6 +186,24 @@ def _load_both(
             f"{ren.dt_ns:g} ns; resample the pulses"
         )
     return sim_set, data_set
+
+
+def _compared(
+    run: Path, info: Mapping[str, Any], sim: InputSet, data: InputSet
+) -> dict[str, Any]:
+    """What a reader must know of the comparison before its scores."""
+    fit = info.get("fit") or {}
+    compared = {
+        "simulation": str(sim.path),
+        "data": str(data.path),
+        "run": str(run),
+        "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
+        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
+        f"{str(info.get('started', ''))[:10]}",
+    }
+    if fit.get("verdict"):
+        compared["fit"] = str(fit["verdict"])
+    return compared | {"scored with": f"cpunet {cpunet.__version__}"}
 
 
 def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:

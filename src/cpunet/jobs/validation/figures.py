@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.analysis.ae_energy_figure import ae_energy_figure
-from cpunet.analysis.ae_figures import ae_figure, two_dimensional_figure
+from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.analysis.baseline_spectra import spectrum_of_noise
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.drift_slices import Slices, Superpulse
@@ -40,7 +40,7 @@ from cpunet.translation.translator import IREN, REN
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
-SPECTRUM, LOSSES = "spectrum", "losses"
+SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
 CYCLES = ("forward cycle", "backward cycle")
 OF_PEAKS = (
     *PARAMETERS,
@@ -76,7 +76,7 @@ class Drawing:
 def figure_names(peaks: Iterable[str]) -> list[str]:
     """Names of all figures that a validation of these peaks may have."""
     names = [f"{peak} {figure}" for peak in peaks for figure in (*CYCLES, *OF_PEAKS)]
-    return [SPECTRUM, AE_ENERGY, *names, LOSSES]
+    return [SPECTRUM, AE_ENERGY, *names, ROC, LOSSES]
 
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
@@ -93,6 +93,8 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     made[f"{fullest.name} {backward}"] = _backward(fullest, found.ren, found.iren)
     for peak in scored:
         made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
+    if DEP in {peak.name for peak in scored} and len(scored) > 1:
+        made[ROC] = _roc(found, [peak.name for peak in scored])
     if found.losses:
         made[LOSSES] = of_losses(found.losses)
     return made
@@ -191,6 +193,18 @@ def _ae(details: PeakDetails, name: str) -> Drawing:
     return Drawing("A over E", {"table": table, "peak": name})
 
 
+def _roc(found: Evaluation, peaks: list[str]) -> Drawing:
+    ae = {
+        peak: {
+            method: values["current_amplitude"]
+            for method, values in found.values[peak].items()
+            if method in DRAWN
+        }
+        for peak in peaks
+    }
+    return Drawing("A over E survival", {"ae": ae, "dep": DEP})
+
+
 def _plane(details: PeakDetails, name: str) -> Drawing:
     table = dict(details.plane)
     shown = ("data", "raw", "ren", "truth")
@@ -253,6 +267,7 @@ _DRAW: Mapping[str, Callable[..., Figure]] = {
     AE_ENERGY: ae_energy_figure,
     "A over E": ae_figure,
     "A over E and drift time": two_dimensional_figure,
+    "A over E survival": roc_figure,
     "noise": _draw_noise,
     "losses": loss_curves,
 }

@@ -55,8 +55,8 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     peak
         Its pulses.
     values
-        Their parameters by method, see `cpunet.jobs.validation.scoring.score_peak`; methods without
-        noise are left out.
+        Their parameters by method, see `cpunet.jobs.validation.scoring.score_peak`; methods
+        without noise are left out.
     bootstraps, seed
         Of the errors.
     """

@@ -123,9 +123,7 @@ def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
 
 def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:
     notes = [
-        f"Trained with recipe “{info['recipe']}” on {info['sim']['used']} simulated and "
-        f"{info['data']['used']} measured pulses of {info['peak']}, unpaired; peaks other "
-        "than that took no part in the training.",
+        f"Peaks other than {info['peak']} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
