@@ -73,8 +73,8 @@ def coloured_noise(
     r"""Gaussian noise with a given spectrum and an RMS of 1, shape ``(n, length)``.
 
     Each real FFT bin is a complex Gaussian whose variance follows `noise_power`. Traces are
-    cut from longer ones. The RMS is taken about 0 and includes frequencies down to that of these
-    longer traces (8 kHz at 16 ns), so the scatter within a short trace is slightly lower.
+    cut from longer ones. The RMS is taken about 0 and includes frequencies down to that of
+    these longer traces (8 kHz at 16 ns), so the scatter within a short trace is slightly lower.
 
     Examples
     --------
