@@ -161,6 +161,15 @@ def noise_of(
 ) -> npt.NDArray[np.float32]:
     """Noise in keV of `n` traces of a chain, shape ``(n, electronics.length)``.
 
+    Parameters
+    ----------
+    electronics
+        The readout chain.
+    n
+        Number of traces.
+    rng
+        Random generator.
+
     Raises
     ------
     CpunetError

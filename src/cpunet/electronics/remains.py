@@ -183,7 +183,15 @@ class Remains:
         )
 
     def measure(self, raw: Pulses) -> FloatArray:
-        """Remainder at the first sample of raw traces in keV; NaN where undetermined."""
+        r"""Remainder at the first sample of raw traces in keV; NaN where undetermined.
+
+        It is the weighted mean of the remainders from slope and level,
+
+        .. math:: A = (1 - w)\, A_{\mathrm{slope}} + w\, \frac{\bar{b} - b_0}{\bar{e}},
+
+        with the mean :math:`\bar{b}` of the baseline, the level :math:`b_0` of an empty one and
+        the mean :math:`\bar{e}` of :math:`e^{-t/\tau}` over the baseline.
+        """
         baselines = np.asarray(raw.waveforms[:, : self.samples], float)
         mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
         kev = (1 - self.level_weight) * left / self.adc_per_kev

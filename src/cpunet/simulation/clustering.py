@@ -17,10 +17,13 @@ Integers = npt.NDArray[np.int64]
 
 
 def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
-    """Merge hits of an event that are closer together than a distance.
+    r"""Merge hits of an event that are closer together than a distance.
 
     Single linkage: hits connected by a chain of neighbours at most `distance_mm` apart become
-    one hit, at their energy-weighted mean position and with the sum of their energies.
+    one hit with the sum of their energies at their energy-weighted mean position,
+
+    .. math:: E = \sum_i E_i, \qquad \mathbf{x} = \frac{1}{E} \sum_i E_i \mathbf{x}_i.
+
     Clusters keep the order of their first hits.
 
     Parameters

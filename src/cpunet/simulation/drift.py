@@ -169,6 +169,11 @@ def drift_paths(
         Starting points in mm.
     settings
         Simulation settings.
+
+    Returns
+    -------
+    DriftPaths
+        Positions (n, steps, 3) in mm of both carriers.
     """
     start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
     maps = drift_maps(fields, settings)

@@ -150,12 +150,20 @@ def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
 def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Extrapolate linearly by one node along r and z, then around the corners.
 
+    A node next to two known ones in line becomes twice the nearer value minus the farther.
+
     Parameters
     ----------
     values
         Array of shape ``(nr, nz, ...)``.
     known
         Boolean array (nr, nz): nodes with a value.
+
+    Examples
+    --------
+    >>> values, known = np.array([[1.0], [2.0], [0.0]]), np.array([[True], [True], [False]])
+    >>> with_ghost_nodes(values, known)[0].ravel().tolist()
+    [1.0, 2.0, 3.0]
     """
     for _ in range(2):
         total = np.zeros_like(values)

@@ -52,6 +52,17 @@ def impurity_values(
     ------
     CpunetError
         If the curve, a parameter or the slice is missing or unknown.
+
+    Examples
+    --------
+    A constant 10 x 1e9/cm3 net acceptors are -1e10/cm3.
+
+    >>> crystal = {
+    ...     "impurity_curve": {"model": "constant_boule", "parameters": {"value": 10.0}},
+    ...     "slices": {"A": {"detector_offset_in_mm": 5.0}},
+    ... }
+    >>> impurity_values(crystal, "V99000.yaml", "A", 90.0)["impurity_z0_1e10_per_cm3"]
+    -1.0
     """
     curve = crystal.get("impurity_curve")
     if not isinstance(curve, Mapping):

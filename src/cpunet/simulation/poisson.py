@@ -166,7 +166,9 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
 
 
 def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
-    """Charge of each ring over the vacuum permittivity, per rad, in V mm.
+    r"""Charge of each ring over the vacuum permittivity, per rad, in V mm.
+
+    .. math:: Q = \int \frac{e N}{\varepsilon_0}\, r\, dr\, dz
 
     Parameters
     ----------

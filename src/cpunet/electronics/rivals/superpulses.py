@@ -62,7 +62,11 @@ def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
 def without_decay(
     data: FloatArray, tail_slope_per_ms: float, dt_ns: float, align: int
 ) -> Values:
-    """Undo the decay (pole-zero correction) and scale the pulses to unit height.
+    r"""Undo the decay (pole-zero correction) and scale the pulses to unit height.
+
+    .. math:: x_j = \sum_{k \le j} \left(s_k - e^{\lambda \Delta t} s_{k-1}\right)
+
+    with the logarithmic slope :math:`\lambda` of the tail.
 
     Parameters
     ----------
@@ -74,6 +78,14 @@ def without_decay(
         Sampling period in ns.
     align
         Sample at which the windows are aligned.
+
+    Examples
+    --------
+    An exponential decay becomes a step.
+
+    >>> decay = np.r_[np.zeros(10), np.exp(-np.arange(30) * 0.016 / 50)]  # 50 us
+    >>> without_decay(decay[np.newaxis], -20.0, 16.0, 10)[0, [9, 10, 39]].round(6).tolist()
+    [0.0, 1.0, 1.0]
     """
     kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
     current = data.astype(float)
@@ -148,7 +160,11 @@ def superpulses(
     groups: Groups,
     length: int,
 ) -> Superpulses:
-    """Mean current spectra by slice, with the half maximum of each pulse at sample 0.
+    r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
+
+    .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
+
+    with the half maximum :math:`t_p` of pulse :math:`p` in samples.
 
     Parameters
     ----------
