@@ -3,7 +3,7 @@
 Noise in ADC counts is the same for all pulses of a channel. After normalisation it scales as
 1/energy, so it is stored in prepared units times keV. The spectrum is estimated from the raw
 samples before the pulse. The short baseline of the prepared window would lose the low
-frequencies, which dominate the errors of drift time and tail slope.
+frequencies, which determine the scatter of drift time and tail slope.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
 class BaselineNoise:
     r"""Spectrum of baseline noise.
 
-    The one-sided FFT bins :math:`X_k` of :math:`N` samples have the density
+    The real FFT bins :math:`X_k` of :math:`N` samples have the density
 
     .. math:: S_k = \langle |X_k|^2 \rangle / N, \qquad
         \mathrm{RMS}^2 = \frac{1}{N} \Big(S_0 + 2 \sum_{0<k<N/2} S_k + S_{N/2}\Big).
