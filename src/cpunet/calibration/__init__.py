@@ -1,7 +1,7 @@
-"""The detector and its readout, calibrated together: physics that a chain cannot stand in for.
+"""Joint calibration of the detector and its readout, for physics a chain cannot absorb.
 
-A simulation's physics are never quite right, and a chain that is fitted to it absorbs what it
-can of that.  But the chain is the same for all drift times, energies and topologies; physics
-are not.  So both are fitted at once to functions of the pulses in slices of drift time, see
-docs/calibration.md.
+The physics of a simulation is never exact, and a chain fitted to it absorbs part of the error.
+But the chain is the same for all drift times, energies and topologies, while the effect of the
+physics is not. Both are therefore fitted together to functions of the pulses in slices of
+drift time, see docs/calibration.md.
 """

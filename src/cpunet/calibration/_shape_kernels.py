@@ -1,4 +1,4 @@
-"""Pulses laid over each other at their half maxima, in compiled code."""
+"""Compiled loops that align pulses at their half maxima."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cpunet.kernels import kernel
 
 @kernel(inline="always")
 def _sample(pulse: Any, at: int, length: int) -> Any:  # pragma: no cover - compiled
-    """A sample; 0 before the pulse, its last one after it."""
+    """Sample of a pulse; 0 before its start, its last sample after its end."""
     if at < 0:
         return np.float32(0.0)
     return pulse[min(at, length - 1)]
@@ -21,7 +21,7 @@ def _sample(pulse: Any, at: int, length: int) -> Any:  # pragma: no cover - comp
 
 @kernel(parallel=True)
 def half_maxima(pulses: Any, found: Any) -> None:  # pragma: no cover - compiled
-    """Where each pulse passes half of its last sample, in samples; as it is if nowhere."""
+    """Sample at which each pulse reaches half its final value; unchanged if it does not."""
     for i in prange(len(pulses)):
         pulse = pulses[i]
         level = 0.5 * pulse[-1]
@@ -33,7 +33,7 @@ def half_maxima(pulses: Any, found: Any) -> None:  # pragma: no cover - compiled
 
 @kernel(parallel=True)
 def move(pulses: Any, samples: Any, moved: Any) -> None:  # pragma: no cover - compiled
-    """Move each pulse to the left by some samples, cubic between them."""
+    """Shift each pulse to the left by a number of samples, with cubic interpolation."""
     for i in prange(len(pulses)):
         pulse, length = pulses[i], pulses.shape[1]
         whole = math.floor(samples[i])

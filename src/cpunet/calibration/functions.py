@@ -1,10 +1,10 @@
-"""What tells physics from electronics: functions of a pulse in slices of drift time.
+r"""Functions of a pulse in slices of drift time, which separate physics from electronics.
 
-The first principal component of pulses laid over each other at half of their height is how
-early their charge begins to move: their drift time.  Its density, above all where it ends, is
-what velocities and impurities change.  The other components and the current amplitude, each
-in slices of it, tell what depends on drift time, such as the growth of the charge cloud, from
-what does not: the readout.
+Pulses are aligned at half maximum. The first principal component of their shapes is then how
+early their charge begins to move: their drift time. Velocities and impurities change its
+density, above all at its end. The other components and the current amplitude are evaluated in
+slices of drift time. They distinguish what depends on drift time, such as the growth of the
+charge cloud, from what does not: the readout.
 """
 
 from __future__ import annotations
@@ -13,22 +13,31 @@ import numpy as np
 
 from cpunet.training.moments import Moments, Readings, Values
 
-# Points of the density of the drift time; slices of it; components and points of the current
-# amplitude taken in each.  Of few pulses, half as many.
+# Bins of the drift time; slices of drift time; components and current amplitude bins in each.
+# For few pulses, half as many.
 DENSITY, SLICES, COMPONENTS, AMPLITUDES = 24, 8, 6, 8
 FEW = 700
-# Widths in units of the distances, and the least: twice what noise does.
+# Widths in units of the spacing, and minimum widths: twice the effect of noise.
 NARROW, WIDE = 1.0, 0.8
 LEAST_DENSITY, LEAST_SLICE, LEAST_AMPLITUDE = 0.02, 0.05, 0.008
 
 
 class SlicedFunctions:
-    """The functions of `Moments`, and those in slices of drift time.
+    r"""The functions of `Moments`, and further ones in slices of drift time.
+
+    With the drift time :math:`t` and Gaussian bins of centre :math:`c_k` and width
+    :math:`w_k`,
+
+    .. math:: g_k(t) = \exp\left[-\frac{1}{2} \Big(\frac{t - c_k}{w_k}\Big)^2\right],
+
+    the further functions are the bins of drift time, :math:`g_k(t)`, the other components in
+    slices, :math:`a_i\, g_k(t)`, and the bins of the current amplitude in slices,
+    :math:`g_j(\ln A)\, g_k(t)`.
 
     Parameters
     ----------
     moments
-        Drawn up from the data.
+        Moments defined by the data.
     """
 
     def __init__(self, moments: Moments) -> None:
@@ -37,7 +46,7 @@ class SlicedFunctions:
         drift, amplitude = moments.data.linear[:, self._first], moments.data.log_amplitude
         parts = 2 if len(moments.data) < FEW else 1
         self._components = min(COMPONENTS, moments.config.components - 1)
-        # towards the longest drift times the density ends sharply
+        # the density ends abruptly at the longest drift times
         self._density = _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, LEAST_DENSITY)
         self._slices = _points(drift, SLICES // parts, (0.03, 0.97), WIDE, LEAST_SLICE)
         self._amplitudes = _points(
@@ -46,7 +55,7 @@ class SlicedFunctions:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the functions."""
+        """Names of the functions."""
         slices = range(1, len(self._slices[0]) + 1)
         return (
             *self.moments.names,
@@ -65,9 +74,10 @@ class SlicedFunctions:
         Parameters
         ----------
         readings
-            Of pulses.
+            Readings of the pulses.
         clip
-            In place of the recipe's; far from the data wider, and all bins with it.
+            Replaces the clip of the recipe. A wider one, for simulations far from the data,
+            also widens all bins.
         """
         values = self.moments.functions(readings, clip)
         wider = 1.0 if clip is None else max(1.0, clip / self.moments.config.clip)
@@ -90,7 +100,7 @@ class SlicedFunctions:
 def _points(
     values: Values, n: int, range_: tuple[float, float], factor: float, least: float
 ) -> tuple[Values, Values]:
-    """Equally populated points, and a width for each."""
+    """Equally populated centres, and a width for each."""
     centres = np.quantile(values, np.linspace(*range_, n))
     gaps = np.diff(centres)
     between = np.concatenate([gaps[:1], np.minimum(gaps[1:], gaps[:-1]), gaps[-1:]])

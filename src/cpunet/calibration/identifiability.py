@@ -1,10 +1,10 @@
-"""What pulses tell of the physics once a readout chain may stand in for it: Fisher first.
+r"""Fisher information of pulses on the physics when the readout chain is free as well.
 
-Derivatives of the compared functions with chain and physics give the information that a number
-of pulses holds; of the physics' part, what the chain can undo is projected off.  The axes of
-what is left, in units of the priors, are the directions that the data know or do not know.
-Two parameters that move pulses alike are told as one direction, never as two numbers with
-small errors.
+The derivatives of the compared functions with respect to chain and physics give the information
+of a number of pulses. What the chain can absorb is projected out of the part on the physics.
+The principal axes of the remainder, in units of the priors, are the directions that the data do
+or do not constrain. Two parameters with the same effect on the pulses are reported as one
+direction, never as two values with small errors.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ import numpy as np
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values
 
-# A parameter is told by the data if its error becomes this part of its prior.
+# A parameter is determined by the data if its error is below this fraction of its prior.
 TOLD = 0.5
-# Of a direction, components that are shown.
+# Minimum component of a direction that is shown.
 SHOWN = 0.25
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters, and how well it is known.
+    r"""A combination of parameters, and how well it is known.
 
     Parameters
     ----------
     components
-        By name, in units of the priors; the squares add up to 1.
+        Components by name, in units of the priors. Their squares add up to 1.
     error
-        Standard deviation with prior and data, in units of the prior: 1 if the data tell
-        nothing.
+        Standard deviation given prior and data, in units of the prior:
+        :math:`1/\sqrt{1 + \lambda}` with the eigenvalue :math:`\lambda` of the scaled
+        information. It is 1 if the data contain no information.
     """
 
     components: dict[str, float]
@@ -41,7 +42,7 @@ class Direction:
 
     @property
     def words(self) -> str:
-        """The larger components, as a sum."""
+        """The larger components as a sum."""
         parts = sorted(self.components.items(), key=lambda part: -abs(part[1]))
         shown = [(n, c) for n, c in parts if abs(c) >= SHOWN]
         text = " ".join(f"{'+' if c > 0 else '−'} {abs(c):.2f} {n}" for n, c in shown)
@@ -50,18 +51,33 @@ class Direction:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information of one set of pulses on the physics, whatever the chain may be.
+    r"""Fisher information of a set of pulses on the physics, for an unknown chain.
+
+    With the derivatives :math:`J` of the whitened functions with respect to chain (c) and
+    physics (p), the full information is :math:`\mathcal{F} = J^T J`. The chain, with its
+    priors :math:`P_c`, is eliminated,
+
+    .. math:: F = \mathcal{F}_{pp} - \mathcal{F}_{pc}
+        (\mathcal{F}_{cc} + P_c^{-1})^{-1} \mathcal{F}_{cp}.
 
     Parameters
     ----------
     nuisances
-        In the order of the matrix.
+        Parameters of the physics in the order of the matrix.
     matrix
-        Fisher's, of the coordinates, without their priors.
+        Fisher information :math:`F` of their coordinates, without their priors.
     widths
-        Of the priors.
+        Standard deviations of their priors.
     pairs
-        Pulses that it is of (the harmonic sum of both sides).
+        Number of pulses it refers to (the harmonic sum of both datasets).
+
+    Examples
+    --------
+    Information of 3 and a prior of width 1 give an error of :math:`1/\sqrt{3 + 1}`.
+
+    >>> one = Information((), np.array([[3.0]]), np.array([1.0]), pairs=100.0)
+    >>> one.errors().tolist(), one.for_pulses(500.0).errors().tolist()
+    ([0.5], [0.25])
     """
 
     nuisances: tuple[Nuisance, ...]
@@ -71,7 +87,7 @@ class Information:
 
     @classmethod
     def of(cls, problem: JointProblem, jacobian: Values) -> Information:
-        """From the derivatives of all residuals of a problem."""
+        """Compute it from the derivatives of all residuals of a problem."""
         parameters = problem.parameters
         n, widths = parameters.n_chain, parameters.widths
         data = jacobian[: problem.moments]
@@ -85,19 +101,38 @@ class Information:
         return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs)
 
     def for_pulses(self, pairs: float) -> Information:
-        """What so many pulses would hold."""
+        """Information of `pairs` pulses; it scales linearly with their number."""
         return Information(
             self.nuisances, self.matrix * (pairs / self.pairs), self.widths, pairs
         )
 
     def errors(self, chosen: Sequence[int] | None = None) -> Values:
-        """Errors of the coordinates with their priors, if only the chosen ones are free."""
+        r"""Standard errors of the coordinates given their priors.
+
+        .. math:: \sigma_i^2 = \left[(F + P^{-1})^{-1}\right]_{ii}
+
+        Parameters
+        ----------
+        chosen
+            Positions of the free coordinates. None for all.
+        """
         rows = list(range(len(self.widths))) if chosen is None else list(chosen)
         matrix = self.matrix[np.ix_(rows, rows)] + np.diag(self.widths[rows] ** -2.0)
         return np.asarray(np.sqrt(np.linalg.inv(matrix).diagonal()))
 
     def directions(self) -> list[Direction]:
-        """Axes of the information in units of the priors, best known first."""
+        r"""Principal axes of the information in units of the priors, best known first.
+
+        They are the eigenvectors of :math:`P^{1/2} F P^{1/2}` with the diagonal matrix
+        :math:`P` of the prior variances.
+
+        Examples
+        --------
+        >>> from cpunet.calibration.nuisances import named
+        >>> one = Information((named("bias"),), np.array([[3.0]]), np.array([1.0]), 1.0)
+        >>> one.directions()[0].error
+        0.5
+        """
         scaled = self.matrix * self.widths[:, np.newaxis] * self.widths
         sizes, axes = np.linalg.eigh(scaled)
         names = [nuisance.name for nuisance in self.nuisances]
@@ -109,7 +144,7 @@ class Information:
         return found
 
     def told(self) -> list[int]:
-        """Positions of the parameters to set free, in their order."""
+        """Positions of the parameters that the data determine, in their order."""
         chosen: list[int] = []
         for i, width in enumerate(self.widths.tolist()):
             if self.errors([*chosen, i])[-1] < TOLD * width:
@@ -118,14 +153,25 @@ class Information:
 
 
 def promises(jacobian: Values, residuals: Values, free: Sequence[int]) -> dict[int, float]:
-    """By how much chi-square would fall if a column that is not free were, to first order.
+    r"""Expected decrease of chi-square for each fixed column if it were free.
+
+    To first order, with the residuals :math:`r` and the column :math:`j` projected
+    orthogonally to the free columns,
+
+    .. math:: \Delta\chi^2 = \frac{(j_\perp^T r_\perp)^2}{j_\perp^T j_\perp}.
 
     Parameters
     ----------
     jacobian, residuals
-        Of all columns, with the priors' rows, where the fit of the free ones has ended.
+        Derivatives for all columns, and residuals, including the rows of the priors, at the
+        end of the fit of the free columns.
     free
-        Columns that were free.
+        Indices of the free columns.
+
+    Examples
+    --------
+    >>> promises(np.diag([1.0, 2.0]), np.array([0.0, 3.0]), free=[0])
+    {1: 9.0}
     """
     others = [i for i in range(jacobian.shape[1]) if i not in set(free)]
     base, _ = np.linalg.qr(jacobian[:, list(free)])

@@ -1,4 +1,4 @@
-"""The comparison that chain and physics minimise together."""
+"""The comparison of simulation and data that chain and physics minimise together."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import Readings
 from cpunet.training.response_problem import Band, Parameters
 
-RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
-# Residuals that keep a step within the reach of the slopes, at its end so many.
+RIDGE = 0.05  # fraction of the identity in the correlation matrix of the functions
+# Residual that keeps a step within the reach of the derivatives: its size at the reach.
 HOLD = 4.0
-# Events from which derivatives are taken, and of each band at the least.
+# Number of events for derivatives, and minimum number of each band.
 FOR_DERIVATIVES, OF_BAND = 1536, 100
-# Simulated pulses of a band that tell how the functions vary.
+# Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
-# Of the reach of a slope: the step of a finite difference.
+# Step of a finite difference as a fraction of the reach of a derivative.
 FINITE = 0.1
 
 
 class JointParameters:
-    """Parameters of the chain, then free coordinates of the physics, as one vector.
+    """Parameters of the chain and free coordinates of the physics as one vector.
 
     Parameters
     ----------
     response
-        The chain; where it is now its priors are centred.
+        The chain. Its priors are centred on its current values.
     physics
         All parameters of the physics.
     coordinates
-        Of these, as they are.
+        Current coordinates of the physics.
     free
-        Positions of those that are free.
+        Positions of the free coordinates.
     given
-        Priors that are not the default's, value and error by name.
+        Priors that replace the defaults: value and error by name.
     """
 
     def __init__(
@@ -71,38 +71,49 @@ class JointParameters:
         self._low, self._high = np.reshape(bounds, (len(chosen), 2)).T
 
     def vector(self) -> Values:
-        """All as one vector."""
+        """Current values of all parameters as one vector."""
         return np.concatenate([self.chain.vector(), self.coordinates[self.free]])
 
     def set(self, vector: Values) -> None:
-        """Take over a vector; coordinates end at their bounds."""
+        """Set all parameters from a vector. Coordinates are limited to their bounds."""
         self.chain.set(vector[: self.n_chain])
         self.coordinates = self.coordinates.copy()
         self.coordinates[self.free] = np.clip(vector[self.n_chain :], self._low, self._high)
 
 
 class JointProblem:
-    """Residuals of functions in slices of drift time, of the priors, and of what else is known.
+    r"""Residuals of functions in slices of drift time, of priors and of further knowledge.
+
+    For each band of energies the mean functions of simulation and data are compared,
+
+    .. math:: \chi^2 = \mathbf{d}^T C^{-1} \mathbf{d}
+        + \sum_i \frac{(x_i - \mu_i)^2}{\sigma_i^2}, \qquad
+        \mathbf{d} = \langle \mathbf{f} \rangle_{\mathrm{sim}}
+        - \langle \mathbf{f} \rangle_{\mathrm{data}},
+
+    where :math:`C` is the mean covariance of both sides divided by the number of pulses, with
+    correlations shrunk towards zero by `RIDGE`, and :math:`\mu_i \pm \sigma_i` are the priors.
 
     Parameters
     ----------
     parameters
-        To be found.
+        Parameters to be fitted.
     bands
-        What is compared; of the simulated pulses their rows, noise and weights.
+        Bands of energies to compare. Of their simulated pulses only rows, noise and weights
+        are used.
     functions
-        One for each band.
+        Functions of each band.
     nearby
-        Pulses about a point of the physics.
+        Pulses near a point of the physics.
     energy_kev
-        Of its events.
+        Energies of its events in keV.
     recipe
-        Whose preparation simulated pulses get.
+        Recipe with the preparation of simulated pulses.
     known
-        Deviations, in standard deviations, of what else is known of the coordinates.
+        Deviations from further knowledge of the coordinates, in standard deviations.
     held
-        Whether steps beyond the reach of the slopes are to cost.  It is for the way from far:
-        how simulated pulses vary there tells nothing of errors.
+        Whether steps beyond the reach of the derivatives are penalised. This is for the first
+        steps from far away, where the variation of simulated pulses says nothing about errors.
     """
 
     def __init__(
@@ -126,7 +137,7 @@ class JointProblem:
 
     @property
     def clip(self) -> float | None:
-        """At how many standard deviations the functions end."""
+        """Number of standard deviations at which the functions are clipped."""
         return self._clip
 
     @clip.setter
@@ -137,7 +148,7 @@ class JointProblem:
             values = functions(band.moments.data, clip)
             covariance = np.cov(values.T) / band.pairs
             if not self.held:
-                # of both sides: weights that follow the chances of one would draw the fit to it
+                # both sides: weights that follow fluctuations of one would bias the fit to it
                 simulated = self._covariance(band, functions) / band.pairs
                 covariance = 0.5 * (covariance + simulated)
             sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
@@ -149,12 +160,12 @@ class JointProblem:
 
     @property
     def moments(self) -> int:
-        """How many functions are compared, of all bands."""
+        """Number of compared functions in all bands."""
         return sum(len(sigma) for sigma in self._sigma)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the functions; with their band, if there are several."""
+        """Names of the functions, with their band if there are several."""
         several = len(self.bands) > 1
         return tuple(
             f"{band.name}: {name}" if several else name
@@ -163,22 +174,22 @@ class JointProblem:
         )
 
     def pulls(self, vector: Values) -> Values:
-        """Deviations of the functions in standard deviations, correlated as they are."""
+        """Deviations of the functions in standard deviations; they are correlated."""
         return np.concatenate(self._pulls(vector))
 
     def chi_square(self, vector: Values) -> float:
-        """Of the functions alone."""
+        r""":math:`\mathbf{d}^T C^{-1} \mathbf{d}` of the functions alone, without priors."""
         deviations = self._deviations(vector)
         return float(deviations @ deviations)
 
     def weigh_like(self, other: JointProblem) -> None:
-        """Take over errors and correlations of the same functions."""
+        """Adopt errors and correlations of the same functions from another problem."""
         self._sigma, self._whiten = other._sigma, other._whiten
 
     def residuals(self, vector: Values) -> Values:
-        """Uncorrelated deviations, and those of all that is known before.
+        """Uncorrelated deviations of the functions, priors and further knowledge.
 
-        While steps are held, where only the way matters, of some of the pulses.
+        While steps are held, accuracy matters less and only some of the pulses are used.
         """
         return self._residuals(vector, self.few if self.held else None)
 
@@ -197,7 +208,7 @@ class JointProblem:
     def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters).
 
-        Of some of the pulses and with one draw of noise: they need not be exact.
+        They need not be exact: some of the pulses and one draw of noise are used.
         """
         here = self._residuals(vector, self.few)
         columns = []
@@ -209,7 +220,7 @@ class JointProblem:
         return np.stack(columns, axis=1)
 
     def prepared(self, coordinates: Values, most: int | None = None) -> Pulses:
-        """Simulated pulses as a readout gets them; the first so many events."""
+        """Prepared simulated pulses of the first `most` events, as input of a readout."""
         pulses = Pulses.of(
             self.nearby.at(coordinates, most),
             dt_ns=self.nearby.simulator.physics.settings.dt_ns,
@@ -244,7 +255,7 @@ class JointProblem:
         return np.concatenate([w @ p for w, p in zip(self._whiten, pulls, strict=True)])
 
     def _pulls(self, vector: Values, most: int | None = None) -> list[Values]:
-        """Deviations of the functions of each band, from the first so many events."""
+        """Deviations of the functions of each band, from the first `most` events."""
         parameters = self.parameters
         parameters.set(vector)
         waveforms = self.prepared(parameters.coordinates, most).waveforms
@@ -259,7 +270,7 @@ class JointProblem:
             def of(readings: Readings, functions: SlicedFunctions = functions) -> tuple[Values]:
                 return (readings.weights @ functions(readings, self._clip),)
 
-            # far from the data many tails are beyond theirs, and none is to be left out
+            # far from the data many tails exceed theirs, and none may be left out
             (total,), n = translated.sums(
                 parameters.chain.response, of, cut=self._clip is None, draws=draws
             )
@@ -268,5 +279,5 @@ class JointProblem:
 
 
 def fewest(bands: Sequence[Band]) -> int:
-    """How many events, from the first, are enough for derivatives: some of each band."""
+    """Number of first events sufficient for derivatives, with some of each band."""
     return max(FOR_DERIVATIVES, *(int(band.rows[:OF_BAND][-1]) + 1 for band in bands))

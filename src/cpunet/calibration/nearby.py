@@ -1,10 +1,13 @@
-"""Pulses of the same hits at physics near those that were simulated.
+r"""Pulses of the same hits for physics close to the simulated one.
 
-A fit asks for pulses at many physics, and to simulate them takes seconds each time.  So they
-are simulated once to either side of a point, and between these a pulse changes in proportion.
-Other drift velocities move the end of a pulse by more than its edge is wide; in proportion
-change only shapes, laid over each other where they pass half of their height.  Nothing is lost
-by that: when a pulse begins, no measured set tells.
+A fit needs pulses for many sets of physics, and each simulation takes seconds. Pulses are
+therefore simulated once on either side of a point and interpolated linearly in between,
+
+.. math:: S(x) = S(x_0) + \sum_i (x_i - x_{0,i}) \frac{\partial S}{\partial x_i}.
+
+Other drift velocities shift the end of a pulse by more than the width of its edge. Only shapes
+aligned at half maximum change linearly. This loses no information, since no measured dataset
+contains the start time of a pulse.
 """
 
 from __future__ import annotations
@@ -22,19 +25,19 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 
 FloatArray = npt.NDArray[np.float32]
-# Simulated pulses are moved at a period shorter by the first of these that steps allow.
+# Factors by which the sampling period is divided for alignment; the first possible one is used.
 FINER = (4, 5, 3, 2, 1)
 
 
 class Simulator:
-    """Simulates events at coordinates of the physics.
+    """Simulation of events as a function of the coordinates of the physics.
 
     Parameters
     ----------
     hits
-        Of the events, merged already; in an order of which any beginning is a fair part.
+        Merged hits of the events, in an order in which any first part is representative.
     physics
-        Which parameters the coordinates are.
+        Detector and parameters that the coordinates refer to.
     simulated
         Called after each simulation.
     """
@@ -48,14 +51,14 @@ class Simulator:
         self._finer = _finer(physics.settings)
 
     def exact(self, coordinates: Values) -> FloatArray:
-        """Pulses as `cpunet simulate` makes them, shape (events, samples)."""
+        """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
         detector, settings = self.physics.at(coordinates)
         events = self._parts[None].simulate(detector, settings)
         self._simulated()
         return events.waveforms
 
     def quick(self, coordinates: Values, most: int | None = None) -> FloatArray:
-        """Pulses for differences, finely sampled; of the first so many events."""
+        """Finely sampled pulses of the first `most` events, for differences."""
         if most not in self._parts:
             self._parts[most] = SameHits(self._hits[:most])
         detector, settings = self.physics.at(coordinates)
@@ -65,7 +68,7 @@ class Simulator:
         return events.waveforms
 
     def coarse(self, pulses: FloatArray) -> FloatArray:
-        """Means over the period of fine samples."""
+        """Average fine samples over the sampling period."""
         whole = pulses.shape[1] // self._finer * self._finer
         blocks = pulses[:, :whole].reshape(len(pulses), -1, self._finer)
         return np.asarray(blocks.mean(axis=2, dtype=np.float32))
@@ -73,20 +76,20 @@ class Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """Pulses about a point of the physics.
+    """Pulses near a point of the physics.
 
     Parameters
     ----------
     simulator
-        Of the events.
+        Simulation of the events.
     centre
         Coordinates of the point.
     base
-        Pulses there, shape (events, samples).
+        Pulses at the point, shape (events, samples).
     slopes
-        Of the pulses, by position of the coordinate.
+        Derivatives of the pulses by the position of the coordinate.
     simulated_at
-        The point that the slopes are of, not far from here.
+        Point of the derivatives, close to the centre.
     """
 
     simulator: Simulator
@@ -97,16 +100,16 @@ class Nearby:
 
     @classmethod
     def about(cls, simulator: Simulator, centre: Values, of: Sequence[int]) -> Nearby:
-        """Simulate pulses about a point, and their slopes with some coordinates."""
+        """Simulate pulses at a point, and their derivatives in some coordinates."""
         base = simulator.exact(centre)
         return cls(simulator, centre, base, _slopes(simulator, centre, of), centre)
 
     def moved(self, centre: Values) -> Nearby:
-        """Pulses about another point, with these slopes."""
+        """Pulses at another point, with the same derivatives."""
         return replace(self, centre=centre, base=self.simulator.exact(centre))
 
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
-        """The same point, with some slopes simulated here; of the first so many events."""
+        """The same point, with some derivatives simulated anew for the first `most` events."""
         slopes = {**self.slopes, **_slopes(self.simulator, self.centre, of, most)}
         renewed = set(self.slopes) <= set(of)
         return replace(
@@ -114,7 +117,7 @@ class Nearby:
         )
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
-        """Pulses at some coordinates, shape (events, samples); of the first so many events."""
+        """Pulses of the first `most` events at some coordinates, shape (events, samples)."""
         pulses = self.base[:most]
         for i, change in enumerate(coordinates - self.centre):
             if change and i in self.slopes:
@@ -125,7 +128,7 @@ class Nearby:
 def _slopes(
     simulator: Simulator, centre: Values, wanted: Sequence[int], most: int | None = None
 ) -> dict[int, FloatArray]:
-    """Changes of shape with each coordinate, from two simulations each."""
+    """Derivatives of the aligned shapes in each coordinate, from two simulations each."""
     physics = simulator.physics
     here = simulator.quick(centre, most)
     half = np.zeros(len(here))
@@ -135,7 +138,7 @@ def _slopes(
         nuisance = physics.nuisances[i]
         low, high = nuisance.bounds(physics.nominal(nuisance))
         ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
-        if ends[0] < low:  # none below; from here on
+        if ends[0] < low:  # not possible below: one-sided upwards
             ends = [low, max(low, centre[i]) + 2 * nuisance.step]
         ends[1] = min(ends[1], high)
         shapes = []
@@ -153,7 +156,7 @@ def _slopes(
 
 
 def _finer(settings: SimulationSettings) -> int:
-    """How many samples a period is parted into."""
+    """Number of samples into which a sampling period is divided."""
     for parts in FINER:
         steps = settings.dt_ns / parts / settings.step_ns
         if steps > 1 - 1e-9 and abs(steps - round(steps)) < 1e-9:

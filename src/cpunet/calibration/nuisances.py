@@ -1,4 +1,4 @@
-"""What of a detector's physics is not known well: its names, priors, and why these."""
+"""Poorly known parameters of a detector's physics: names, priors and their origin."""
 
 from __future__ import annotations
 
@@ -20,33 +20,34 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A parameter of the physics, and how far it may be from where it was simulated.
+    r"""A parameter of the physics, and how far it may be from its simulated value.
 
-    A fit knows it by a coordinate that is 0 where it was simulated: its change, the logarithm
-    of a factor, or the change of its square.
+    The fit uses a coordinate :math:`x` that is 0 at the simulated value :math:`p_0`. The
+    parameter is :math:`p = p_0 + x` (``added``), :math:`p = p_0 e^x` (``factor``) or
+    :math:`p = \sqrt{p_0^2 + x}` (``square``).
 
     Parameters
     ----------
     name
-        As outputs have it, with its unit.
+        Name in outputs, with the unit.
     short
-        As it may be called on the command line.
+        Short name for the command line.
     field
-        Of `Detector` or `SimulationSettings`.
+        Field of `Detector` or `SimulationSettings`.
     kind
-        What the coordinate is.
+        Relation of the coordinate to the parameter.
     prior
-        Standard deviation of the coordinate, before any data.
+        Standard deviation of the coordinate before any data.
     step
-        Of the coordinate: half of what pulses are simulated apart for a derivative.
+        Half the difference in the coordinate between two simulations for a derivative.
     reach
-        Change of the coordinate up to which that derivative is trusted.
+        Maximum change of the coordinate for which that derivative is used.
     lowest, highest
-        Values allowed.
+        Range of allowed values.
     source
-        Of the prior.
+        Origin of the prior.
     first
-        Whether it is looked at before the others.
+        Whether it is considered before the others.
     """
 
     name: str
@@ -62,7 +63,14 @@ class Nuisance:
     first: bool = False
 
     def value(self, nominal: float, coordinate: float) -> float:
-        """The parameter at a coordinate, within what is allowed."""
+        """Value of the parameter at a coordinate, within the allowed range.
+
+        Examples
+        --------
+        >>> factor = named("hole_velocity_low")
+        >>> round(factor.value(2.0, math.log(1.1)), 6)
+        2.2
+        """
         if self.kind == "factor":
             value = nominal * math.exp(coordinate)
         elif self.kind == "square":
@@ -72,20 +80,20 @@ class Nuisance:
         return min(max(value, self.lowest), self.highest)
 
     def coordinate(self, nominal: float, value: float) -> float:
-        """The coordinate of a value."""
+        """Coordinate of a value."""
         if self.kind == "factor":
             return math.log(value / nominal)
         return value**2 - nominal**2 if self.kind == "square" else value - nominal
 
     def slope(self, nominal: float, value: float) -> float:
-        """Change of the parameter with its coordinate: of an error of the one, the other's."""
+        """Derivative of the parameter with respect to its coordinate, to convert errors."""
         if self.kind == "square":
-            # near 0, by how much a step of the coordinate raises it
+            # near 0: the increase by one step of the coordinate
             return 0.5 / max(value, math.sqrt(self.step))
         return value if self.kind == "factor" else 1.0
 
     def bounds(self, nominal: float) -> tuple[float, float]:
-        """Coordinates of the least and the largest value."""
+        """Coordinates of the minimum and maximum value."""
         low = max(self.lowest, 1e-9) if self.kind == "factor" else self.lowest
         return self.coordinate(nominal, low), self.coordinate(nominal, self.highest)
 
@@ -94,8 +102,8 @@ _MOBILITIES = (
     "published mobilities differ by 10 to 20 % (Reggiani et al. 1977, Bruyneel et al. 2016)"
 )
 
-# Those first that differ for any detector and are looked at first; the others only if these do
-# not explain the data.
+# Parameters that are uncertain for any detector come first and are considered first. The others
+# are used only if these do not explain the data.
 NUISANCES = (
     Nuisance(
         "temperature_K", "temperature", "temperature_K", "added",
@@ -159,12 +167,12 @@ NUISANCES = (
 
 
 def named(text: str) -> Nuisance:
-    """The nuisance of a name, long or short.
+    """Find a nuisance by its long or short name.
 
     Raises
     ------
     CpunetError
-        If there is none.
+        If there is none of this name.
 
     Examples
     --------
@@ -180,14 +188,14 @@ def named(text: str) -> Nuisance:
 
 @dataclass(frozen=True)
 class Physics:
-    """A detector and its clouds as functions of some coordinates, all 0 as simulated.
+    """A detector and its charge clouds as functions of coordinates, all 0 as simulated.
 
     Parameters
     ----------
     detector, settings
-        As simulated.
+        Detector and settings as simulated.
     nuisances
-        That may change, in the order of the coordinates.
+        Parameters that may change, in the order of the coordinates.
     """
 
     detector: Detector
@@ -195,7 +203,7 @@ class Physics:
     nuisances: tuple[Nuisance, ...]
 
     def nominal(self, nuisance: Nuisance) -> float:
-        """The value as simulated; of a factor that is none of the settings', 1."""
+        """Simulated value; 1 for a factor that is not one of the settings."""
         if nuisance.name == "impurity_factor":
             return 1.0
         of_detector = nuisance.field in Detector.model_fields
@@ -214,12 +222,12 @@ class Physics:
         }
 
     def at(self, coordinates: Values) -> tuple[Detector, SimulationSettings]:
-        """Detector and settings; what is at 0 stays as it is, in every bit.
+        """Detector and settings at some coordinates. Fields at 0 are kept bit by bit.
 
         Raises
         ------
         CpunetError
-            If there can be no such detector.
+            If there is no valid detector with these values.
         """
         of_detector, of_settings = self.detector.model_dump(), self.settings.model_dump()
         values = self.values(coordinates)
@@ -247,20 +255,20 @@ class Physics:
             ) from error
 
     def of(self, nuisances: Sequence[Nuisance]) -> Physics:
-        """The same detector with others free."""
+        """The same detector with other parameters free."""
         return Physics(self.detector, self.settings, tuple(nuisances))
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a coordinate before any data: centre and standard deviation."""
+    """Prior of a coordinate: centre and standard deviation."""
 
     centre: float
     width: float
 
 
 def priors(physics: Physics, given: Mapping[str, tuple[float, float]]) -> list[Prior]:
-    """Of the free nuisances: as given (value and error by name), or the default about 0."""
+    """Priors of the free nuisances: value and error as given, or the default around 0."""
     found = []
     for nuisance in physics.nuisances:
         nominal = physics.nominal(nuisance)

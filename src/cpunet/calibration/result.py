@@ -1,4 +1,4 @@
-"""What a calibration has found, as plain numbers to be stored and drawn."""
+"""Results of a calibration as plain numbers for storage and figures."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from cpunet.calibration.nuisances import Nuisance, Values, priors
 from cpunet.calibration.search import Calibrated
 from cpunet.training.response_starts import GOOD_FIT
 
-# Offsets of a profile in errors, and steps with which all else follows.
+# Offsets of a profile in errors, and steps in which the other parameters are minimised.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
-# Errors of its prior from which on a parameter is far from what was thought possible, and part
-# of them in which it is at a bound.
+# Number of prior errors beyond which a parameter is reported as unexpected, and fraction of an
+# error within which it is at a bound.
 FAR, AT_BOUND = 3.0, 1e-6
-# Chi-square per moment of data that these physics do not describe at all.
+# Chi-square per moment beyond which the physics does not describe the data at all.
 HOPELESS = 50.0
-# Fall of chi-square with one parameter more that is told.
+# Minimum decrease of chi-square that is reported for a further parameter.
 WORTH_TELLING = 9.0
 
 
 def described(calibrated: Calibrated) -> dict[str, Any]:
-    """The content of ``calibration.json``.
+    """Content of ``calibration.json``.
 
     Returns
     -------
     dict
         ``parameters``: value, error (with the parameters below as simulated), error_all (with
-        all that were looked at free), value as simulated and prior of each free one;
-        ``fixed``: those looked at that stayed as simulated, and by how much chi-square would
-        fall with them; ``chi_square``; ``directions``; ``covariance`` of chain and
+        all parameters considered free), simulated value and prior of each free parameter;
+        ``fixed``: parameters considered but kept as simulated, and the decrease of chi-square
+        expected if they were free; ``chi_square``; ``directions``; ``covariance`` of chain and
         coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
     """
     problem = calibrated.problem
@@ -90,7 +90,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def notes(calibrated: Calibrated) -> list[str]:
-    """What is to be said of where a calibration has ended."""
+    """Remarks on the result of a calibration."""
     problem = calibrated.problem
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
     values = physics.values(parameters.coordinates)
@@ -126,7 +126,7 @@ def notes(calibrated: Calibrated) -> list[str]:
 
 
 def hopeless(calibrated: Calibrated) -> bool:
-    """Whether these are data of plainly another detector."""
+    """Whether the data clearly belong to another detector."""
     return calibrated.chi_square > HOPELESS * calibrated.problem.moments
 
 
@@ -139,7 +139,7 @@ def _direction(direction: Direction) -> dict[str, Any]:
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, Any]:
-    """Chi-square, priors and all, along the valley of each free coordinate."""
+    """Chi-square including priors along the valley of each free coordinate."""
     problem = calibrated.problem
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
     here, n = parameters.vector(), parameters.n_chain
@@ -167,7 +167,7 @@ def _profiles(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def _lowest(problem: JointProblem, vector: Values, others: list[int], follow: Values) -> float:
-    """Sum of squares with one coordinate held and all others at their best for it."""
+    """Sum of squares with one coordinate fixed and all others at their optimum."""
     residuals = problem.residuals(vector)
     lowest = float(residuals @ residuals)
     for _ in range(FOLLOWING):

@@ -1,8 +1,8 @@
-"""The search for chain and physics that explain the data together.
+"""Search for the chain and the physics that together explain the data.
 
-From a chain that was fitted to the simulation as it is, round after round: pulses are simulated
-at the physics found, both are fitted to the data with pulses nearby, and so on until the
-physics stay where they are.
+It starts from a chain fitted to the simulation as it is. In each round, pulses are simulated
+for the current physics, and chain and physics are fitted to the data with pulses near it. The
+search ends when the physics no longer changes.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, start_r
 Note = Callable[[str], None]
 
 ROUNDS, STEPS, FIRST_STEPS = 8, 12, 20
-# A search has ended when all coordinates move by less than this part of their error.
+# The search ends when all coordinates move by less than this fraction of their error.
 SETTLED = 0.4
-# In one round no coordinate goes farther than so many times the reach of its slope, and where
-# no pulses can be simulated, it goes half as far, so many times.
+# Maximum move of a coordinate in one round, in units of the reach of its derivative, and number
+# of times the move is halved if pulses cannot be simulated there.
 FARTHEST, HALVINGS = 1.5, 4
-# A parameter that was left out becomes free if chi-square promises to fall by so much (five
-# standard deviations); at most so many do.
+# Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
+# freed, and maximum number of such parameters.
 NEEDED, MOST_MORE = 25.0, 3
 
 
@@ -46,21 +46,22 @@ class Calibrated:
     Parameters
     ----------
     problem
-        Where the search has ended: chain, coordinates, functions, pulses.
+        Comparison at the end of the search: chain, coordinates, functions, pulses.
     covariance
-        Of its parameters; if chi-square per degree of freedom is above 1, times that.
+        Covariance of its parameters, multiplied by chi-square per degree of freedom if this
+        is above 1.
     chi_square_before, pulls_before
-        Of the chain alone, with the physics as simulated.
+        Chi-square and pulls with the chain alone, for the physics as simulated.
     chi_square
-        With both.
+        Chi-square with chain and physics.
     directions
-        Of all physics looked at, best known first.
+        Directions of all physics considered, best known first.
     promised
-        By how much chi-square would fall if a parameter that was not free were.
+        Expected decrease of chi-square for each fixed parameter if it were free.
     errors_all
-        Errors of all coordinates looked at, if all of them were free.
+        Errors of all coordinates considered if all of them were free.
     rounds, settled
-        Of the search, and whether the physics stayed where they were in the last one.
+        Number of rounds, and whether the physics was unchanged in the last one.
     """
 
     problem: JointProblem
@@ -81,38 +82,38 @@ class Calibrated:
 
     @property
     def errors(self) -> Values:
-        """Of the free coordinates."""
+        """Standard errors of the free coordinates."""
         n = self.problem.parameters.n_chain
         return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
 
     @property
     def scale(self) -> float:
-        """By how much errors are larger than if all were explained: a root of chi-square."""
+        """Factor of the errors from imperfect agreement: the root of the reduced chi-square."""
         return _scale(self.problem, self.chi_square)
 
 
 @dataclass(eq=False)
 class Search:
-    """A search, round by round.
+    """A search in rounds.
 
     Parameters
     ----------
     simulator
-        Of the events, with all parameters that may become free.
+        Simulation of the events, with all parameters that may become free.
     sets
-        Both sides, prepared, in bands.
+        Prepared simulated and measured datasets, in bands.
     energy_kev
-        Of the events.
+        Energies of the events in keV.
     recipe
-        Of the chain.
+        Recipe of the chain.
     given
-        Priors that are not the default's, value and error by name.
+        Priors that replace the defaults: value and error by name.
     known
-        Deviations of what else is known of the coordinates.
+        Deviations from further knowledge of the coordinates.
     free
-        Positions of the parameters that are free; None for those that the data tell.
+        Positions of the free parameters. None for those that the data determine.
     note
-        Told of each round.
+        Called with a message in each round.
     """
 
     simulator: Simulator
@@ -132,19 +133,19 @@ class Search:
         self._first = [i for i in self._looked_at if self.free or nuisances[i].first]
 
     def plan(self) -> Information:
-        """What the pulses tell of all that may become free, before any fit of it."""
+        """Information of the pulses on all parameters that may become free, before a fit."""
         few = fewest(self._bands)
         nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._looked_at, few)
         problem = self._problem(self._chain(), nearby, self._looked_at)
         return Information.of(problem, _jacobian(problem))
 
     def run(self) -> Calibrated:
-        """Search until the physics stay where they are.
+        """Search until the physics no longer changes.
 
         Raises
         ------
         CpunetError
-            If pulses cannot be simulated as the detector is given.
+            If pulses cannot be simulated for the detector as given.
         """
         nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
         response = self._chain()
@@ -177,7 +178,7 @@ class Search:
         return len(self.simulator.physics.nuisances)
 
     def _chain(self) -> ElectronicsResponse:
-        """The chain alone, with the physics as simulated; of some of the pulses."""
+        """Fit of the chain alone to some of the pulses, with the physics as simulated."""
         config, training = self.recipe.matching
         bands = self.sets.bands(training.search_pulses)
         dt_ns = self.simulator.physics.settings.dt_ns
@@ -194,7 +195,7 @@ class Search:
         *,
         held: bool = False,
     ) -> JointProblem:
-        """The comparison about where pulses were simulated."""
+        """Comparison near the point at which pulses were simulated."""
         parameters = JointParameters(
             copy.deepcopy(response), self.simulator.physics, nearby.centre, free, self.given
         )
@@ -210,7 +211,7 @@ class Search:
         )
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
-        """Parameters that are free at first."""
+        """Parameters that are free initially."""
         if self.free is not None:
             return list(self.free)
         problem = self._problem(response, nearby, self._first)
@@ -218,7 +219,7 @@ class Search:
         return [self._first[i] for i in told]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
-        """Pulses about where the coordinates have moved, but not out of all reach."""
+        """Pulses at the moved coordinates, with each move limited to some times its reach."""
         nuisances = self.simulator.physics.nuisances
         farthest = FARTHEST * np.array([nuisance.reach for nuisance in nuisances])
         move = np.clip(moved, -farthest, farthest)
@@ -226,7 +227,7 @@ class Search:
             try:
                 there = nearby.moved(nearby.centre + move)
                 break
-            except CpunetError as error:  # as where the detector is not depleted
+            except CpunetError as error:  # for example, if the detector is not depleted
                 self.note(f"{error}; going half as far")
                 move = 0.5 * move
         else:
@@ -240,7 +241,7 @@ class Search:
         return there.again(free) if far.any() or short else there
 
     def _ringing(self, problem: JointProblem) -> ElectronicsResponse | None:
-        """A chain that rings, if that explains much of what is left."""
+        """A chain with ringing if it explains much of the remaining deviation."""
         config, training = self.recipe.matching
         if config.ringing_mhz is not None:
             return None
@@ -258,7 +259,7 @@ class Search:
         return best.response if len(best.response.ringing) else None
 
     def _needed(self, problem: JointProblem) -> int | None:
-        """The parameter that chi-square asks for most, if it asks for any."""
+        """Fixed parameter with the largest expected decrease of chi-square, if significant."""
         if self.free is not None:
             return None
         promised = self._promised(problem)[0]
@@ -268,7 +269,7 @@ class Search:
         return best if promised[best] > NEEDED else None
 
     def _promised(self, problem: JointProblem) -> tuple[dict[int, float], Information]:
-        """What parameters that are not free promise, and the information on all."""
+        """Expected decreases for fixed parameters, and the information on all."""
         parameters = problem.parameters
         missing = [i for i in self._looked_at if i not in problem.nearby.slopes]
         if missing:
@@ -334,7 +335,7 @@ class Search:
 
 
 def _scale(problem: JointProblem, chi_square: float) -> float:
-    """Where chain and physics do not explain all, errors grow with the root of chi-square."""
+    """Scale errors by the root of the reduced chi-square if it is above 1."""
     freedom = problem.moments - len(problem.parameters.vector())
     return float(np.sqrt(max(1.0, chi_square / freedom)))
 
@@ -349,9 +350,9 @@ def _poor(problem: JointProblem) -> bool:
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
-    """Moves that turn back end where they and those before them would meet.
+    """Damp moves that change sign, to where they and the previous moves would meet.
 
-    Where pulses are far from in proportion, a search goes back and forth about its end.
+    Where pulses are far from linear, a search oscillates about its end.
     """
     back = moved * last < 0
     share = np.ones(len(moved))
@@ -360,7 +361,7 @@ def _relaxed(moved: Values, last: Values) -> Values:
 
 
 def _settled(problem: JointProblem, found: Minimum, moved: Values) -> bool:
-    """Whether the coordinates have moved by little of their errors."""
+    """Whether all coordinates have moved by a small fraction of their errors."""
     parameters = problem.parameters
     errors = np.sqrt(found.covariance.diagonal()[parameters.n_chain :])
     return bool((np.abs(moved[parameters.free]) < SETTLED * errors).all())

@@ -1,1 +1,1 @@
-"""The readout of a detector: from ideal charge pulses to raw traces with a known answer."""
+"""The detector readout: from ideal charge pulses to raw traces with a known truth."""

@@ -1,9 +1,9 @@
-"""Noise with the spectrum of the data's own baselines, of any length.
+"""Noise with the spectrum of measured baselines, of any length.
 
-Noise in ADC counts is the same for all pulses of a channel, so after normalisation it
-goes as 1/energy: it is kept as prepared units times keV.  The spectrum comes from the
-raw samples before the pulse and not from the short baseline of the prepared window,
-which would lose the low frequencies that decide drift time and tail slope.
+Noise in ADC counts is the same for all pulses of a channel. After normalisation it scales as
+1/energy, so it is stored in prepared units times keV. The spectrum is estimated from the raw
+samples before the pulse. The short baseline of the prepared window would lose the low
+frequencies, which determine the scatter of drift time and tail slope.
 """
 
 from __future__ import annotations
@@ -24,40 +24,56 @@ from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 LEAST_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
-FEWEST = 30  # flat baselines
-SHORTEST_SHARE = 0.1  # of the baselines may be shorter than those used
-# Where a pulse is seen to begin, and the samples before that in which it may have crept up.
+FEWEST = 30  # minimum number of flat baselines
+SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
+# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
 START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
 TRACES = 64  # drawn at a time, to bound memory
-FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and how often
+FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and number of iterations
 SIGMA_PER_MAD = 1.4826
-# Kinds of baselines are told apart where their powers spread this many times as much as
-# those of baselines of one spectrum.
+# Baselines are clustered along directions in which their band powers spread this many times
+# more than those of baselines from a single spectrum.
 KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class BaselineNoise:
-    """Spectrum of baseline noise.
+    r"""Spectrum of baseline noise.
+
+    The real FFT bins :math:`X_k` of :math:`N` samples have the density
+
+    .. math:: S_k = \langle |X_k|^2 \rangle / N, \qquad
+        \mathrm{RMS}^2 = \frac{1}{N} \Big(S_0 + 2 \sum_{0<k<N/2} S_k + S_{N/2}\Big).
 
     Parameters
     ----------
     density
-        Mean square per sample and frequency bin, at the frequencies of a real FFT of
-        `samples`: the expected square of a bin over `samples`, (prepared units x keV)^2.
+        Density :math:`S_k` at the frequencies of a real FFT of `samples`, in (prepared units
+        x keV)^2.
     samples, dt_ns
-        Length of that FFT and the sampling period.
+        Length :math:`N` of that FFT, and the sampling period in ns.
     n_baselines
-        How many flat baselines it was estimated from.
+        Number of flat baselines in the estimate.
     kinds, lines, shares
-        Spectra of several kinds of baselines: continuum and narrow lines, shapes
-        ``(kinds, bins)``, and how frequent each kind is, shape ``(kinds,)``; `density` is
-        their mean.  None for Gaussian noise of one spectrum.  Traces of several channels, or
-        of different days, have noise of different sizes and colours, which a mean would
-        hide; and a line is a sine of fixed height, not Gaussian noise.
+        Continuum and narrow lines of several kinds of baselines, shape ``(kinds, bins)``, and
+        the fraction of each kind, shape ``(kinds,)``. `density` is their mean. None for
+        Gaussian noise with a single spectrum. Traces of several channels or days have noise
+        of different RMS and spectrum, which a mean would hide. A line is a sine of fixed
+        amplitude, not Gaussian noise.
     rms_error
-        Standard error of `rms`: from the spread of the baselines, and as much as is guessed
-        of noise slower than they are long.  None if it was not estimated from baselines.
+        Standard error of `rms`. It includes the spread of the baselines and all noise that is
+        extrapolated to periods longer than a baseline. None if not estimated from baselines.
+
+    Examples
+    --------
+    White noise with a variance of 4 in each sample.
+
+    >>> white = BaselineNoise(np.full(513, 4.0), 1024, 16.0, 100)
+    >>> white.rms
+    2.0
+    >>> drawn = white.draw(np.full(50, 2.0), 1024, np.random.default_rng(1))
+    >>> bool(abs(drawn.std() - white.rms / 2.0) < 0.02)  # scales as 1/energy
+    True
     """
 
     density: Values
@@ -71,14 +87,14 @@ class BaselineNoise:
 
     @classmethod
     def from_traces(cls, raw: Pulses, config: PreparationConfig) -> Self:
-        """Estimate the spectrum from what precedes the pulses of raw traces.
+        """Estimate the spectrum from the samples before the pulses of raw traces.
 
         Parameters
         ----------
         raw
-            Measured traces of one channel with their energies, any mixture of peaks.
+            Measured traces of one channel with their energies, from any mixture of peaks.
         config
-            How they are prepared: gives baseline and scale of each.
+            Preparation settings, which give the baseline and scale of each trace.
 
         Raises
         ------
@@ -100,7 +116,7 @@ class BaselineNoise:
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
         which = _kinds(flat, mean)
         counts = np.bincount(which)
-        # few baselines have no spectrum of their own
+        # kinds with few baselines take the common spectrum
         spectra = [
             spectrum(flat[which == kind]) if counts[kind] >= FEWEST else (continuum, lines)
             for kind in range(len(counts))
@@ -116,22 +132,22 @@ class BaselineNoise:
 
     @classmethod
     def from_windows(cls, windows: Pulses, samples: int) -> Self:
-        """Estimate the spectrum from the beginnings of prepared windows.
+        """Estimate the spectrum from the first samples of prepared windows.
 
-        For data that come prepared, without their raw traces.  Such baselines are short:
-        noise slower than their length is guessed from its drift over them.
+        For data that are available only as prepared windows. Such baselines are short. Noise
+        slower than their length is extrapolated from its drift over them.
 
         Parameters
         ----------
         windows
             Prepared measured pulses with their energies.
         samples
-            How many of each begin the window before any pulse does.
+            Number of samples at the start of each window that precede any pulse.
 
         Raises
         ------
         CpunetError
-            If too few have a known energy and a flat baseline.
+            If too few windows have a known energy and a flat baseline.
         """
         known = np.isfinite(windows.energy_kev) & (windows.energy_kev > 0)
         chosen = windows[known]
@@ -141,32 +157,32 @@ class BaselineNoise:
     @property
     def rms(self) -> float:
         """Root mean square in prepared units times keV."""
-        # all frequencies but the first and the last stand for two signs
+        # all bins but the first and the last represent both signs of frequency
         both = 2 * self.density.sum() - self.density[0] - self.density[-1]
         return float(np.sqrt(both / self.samples))
 
     def draw(
         self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw Gaussian noise for pulses of these energies.
+        """Draw Gaussian noise for pulses of given energies.
 
-        Several pulses take parts of one long trace, of one kind, in random order and with
-        random signs: noise slower than a record is much the same in them, but for the sign,
-        so that it does not move their means alike.
+        Each long trace of one kind is cut into parts for several pulses, assigned in random
+        order and with random signs. Noise slower than a record is nearly the same in these
+        parts but for the sign, so it does not shift their means in common.
 
         Parameters
         ----------
         energy_kev
-            Energy of each pulse, shape ``(n,)``.
+            Energy of each pulse in keV, shape ``(n,)``.
         length
-            Samples of each.
+            Number of samples per pulse.
         rng
-            Where the randomness comes from.
+            Random generator.
 
         Returns
         -------
         numpy.ndarray
-            Float32, shape ``(n, length)``, in prepared units.
+            Noise in prepared units, float32, shape ``(n, length)``.
 
         Raises
         ------
@@ -175,9 +191,9 @@ class BaselineNoise:
         """
         require_energies(energy_kev)
         n = len(energy_kev)
-        # Twice as long as needed, so that end and beginning know nothing of each other.
+        # Twice as long as needed, so that its end is independent of its beginning.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
-        each = max(1, (long - length) // length)  # parts of a trace; a gap stays at its end
+        each = max(1, (long - length) // length)  # parts of a trace, with a gap at its end
         size = self._sizes(self.density[np.newaxis] if self.kinds is None else self.kinds, long)
         lines = None if self.lines is None else self._sizes(self.lines, long)
         noise = np.empty((n, length), np.float32)
@@ -196,7 +212,7 @@ class BaselineNoise:
         return noise
 
     def _sizes(self, densities: Values, long: int) -> FloatArray:
-        """Standard deviation of real and imaginary parts of a spectrum of `long` samples."""
+        """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
         return np.asarray(np.sqrt(0.5 * long * self._at(densities, long)), np.float32)
 
     def density_of(self, length: int) -> Values:
@@ -223,7 +239,7 @@ def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
 
 
 def _rms_error(flat: Values, rms: float) -> float:
-    """Standard error of an RMS, part of which is slower than the baselines."""
+    """Standard error of an RMS that is partly extrapolated beyond the baselines."""
     power = flat.var(axis=1)
     seen = float(np.sqrt(power.mean()))
     chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
@@ -233,18 +249,18 @@ def _rms_error(flat: Values, rms: float) -> float:
 def _add_lines(
     bins: npt.NDArray[np.complex64], lines: FloatArray, rng: np.random.Generator
 ) -> None:
-    """Add sines of fixed height and random phase to spectra, shape ``(traces, bins)``."""
+    """Add sines of fixed amplitude and random phase to spectra, shape ``(traces, bins)``."""
     trace, column = np.nonzero(lines)
     phase = rng.uniform(0, 2 * np.pi, len(trace))
-    # a Gaussian bin has this modulus on average, a sine has it always
+    # the RMS modulus of a Gaussian bin; that of a sine is constant
     bins[trace, column] += np.sqrt(2) * lines[trace, column] * np.exp(1j * phase)
 
 
 def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
-    """Which kind each baseline is of; all of kind 0 if they differ by no more than chance.
+    """Cluster baselines into kinds; all are of kind 0 if they differ only statistically.
 
-    Baselines are told apart by the logarithm of their power in bands, in the directions in
-    which it spreads more than that of baselines drawn from the mean spectrum.
+    The features are the logarithms of the power in bands, along directions in which their
+    spread exceeds that of baselines drawn from the mean spectrum.
     """
     one = np.zeros(len(flat), np.intp)
     if len(flat) < KINDS * FEWEST:
@@ -268,13 +284,13 @@ def _band_powers(baselines: Values) -> Values:
     window = np.hanning(baselines.shape[1])
     centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
     power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-    # the first bins hold what is left of the mean, and drifts
+    # the first bins hold residuals of the mean, and drifts
     bands = np.array_split(power[:, 4:], BANDS, axis=1)
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 
 def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
-    """Samples before the pulse in prepared units times keV, equally many of each trace."""
+    """Samples before the pulse in prepared units times keV, the same number of each trace."""
     known = np.flatnonzero(np.isfinite(raw.energy_kev) & (raw.energy_kev > 0))
     prepared = prepare(raw[known], config, "measured")
     if len(prepared) < FEWEST:
@@ -300,17 +316,17 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
 def samples_before_pulses(
     prepared: Prepared, config: PreparationConfig
 ) -> npt.NDArray[np.int64]:
-    """Samples of each raw trace that surely precede its pulse, shape ``(n,)``."""
+    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
     windows = prepared.pulses.waveforms[:, : config.samples_before]
     level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
     above = windows >= level[:, np.newaxis]
-    # The start of the pulse proper: everything from there to the alignment is above.
+    # Start of the pulse proper: every sample from there to the alignment is above threshold.
     start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
     return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
-    """Tell which baselines neither slope nor hold another pulse."""
+    """Select baselines that neither slope nor contain another pulse."""
     lever = np.arange(baselines.shape[1]) - 0.5 * (baselines.shape[1] - 1)
     slope = baselines @ lever / (lever @ lever)
     mean = baselines.mean(axis=1)

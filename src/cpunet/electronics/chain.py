@@ -1,4 +1,4 @@
-"""A readout chain in figures: preamplifier, noise, digitiser, and what else is in a trace."""
+"""Description of a readout chain: preamplifier, noise, digitiser and disturbances."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apar
 from cpunet.recipes.base import Config, Fraction, NonNegative, Positive, Samples
 
 REFERENCE_KEV = 2614.5
-"""Energy (keV) at which figures that depend on it are given: the full-energy peak."""
+"""Energy (keV) of the full-energy peak, at which energy-dependent values are quoted."""
 
 _Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -23,16 +23,19 @@ class _Figures(Config):
 
 
 class SlowPart(_Figures):
-    """A `fraction` of the charge arrives with a time constant of its own."""
+    """A `fraction` of the charge that arrives with the time constant `tau_ns`."""
 
     fraction: Fraction
     tau_ns: Positive
 
 
 class Ringing(_Figures):
-    """Oscillation added to a step, ``fraction exp(-t/damping) sin(2 pi frequency t)``.
+    r"""Damped oscillation added to a unit step.
 
-    The bandwidth, which comes after it, weakens it.
+    .. math:: f\, e^{-t / \tau_d} \sin(2 \pi \nu t)
+
+    with the fraction :math:`f`, the damping time :math:`\tau_d` and the frequency
+    :math:`\nu`. The bandwidth stages act after it and attenuate it.
     """
 
     frequency_MHz: Positive
@@ -41,17 +44,22 @@ class Ringing(_Figures):
 
 
 class Decay(_Figures):
-    """A `fraction` of the step decays with `tau_us`."""
+    """A `fraction` of the step that decays with the time constant `tau_us`."""
 
     fraction: _Share
     tau_us: Positive
 
 
 class NonLinearity(_Figures):
-    """Departures from a linear chain.
+    r"""Departures from a linear chain.
 
-    ``quadratic_fraction``: a signal of 2614.5 keV comes out taller by this fraction, others
-    in proportion to their height squared.  ``slew_kev_per_ns``: fastest change; null: none.
+    Parameters
+    ----------
+    quadratic_fraction
+        Relative excess :math:`q` of a 2614.5 keV signal. A signal of height :math:`E` is
+        read out as :math:`E\,(1 + q E / 2614.5\ \mathrm{keV})`.
+    slew_kev_per_ns
+        Maximum rate of change in keV/ns, or null for no limit.
     """
 
     quadratic_fraction: Annotated[float, Field(gt=-0.5, lt=0.5)]
@@ -59,16 +67,21 @@ class NonLinearity(_Figures):
 
 
 class NoiseLine(_Figures):
-    """A narrow line: its frequency, and its share of the noise power."""
+    """A narrow line in the noise: its frequency and its fraction of the noise power."""
 
     frequency_MHz: Positive
     power_fraction: Fraction
 
 
 class NoiseSpectrum(_Figures):
-    """Shape of the power: flat, with a roll-off, an excess at low frequency, and lines.
+    r"""Shape of the noise power spectrum.
 
-    ``(1 + excess / (1 + (f/excess_corner)²)) / (1 + (f/corner)^order)``
+    A flat continuum with a high-frequency roll-off and a low-frequency excess,
+
+    .. math:: P(\nu) \propto \frac{1 + e / (1 + (\nu/\nu_e)^2)}{1 + (\nu/\nu_c)^m},
+
+    plus narrow lines. :math:`\nu_c` is `corner_MHz`, :math:`m` is `order`, :math:`e` is
+    `excess` and :math:`\nu_e` is `excess_corner_kHz`.
     """
 
     corner_MHz: Positive
@@ -85,10 +98,11 @@ class NoiseSpectrum(_Figures):
 
 
 class Noise(_Figures):
-    """Noise of `rms_kev`, the same at all energies: from a spectrum, or cut from a file.
+    """Noise with an RMS of `rms_kev`, independent of the pulse energy.
 
-    ``baselines_file`` holds measured traces without pulses, at least as long as the record;
-    they are scaled to `rms_kev`.
+    It is drawn from a spectrum or cut from measured baselines. `baselines_file` holds
+    measured traces without pulses, at least as long as the record. They are scaled to
+    `rms_kev`.
     """
 
     rms_kev: NonNegative
@@ -103,19 +117,19 @@ class Noise(_Figures):
 
 
 class EarlierPulses(_Figures):
-    """Pulses before the record, at random at a rate: their tails are under its traces."""
+    """Pulses before the record, a Poisson process. Their tails lie under its traces."""
 
     rate_kHz: NonNegative
 
 
 class PileUp(_Figures):
-    """Second pulses in the record, at a rate."""
+    """Second pulses within the record, a Poisson process."""
 
     rate_kHz: NonNegative
 
 
 class Hum(_Figures):
-    """A wave of the mains under all traces, at any phase."""
+    """Mains hum: a sine under every trace with a random phase."""
 
     frequency_Hz: Positive
     amplitude_kev: Positive
@@ -127,37 +141,43 @@ class Electronics(_Figures):
     Parameters
     ----------
     name, description
-        For messages and ``stand.json``.
+        Used in messages and in ``stand.json``.
     bandwidth_poles_ns
-        Time constants of RC integrations, one to four.
-    slow, overshoot, ringing
-        Further stages, or null: a slow part of the charge; a step that begins too high by
-        a fraction, and comes down with a time constant; an oscillation.
+        Time constants of one to four RC integrations in ns.
+    slow
+        A delayed part of the charge, or null.
+    overshoot
+        A step that starts too high by a fraction and relaxes with a time constant, or null.
+    ringing
+        A damped oscillation, or null.
     decays
-        Parts of the step's decay; their fractions add up to 1.
-    gain_adc_per_kev, non_linearity
-        ADC counts per keV, and departures from it (null: none).
+        Components of the preamplifier decay. Their fractions add up to 1.
+    gain_adc_per_kev
+        Gain in ADC counts per keV.
+    non_linearity
+        Departures from a linear chain, or null.
     noise
-        Its size and spectrum.
+        RMS and spectrum of the noise.
     baseline_mean_adc, baseline_spread_adc
-        Baseline of a trace, Gaussian from trace to trace.
+        Mean and standard deviation of the Gaussian distribution of baselines, in ADC counts.
     trigger_jitter_ns
-        RMS of the time of the pulse in the record, beside the clock's random phase.
+        RMS of the trigger time in ns, in addition to the uniform phase of the clock.
     earlier_pulses, pile_up
-        Other pulses, by Poisson processes: before the record and in it.
+        Other pulses before and within the record, as Poisson processes.
     other_pulses_kev
-        Quantiles of their energies, evenly spaced from the lowest to the highest; between
-        them the logarithm is taken as linear.
+        Quantiles of the energies of other pulses in keV, evenly spaced in probability from
+        the minimum to the maximum. The logarithm is interpolated linearly between them.
     hum
-        A slow wave, or null.
+        Mains hum, or null.
     adc_bits
-        Samples beyond ``2**adc_bits - 1`` stay there.
+        Resolution of the digitiser. Samples saturate at ``2**adc_bits - 1``.
     resolution_fwhm_kev
-        Of the calibrated energies at 2614.5 keV; in proportion to the root of the energy.
+        FWHM of the calibrated energies at 2614.5 keV. It scales with the square root of the
+        energy.
     n_pre, length
-        Samples before the pulse, and in the record.
+        Number of samples before the pulse, and of the whole record.
     dt_ns
-        Sampling period; a sample is the mean over it.
+        Sampling period in ns. A sample is the mean over one period.
     """
 
     name: str
@@ -208,7 +228,14 @@ class Electronics(_Figures):
         pile_up_khz: float | None = None,
         hum: Hum | None = None,
     ) -> Electronics:
-        """The same chain with other rates of earlier and of second pulses, or with a hum.
+        """Copy of the chain with other rates of earlier and second pulses, or with hum.
+
+        Parameters
+        ----------
+        rate_khz, pile_up_khz
+            Rates of earlier and of second pulses in kHz. None keeps the chain's own.
+        hum
+            Mains hum. None keeps the chain's own.
 
         Examples
         --------
@@ -227,19 +254,19 @@ class Electronics(_Figures):
 
     @property
     def adc_top(self) -> int:
-        """The highest ADC count."""
+        """Highest ADC count."""
         return int(2**self.adc_bits - 1)
 
     @property
     def times_ns(self) -> dict[str, float]:
-        """The fastest time of each stage in ns, by the field that gives it."""
+        """Shortest time scale of each stage in ns, by field name."""
         times = {"bandwidth_poles_ns": min(self.bandwidth_poles_ns)}
         if self.slow:
             times["slow.tau_ns"] = self.slow.tau_ns
         if self.overshoot:
             times["overshoot.tau_ns"] = self.overshoot.tau_ns
         if self.ringing:
-            # an oscillation is followed if a radian of it is
+            # an oscillation is resolved if one radian of it is
             times["ringing.frequency_MHz"] = 1e3 / (2 * 3.1416 * self.ringing.frequency_MHz)
             times["ringing.damping_ns"] = self.ringing.damping_ns
         times["decays.tau_us"] = 1e3 * min(part.tau_us for part in self.decays)
@@ -247,7 +274,16 @@ class Electronics(_Figures):
 
     @cached_property
     def transfer(self) -> Exponentials:
-        """The chain's linear part as a sum of exponentials.
+        r"""Linear part of the chain as a sum of exponentials.
+
+        .. math:: H(s) = \Big[\sum_i f_i \frac{s\tau_i}{1 + s\tau_i}\Big]
+            \Big[1 - f_s \frac{s\tau_s}{1 + s\tau_s}\Big]
+            \Big[1 + f_o \frac{s\tau_o}{1 + s\tau_o}\Big]
+            \Big[1 + f_r \frac{s\,\omega}{(s + 1/\tau_d)^2 + \omega^2}\Big]
+            \prod_j \frac{1}{1 + s\tau_j}
+
+        The factors are the decays, the slow part, the overshoot, the ringing
+        (:math:`\omega = 2\pi\nu`) and the bandwidth poles. Stages that are null drop out.
 
         Examples
         --------
@@ -268,7 +304,7 @@ class Electronics(_Figures):
             [part.fraction for part in self.decays], taus[len(taus) - n_decays :]
         )
         for part, tau in zip(single, taus[n_poles:], strict=False):
-            # a slow part is missing at first, an overshoot is too much
+            # a slow part is missing at first, an overshoot is in excess
             sign = -1 if part is self.overshoot else 1
             chain = chain * Exponentials.mixed(sign * part.fraction, tau)
         for tau in taus[:n_poles]:
@@ -281,16 +317,37 @@ class Electronics(_Figures):
         return chain
 
     def step_response(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """What a unit of charge at 0 looks like at times `t_ns`; 0 before.
+        r"""Response to a unit charge at time 0; zero before it.
+
+        .. math:: r(t) = \mathcal{L}^{-1}\left[H(s) / s\right](t)
+
+        with the transfer function :math:`H` of `transfer`.
+
+        Parameters
+        ----------
+        t_ns
+            Times in ns, any shape.
 
         Examples
         --------
         >>> from cpunet.electronics.presets import read_electronics
         >>> read_electronics("legend200").step_response([-16, 0, 1000]).round(2).tolist()
         [0.0, 0.0, 0.99]
+
+        A single decay and one pole give the difference of two exponentials.
+
+        >>> from math import exp
+        >>> chain = read_electronics("ornl").model_copy(
+        ...     update=dict(slow=None, overshoot=None, ringing=None,
+        ...                 bandwidth_poles_ns=(50.0,),
+        ...                 decays=(Decay(fraction=1.0, tau_us=50.0),))
+        ... )
+        >>> expected = (exp(-1e3 / 5e4) - exp(-1e3 / 50)) / (1 - 50 / 5e4)
+        >>> bool(abs(chain.step_response(1e3) - expected) < 1e-12)
+        True
         """
         return self.transfer.step(t_ns)
 
     def impulse_response(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Derivative of the step response in 1/ns at times `t_ns`."""
+        """Impulse response in 1/ns, the derivative of `step_response`, at times in ns."""
         return self.transfer.impulse(t_ns)

@@ -1,9 +1,9 @@
-"""Remains of earlier pulses to be drawn: what a translation needs to have them like data.
+"""Random tails of earlier pulses for translated pulses, distributed as in the data.
 
-They are drawn by the law of the data.  Quality cuts take traces with large ones: how likely a
-remainder is to pass them is measured by adding remains to measured traces that have none, and
-translations into prepared windows, which are compared with data behind these cuts, are drawn
-accordingly.  Raw traces have not passed any.
+They are drawn from the law of the data. Quality cuts remove traces with large remainders. The
+probability to pass the cuts is measured by adding remainders to measured traces without any.
+Translations into prepared windows are compared with data after cuts, so their remainders are
+drawn with this probability. Raw traces have not passed any cuts.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from cpunet.pulses.cuts import CutWindows, apply_cuts
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Sizes in keV at which it is measured how likely a remainder passes the cuts.
+# Remainders in keV at which the probability to pass the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
-TEMPLATES, FEWEST_TEMPLATES = 150, 20  # traces that remains are added to
+TEMPLATES, FEWEST_TEMPLATES = 150, 20  # traces to which remainders are added
 
 
 class KnownDecay(NamedTuple):
-    """A decay in us, and its relative error."""
+    """Decay time in us and its relative error."""
 
     us: float
     relative_error: float
@@ -38,22 +38,22 @@ class KnownDecay(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnRemains:
-    """Remains to be added to records.
+    """Remainders to be drawn and added to records.
 
     Parameters
     ----------
     law
-        What they are drawn by, at the beginning of a trace as long as the data's.
+        Law from which they are drawn, at the start of a trace as long as the data's.
     height
-        Of a pulse of 1 keV in prepared units times keV: about the maximum of a window.
+        Height of a 1 keV pulse in prepared units times keV: about the maximum of a window.
     lead_us
-        By how much later records begin than these traces.
+        Delay of the start of a record relative to these traces, in us.
     dt_ns
-        Sampling period.
+        Sampling period in ns.
     passed
-        Probability to pass the data's cuts at `SIZES_KEV`; None if there are no cuts.
+        Probability to pass the cuts of the data at `SIZES_KEV`. None if there are no cuts.
     decay_error_us
-        Of the law's decay, if remains have told it themselves.
+        Error in us of the decay time of the law, if it was measured from remainders.
     """
 
     law: RemainsLaw
@@ -65,23 +65,23 @@ class DrawnRemains:
 
     @property
     def known_decay(self) -> KnownDecay | None:
-        """The decay, if remains have told it."""
+        """The decay time, if it was measured from remainders."""
         if self.decay_error_us is None:
             return None
         return KnownDecay(self.law.decay_us, self.decay_error_us / self.law.decay_us)
 
     def uncut(self, rate_khz: float | None = None) -> Self:
-        """The same without cuts, and at another rate if wanted."""
+        """Copy without cuts, optionally with another rate in kHz."""
         law = self.law if rate_khz is None else replace(self.law, rate_khz=rate_khz)
         return replace(self, law=law, passed=None)
 
     def draw_kev(self, n: int, rng: np.random.Generator) -> Values:
-        """What is left at the beginning of `n` traces, in keV."""
+        """Draw the remainders at the start of `n` traces, in keV."""
         kev = self.law.draw(n, rng)
         if self.passed is None or not n:
             return kev
         again = np.arange(n)
-        for _ in range(100):  # nothing at all is left in most traces, and passes
+        for _ in range(100):  # most traces have no remainder and pass
             sizes = np.log1p(kev[again])
             passes = np.interp(sizes, np.log1p(SIZES_KEV), self.passed)
             again = again[rng.random(len(again)) >= passes]
@@ -91,7 +91,7 @@ class DrawnRemains:
         return kev
 
     def decay(self, length: int, lead_us: float | None = None) -> Values:
-        """What is left of 1 keV at the samples of a record."""
+        """Remainder of 1 keV at each sample of a record, shape ``(length,)``."""
         lead = self.lead_us if lead_us is None else lead_us
         time_us = np.arange(length) * self.dt_ns * 1e-3 + lead
         return np.asarray(np.exp(-time_us / self.law.decay_us), float)
@@ -99,13 +99,13 @@ class DrawnRemains:
     def factors(
         self, energy_kev: npt.NDArray[np.float64], rng: np.random.Generator
     ) -> tuple[FloatArray, Values]:
-        """Drawn remains for pulses of these energies, in prepared units and in keV."""
+        """Draw remainders for pulses of given energies, in prepared units and in keV."""
         require_energies(energy_kev)
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32), kev
 
     def describe(self) -> dict[str, Any]:
-        """As `of` reads it."""
+        """Serialise to a mapping that `of` reads."""
         return {
             "rate_khz": self.law.rate_khz,
             "decay_us": self.law.decay_us,
@@ -118,7 +118,7 @@ class DrawnRemains:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Self:
-        """Read what `describe` gave."""
+        """Read a mapping written by `describe`."""
         law = RemainsLaw(
             float(told["rate_khz"]), float(told["decay_us"]), tuple(told["energies_kev"])
         )
@@ -130,14 +130,14 @@ class DrawnRemains:
 
 @dataclass(frozen=True, eq=False)
 class TraceNoise:
-    """Noise and remains together: all that is added to a record.
+    """Noise and tails of earlier pulses: everything that is added to a record.
 
     Parameters
     ----------
     noise
-        Of the baselines.
+        Noise of the baselines.
     remains
-        None for noise alone.
+        Tails of earlier pulses, or None for noise alone.
     """
 
     noise: BaselineNoise
@@ -145,13 +145,13 @@ class TraceNoise:
 
     @property
     def dt_ns(self) -> float:
-        """Sampling period of the noise."""
+        """Sampling period of the noise in ns."""
         return self.noise.dt_ns
 
     def draw(
         self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
     ) -> FloatArray:
-        """As `BaselineNoise.draw`, with remains on top."""
+        """Draw noise as `BaselineNoise.draw`, with tails of earlier pulses added."""
         drawn = self.noise.draw(energy_kev, length, rng)
         if self.remains is not None:
             factors, _ = self.remains.factors(energy_kev, rng)
@@ -162,21 +162,21 @@ class TraceNoise:
 def passing(
     remains: Remains, traces: Iterable[Pulses], config: PreparationConfig, cuts: CutWindows
 ) -> tuple[float, ...] | None:
-    """Probability of remains of `SIZES_KEV` to pass quality cuts.
+    """Probability that traces with remainders of `SIZES_KEV` pass the quality cuts.
 
     Parameters
     ----------
     remains
-        Of the traces' channel.
+        Remainders of the channel.
     traces
         Blocks of raw traces that have passed the cuts.
     config, cuts
-        Preparation and cuts.
+        Preparation settings and quality cuts.
 
     Returns
     -------
     tuple of float
-        None if there are too few traces without a remainder.
+        One probability per size, or None if too few traces have no remainder.
     """
     templates: list[npt.NDArray[np.float32]] = []
     for block in traces:

@@ -1,4 +1,4 @@
-"""Linear circuits as sums of exponentials: impulse and step response by partial fractions."""
+"""Linear circuits as sums of exponentials, combined by partial fractions."""
 
 from __future__ import annotations
 
@@ -12,28 +12,40 @@ import numpy.typing as npt
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 
-# Equal time constants are moved apart by this, relative to each other. A sum of single
-# poles then stands for a multiple one: a step response changes by less than 1e-6 of its
-# height, while the residues of even four equal poles leave eight digits.
+# Equal time constants are separated by this relative amount. A sum of single poles then
+# represents a multiple pole: a step response changes by less than 1e-6 of its height, while
+# the residues of even four equal poles keep eight digits.
 _APART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Exponentials:
-    """A transfer function ``H(s) = direct + sum(residue / (s - pole))``, poles all different.
+    r"""A transfer function with distinct poles.
+
+    .. math:: H(s) = d + \sum_k \frac{\rho_k}{s - p_k}
+
+    Its impulse and step responses are sums of exponentials,
+
+    .. math:: h(t) = d\,\delta(t) + \sum_k \rho_k e^{p_k t}, \qquad
+        r(t) = d + \sum_k \frac{\rho_k}{p_k} \left(e^{p_k t} - 1\right).
 
     Parameters
     ----------
     direct
-        What passes at once, without dimension.
+        Instantaneous part :math:`d`, dimensionless.
     poles, residues
-        Complex arrays of the same length, in 1/ns.
+        Complex arrays :math:`p_k` and :math:`\rho_k` of the same length, in 1/ns.
 
     Examples
     --------
     >>> two = Exponentials.low_pass(40.0) * Exponentials.low_pass(60.0)
     >>> two.step(np.array([-1.0, 0.0, 1e4])).round(6).tolist()
     [0.0, 0.0, 1.0]
+
+    One RC integration responds to a step with :math:`1 - e^{-t/\tau}`.
+
+    >>> bool(abs(Exponentials.low_pass(40.0).step(40.0) - (1 - np.exp(-1))) < 1e-15)
+    True
     """
 
     direct: float
@@ -44,23 +56,23 @@ class Exponentials:
     def of_real(
         cls, direct: float, taus_ns: Sequence[float], residues: Sequence[float]
     ) -> Exponentials:
-        """Real poles ``-1/tau``, with residues in 1/ns."""
+        """Transfer function with real poles ``-1/tau`` and residues in 1/ns."""
         poles = -1 / np.asarray(taus_ns, np.complex128)
         return cls(float(direct), poles, np.asarray(residues, np.complex128))
 
     @classmethod
     def low_pass(cls, tau_ns: float) -> Exponentials:
-        """One RC integration: ``1 / (1 + s tau)``."""
+        r"""RC integration, :math:`1 / (1 + s\tau)`."""
         return cls.of_real(0.0, [tau_ns], [1 / tau_ns])
 
     @classmethod
     def mixed(cls, fraction: float, tau_ns: float) -> Exponentials:
-        """A `fraction` takes ``tau_ns``, the rest passes: step ``1 - f exp(-t/tau)``."""
+        r"""Delay a `fraction` by `tau_ns`: step response :math:`1 - f e^{-t/\tau}`."""
         return cls.of_real(1 - fraction, [tau_ns], [fraction / tau_ns])
 
     @classmethod
     def ringing(cls, fraction: float, frequency_MHz: float, damping_ns: float) -> Exponentials:
-        """Step response ``1 + f exp(-t/damping) sin(2 pi frequency t)``."""
+        r"""Damped oscillation: step response :math:`1 + f e^{-t/\tau_d} \sin(2\pi\nu t)`."""
         pole = complex(-1 / damping_ns, 2 * np.pi * frequency_MHz * 1e-3)
         residue = fraction * pole / 2j
         poles, residues = [pole, pole.conjugate()], [residue, residue.conjugate()]
@@ -68,17 +80,17 @@ class Exponentials:
 
     @classmethod
     def decaying(cls, fractions: Sequence[float], taus_ns: Sequence[float]) -> Exponentials:
-        """Step response ``sum(f exp(-t/tau))``: RC-coupled charge that leaks away."""
+        r"""RC coupling: step response :math:`\sum_i f_i e^{-t/\tau_i}`."""
         residues = [-f / tau for f, tau in zip(fractions, taus_ns, strict=True)]
         return cls.of_real(sum(fractions), taus_ns, residues)
 
     def at(self, s: ComplexArray) -> ComplexArray:
-        """``H(s)``, with `s` in 1/ns and none of the poles."""
+        """Evaluate ``H(s)`` at `s` in 1/ns. `s` must not be a pole."""
         parts = self.residues / (np.asarray(s, np.complex128)[..., None] - self.poles)
         return np.asarray(self.direct + parts.sum(axis=-1))
 
     def __mul__(self, other: Exponentials) -> Exponentials:
-        """One after the other; they may have no pole in common."""
+        """Cascade two circuits. They must not share a pole."""
         return Exponentials(
             self.direct * other.direct,
             np.concatenate([self.poles, other.poles]),
@@ -91,13 +103,13 @@ class Exponentials:
         )
 
     def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Impulse response in 1/ns at times in ns, without the part that passes at once."""
+        """Impulse response in 1/ns at times in ns, without the instantaneous part."""
         t = np.asarray(t_ns, float)
         modes = np.exp(np.maximum(t, 0)[..., None] * self.poles) * self.residues
         return np.where(t >= 0, modes.sum(axis=-1).real, 0.0)
 
     def step(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Response to a unit step at 0, at times in ns; 0 before it."""
+        """Response to a unit step at 0, at times in ns; zero before it."""
         t = np.asarray(t_ns, float)
         modes = np.expm1(np.maximum(t, 0)[..., None] * self.poles) * (
             self.residues / self.poles
@@ -106,7 +118,7 @@ class Exponentials:
 
 
 def moved_apart(taus_ns: Sequence[float]) -> list[float]:
-    """Time constants in the given order, equal ones (to 0.1 %) moved apart about their mean.
+    """Separate time constants that agree within 0.1 %, about their mean; keep the order.
 
     Examples
     --------

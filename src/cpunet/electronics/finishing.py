@@ -1,4 +1,4 @@
-"""From the response of the electronics to windows made exactly as those of the data are."""
+"""From the response of the electronics to windows prepared exactly as those of the data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BLOCK = 512  # pulses at a time, to bound memory
 
 
 def blocks(n: int) -> Iterator[slice]:
-    """Rows of all pulses, `BLOCK` at a time."""
+    """Slices of `BLOCK` rows that cover `n` pulses."""
     return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
 
 
@@ -31,39 +31,40 @@ def finish(
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
 ) -> FloatArray:
-    """Align and normalise noise-free records as measured traces, with noise if asked.
+    """Align and normalise noise-free records as measured traces are, optionally with noise.
 
-    Noise is added to the whole record once its tail has the level of the data's, and
-    the record is prepared again: alignment, baseline and scale then suffer from noise
-    as those of the data do.  A pulse without any decay has no place at which noise would
-    let it be aligned, so finish `Raw` without noise.
+    Noise is added to the whole record once its tail is at the level of the data's. The
+    record is then prepared again, so that noise affects alignment, baseline and scale as it
+    does in the data. A pulse without decay cannot be aligned once noise is added: finish
+    `Raw` without noise.
 
     Parameters
     ----------
     records
-        Noise-free pulses of any height with room around the window, shape
+        Noise-free pulses of any height with padding around the window, shape
         ``(n, samples)``.
     config
-        The preparation of the data.
+        Preparation settings of the data.
     dt_ns
         Sampling period in ns.
     noise
-        What to add, with remains of earlier pulses or without; None for noise-free windows.
+        Noise to add, with or without the tails of earlier pulses. None gives noise-free
+        windows.
     energy_kev
-        Energy of each pulse, shape ``(n,)``; needed for the noise.
+        Energy of each pulse in keV, shape ``(n,)``. Required for noise.
     seed
-        Of the noise.
+        Seed or random generator of the noise.
 
     Returns
     -------
     numpy.ndarray
-        Float32, shape ``(n, config.length)``; a row of NaN where a pulse cannot be
+        Windows, float32, shape ``(n, config.length)``. A row is NaN if the pulse cannot be
         prepared.
 
     Raises
     ------
     CpunetError
-        If shapes, sampling or energies do not fit.
+        If shapes, sampling periods or energies do not match.
     """
     windows, _ = finish_with_codes(
         records, config, dt_ns=dt_ns, noise=noise, energy_kev=energy_kev, seed=seed
@@ -81,9 +82,9 @@ def finish_with_codes(
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
 ) -> tuple[FloatArray, Codes]:
-    """As `finish`, with a `cpunet.pulses.preparation.Rejection` for each record.
+    """As `finish`, with a `cpunet.pulses.preparation.Rejection` code for each record.
 
-    What is `added` comes with the noise, in prepared units, shape ``(n, samples)``.
+    `added` is added together with the noise, in prepared units, shape ``(n, samples)``.
     """
     clean, noisy, codes = _finished(records, config, dt_ns, noise, energy_kev, seed, added)
     return clean if noise is None else noisy, codes
@@ -98,7 +99,7 @@ def finish_both(
     energy_kev: npt.NDArray[np.float64],
     seed: int | np.random.Generator = 0,
 ) -> tuple[FloatArray, FloatArray]:
-    """`finish` without noise and with it, in the time of the latter."""
+    """`finish` without and with noise, at the cost of the latter alone."""
     clean, noisy, _ = _finished(records, config, dt_ns, noise, energy_kev, seed)
     return clean, noisy
 
@@ -112,14 +113,14 @@ def _finished(
     seed: int | np.random.Generator,
     added: npt.NDArray[np.float64] | None = None,
 ) -> tuple[FloatArray, FloatArray, Codes]:
-    """Windows without noise, with it (none if there is none), and the codes of the last."""
+    """Windows without noise, windows with noise (empty without one), and rejection codes."""
     if records.ndim != 2:
         raise CpunetError(
             f"translated waveforms have shape {records.shape}; expected (pulses, samples)"
         )
     if noise is not None:
         _check_noise(noise, dt_ns, energy_kev, len(records))
-    # A record without noise may well have equal samples at its top; none is clipped.
+    # A noise-free record may have equal samples at its top; none of them is clipped.
     config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)
     windows = np.full((n, config.length), np.nan, np.float32)

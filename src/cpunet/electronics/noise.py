@@ -1,4 +1,4 @@
-"""Noise of a chain: with a given spectrum, or cut from measured baselines."""
+"""Noise of a readout chain, drawn from a spectrum or cut from measured baselines."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.opening import open_pulses
 
-# Traces are cut from longer ones, so that noise slower than the record is a wander of its
-# level, and the trace's end knows nothing of its beginning: 131 us at 16 ns, down to 8 kHz.
+# Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
+# the record moves its level and the trace's end is independent of its beginning.
 _LEAST_SAMPLES = 8192
 _TRACES_AT_A_TIME = 128
 # Measured traces kept for cutting; some tens of MB.
@@ -22,19 +22,34 @@ _MOST_BASELINES = 2000
 
 
 def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatArray:
-    """Share of the noise power in each frequency of a real FFT, adding up to 1.
+    r"""Fraction of the noise power in each frequency bin of a real FFT.
+
+    .. math:: P(\nu) = c\,\frac{1 + e / (1 + (\nu/\nu_e)^2)}{1 + (\nu/\nu_c)^m}
+        + \sum_l a_l\,\delta_{\nu \nu_l}, \qquad \sum_\nu P(\nu) = 1,
+
+    with the symbols of `cpunet.electronics.chain.NoiseSpectrum` and the power fractions
+    :math:`a_l` of its lines.
 
     Parameters
     ----------
     spectrum
-        Its shape.
+        Shape of the spectrum.
     dt_ns, n_samples
-        Sampling period in ns and length of the traces.
+        Sampling period in ns and number of samples of the traces.
 
     Returns
     -------
     array
-        Shape ``(n_samples // 2 + 1,)``; nothing at frequency 0, which is the baseline.
+        Shape ``(n_samples // 2 + 1,)``. Bin 0 is empty: it is the baseline.
+
+    Examples
+    --------
+    At the corner of a steep roll-off the power is half that of the plateau.
+
+    >>> flat = NoiseSpectrum(corner_MHz=10, order=8, excess=0, excess_corner_kHz=1)
+    >>> power = noise_power(flat, dt_ns=10.0, n_samples=1000)
+    >>> round(float(power.sum()), 6), round(float(power[100] / power[1]), 3)
+    (1.0, 0.5)
     """
     frequency_MHz = fft.rfftfreq(n_samples, dt_ns * 1e-3)
     slow = frequency_MHz / (spectrum.excess_corner_kHz * 1e-3)
@@ -43,7 +58,7 @@ def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatA
     )
     power[0] = 0
     if n_samples % 2 == 0:
-        power[-1] /= 2  # half the sampling rate stands for half a step of frequency
+        power[-1] /= 2  # the Nyquist bin covers half a frequency step
     power *= (1 - sum(line.power_fraction for line in spectrum.lines)) / power.sum()
     for line in spectrum.lines:
         power[max(1, np.abs(frequency_MHz - line.frequency_MHz).argmin())] += (
@@ -55,14 +70,22 @@ def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatA
 def coloured_noise(
     spectrum: NoiseSpectrum, n: int, length: int, dt_ns: float, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
-    """Gaussian noise of RMS 1 with a given spectrum, shape ``(n, length)``.
+    r"""Gaussian noise with a given spectrum and an RMS of 1, shape ``(n, length)``.
 
-    The RMS is about 0 and counts frequencies down to that of the long traces of which these
-    are parts (8 kHz at 16 ns), so that the scatter within a short trace is a little less.
+    Each real FFT bin is a complex Gaussian whose variance follows `noise_power`. Traces are
+    cut from longer ones. The RMS is taken about 0 and includes frequencies down to that of
+    these longer traces (8 kHz at 16 ns), so the scatter within a short trace is slightly lower.
+
+    Examples
+    --------
+    >>> flat = NoiseSpectrum(corner_MHz=10, order=4, excess=0, excess_corner_kHz=1)
+    >>> noise = coloured_noise(flat, 20, 1000, 16.0, np.random.default_rng(1))
+    >>> bool(abs(noise.std() - 1) < 0.05)
+    True
     """
     n_long = max(_LEAST_SAMPLES, fft.next_fast_len(2 * length, real=True))
     power = noise_power(spectrum, dt_ns, n_long)
-    # irfft divides by n_long, and each frequency but the last is there twice
+    # irfft divides by n_long, and each bin but the last represents both signs of frequency
     scale = n_long * np.sqrt(power / 4)
     scale[-1] = n_long * np.sqrt(power[-1] / (1 if n_long % 2 == 0 else 4))
     noise = np.empty((n, length), np.float32)
@@ -77,19 +100,19 @@ def coloured_noise(
 
 
 def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.float32]:
-    """Measured traces without pulses, shape ``(traces, samples)``, each less its mean.
+    """Measured traces without pulses, shape ``(traces, samples)``, with their means removed.
 
     Parameters
     ----------
     path
-        Any file of waveforms that `open_pulses` reads.
+        Waveform file in any format that `open_pulses` reads.
     length, dt_ns
-        Of the traces to be cut from them.
+        Number of samples and sampling period in ns of the traces to be cut from them.
 
     Raises
     ------
     CpunetError
-        If they are too short, sampled otherwise, or do not vary.
+        If the baselines are too short, have another sampling period, or are constant.
     """
     source = open_pulses(path)
     if not np.isclose(source.dt_ns, dt_ns):
@@ -116,16 +139,16 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
 def cut_noise(
     baselines: npt.NDArray[np.float32], n: int, length: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
-    """Windows from measured baselines, at random, scaled to an RMS of 1 over all of them.
+    """Random windows of measured baselines, scaled to a common RMS of 1.
 
     Parameters
     ----------
     baselines
-        As `read_baselines` gives them.
+        Output of `read_baselines`.
     n, length
-        Shape of the result.
+        Number of windows and of samples in each.
     rng
-        Of the choice.
+        Random generator.
     """
     trace = rng.integers(len(baselines), size=n)
     begin = rng.integers(baselines.shape[1] - length + 1, size=n)
@@ -138,6 +161,15 @@ def noise_of(
 ) -> npt.NDArray[np.float32]:
     """Noise in keV of `n` traces of a chain, shape ``(n, electronics.length)``.
 
+    Parameters
+    ----------
+    electronics
+        The readout chain.
+    n
+        Number of traces.
+    rng
+        Random generator.
+
     Raises
     ------
     CpunetError
@@ -147,6 +179,6 @@ def noise_of(
     if noise.spectrum is not None:
         unit = coloured_noise(noise.spectrum, n, length, dt_ns, rng)
     else:
-        assert noise.baselines_file is not None  # as Noise makes sure
+        assert noise.baselines_file is not None  # Noise validates this
         unit = cut_noise(read_baselines(noise.baselines_file, length, dt_ns), n, length, rng)
     return unit * np.float32(noise.rms_kev)

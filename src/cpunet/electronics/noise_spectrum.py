@@ -1,4 +1,4 @@
-"""Spectra of baselines, also where a baseline is too short to show them."""
+"""Noise spectra of baselines, including frequencies that a baseline is too short for."""
 
 from __future__ import annotations
 
@@ -9,28 +9,45 @@ import scipy.optimize
 
 from cpunet.electronics.exponentials import FloatArray as Values
 
-# Below the third frequency of a baseline its mean and the window's leakage hide the
-# spectrum; there it follows from how the noise drifts apart over the baseline's length.
+# Below the third bin of a baseline, its mean and the window's leakage hide the spectrum.
+# There it is inferred from the structure function over the baseline's length.
 FIRST_CLEAN_BIN, RECORD_SAMPLES = 3, 8192
-# A line stands out this much from the median of so many bins to either side, and a window
-# spreads it over so many.
+# A line exceeds the median of the ten bins on either side by this factor. The window spreads
+# it over two bins on either side.
 LINE_HEIGHT, LINE_AROUND, LINE_HALF_WIDTH = 3.0, 10, 2
-CORNERS, LAGS = 8, 40  # of the slow part's Lorentzians; at which the drift is compared
+CORNERS, LAGS = 8, 40  # Lorentzians of the slow part; lags at which the drift is compared
 
 
 def spectrum(baselines: Values) -> tuple[Values, Values]:
-    """Mean square per sample and frequency bin of a set of baselines.
+    r"""Power spectrum of a set of baselines: mean square per sample and frequency bin.
+
+    The Hann-windowed periodogram of the baselines :math:`x_j`,
+
+    .. math:: S(\nu) = \frac{\langle |\sum_j w_j (x_j - \bar x)
+        e^{-2\pi i \nu j}|^2 \rangle}{\sum_j w_j^2},
+
+    without its lines, continued to low frequencies by a sum of Lorentzians that is fitted to
+    the structure function :math:`\frac{1}{2} \langle (x_{j+k} - x_j)^2 \rangle`.
 
     Parameters
     ----------
     baselines
-        Shape ``(n, samples)``, any level.
+        Baselines at any level, shape ``(n, samples)``.
 
     Returns
     -------
     tuple of array
-        The continuum and the lines, at the frequencies of a real FFT of `RECORD_SAMPLES`:
-        their sum is the density.  A line, narrower than the baselines resolve, is one bin.
+        Continuum and lines at the frequencies of a real FFT of `RECORD_SAMPLES`. Their sum is
+        the density. A line, which the baselines do not resolve, occupies one bin.
+
+    Examples
+    --------
+    The spectrum of white noise is its variance.
+
+    >>> white = np.random.default_rng(1).normal(0, 2, size=(200, 512))
+    >>> continuum, lines = spectrum(white)
+    >>> bool(abs(continuum[1000:].mean() - 4) < 0.1), bool(lines.any())
+    (True, False)
     """
     density = _periodogram(baselines)
     continuum, lines = _without_lines(density, baselines.shape[1])
@@ -38,7 +55,7 @@ def spectrum(baselines: Values) -> tuple[Values, Values]:
 
 
 def _without_lines(density: Values, samples: int) -> tuple[Values, Values]:
-    """A periodogram without its lines, and the lines on the grid of the records."""
+    """Split a periodogram into its continuum and its lines on the grid of the records."""
     around = scipy.ndimage.median_filter(density, 2 * LINE_AROUND + 1, mode="nearest")
     lines = np.zeros(RECORD_SAMPLES // 2 + 1)
     continuum = density.copy()
@@ -65,10 +82,10 @@ def _periodogram(baselines: Values) -> Values:
 
 
 def _structure_function(baselines: Values) -> Values:
-    """Half the mean square difference of samples 0, 1, 2 ... apart.
+    """Half the mean square difference of samples at lags 0, 1, 2, ...
 
-    Unlike a spectrum it needs no mean to be taken off, so that nothing is lost of noise
-    slower than the baseline.
+    Unlike a spectrum it needs no subtraction of the mean. Noise slower than the baseline is
+    therefore retained in full.
     """
     n, samples = baselines.shape
     padded = scipy.fft.next_fast_len(2 * samples, real=True)
@@ -79,29 +96,29 @@ def _structure_function(baselines: Values) -> Values:
     products = scipy.fft.irfft(power, padded)[:samples]
     squares = np.cumsum((centred**2).sum(axis=0))
     lag = np.arange(samples)
-    # the squares of the samples that have a partner later, and of those that have one earlier
+    # sums of squares over samples with a later partner, and over those with an earlier one
     left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
     return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)
 
 
 def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
-    """The spectrum down to the frequencies of `RECORD_SAMPLES`.
+    """Continue the spectrum down to the frequencies of `RECORD_SAMPLES`.
 
     Parameters
     ----------
     density
         Periodogram of the baselines without its lines.
     lines
-        These, at the frequencies of the result.
+        The lines at the frequencies of the result.
     drift
         Structure function of the baselines.
 
     Returns
     -------
     array
-        Density at the frequencies of a real FFT of `RECORD_SAMPLES`: as measured from
-        `FIRST_CLEAN_BIN` on, and rising from there towards 0 by a sum of Lorentzians, none
-        of them negative, whose structure function comes closest to `drift`.
+        Density at the frequencies of a real FFT of `RECORD_SAMPLES`. From `FIRST_CLEAN_BIN`
+        upwards it is the measured one. Below, it rises towards 0 by a non-negative sum of
+        Lorentzians whose structure function is closest to `drift`.
     """
     samples = len(drift)
     frequency = np.arange(RECORD_SAMPLES // 2 + 1) / RECORD_SAMPLES
@@ -112,7 +129,7 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
     slow = np.maximum(slow, 0)
     lags = np.unique(np.geomspace(4, 0.9 * samples, LAGS).astype(int))
-    # both signs of the frequency; a density of 1 is a mean square of 1
+    # both signs of the frequency: a density of 1 is a mean square of 1
     apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / RECORD_SAMPLES
     weights = 1 / drift[lags]
     rest = (drift[lags] - apart @ (fast + lines)) * weights

@@ -1,4 +1,4 @@
-"""What else is in a trace: what earlier pulses have left, second pulses, and a slow wave."""
+"""Disturbances of a trace: tails of earlier pulses, second pulses and mains hum."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from cpunet.pulses.container import Pulses
 
 @dataclass(frozen=True, eq=False)
 class OtherPulses:
-    """What is added to the traces, and what is known of it.
+    """The disturbances added to the traces and their truth.
 
     Parameters
     ----------
     added_kev
-        Signal in keV, shape ``(n, length)``.
+        Added signal in keV, shape ``(n, length)``.
     remains_kev
-        What earlier pulses have left at the beginning of each trace, in keV.
+        Sum of the tails of earlier pulses at the first sample of each trace, in keV.
     n_piled
-        Pulses within each trace besides its own.
+        Number of additional pulses within each trace.
     piled_kev, piled_ns
-        Energy of the largest of them, and how long after the trace's own it began
-        (negative: before); NaN where there is none.
+        Energy of the largest additional pulse, and its start relative to the trace's own
+        pulse in ns (negative: before it). NaN where there is none.
     """
 
     added_kev: FloatArray
@@ -41,20 +41,20 @@ class OtherPulses:
 def draw_other_pulses(
     pulses: Pulses, electronics: Electronics, rng: np.random.Generator
 ) -> OtherPulses:
-    """Draw the other pulses of traces by Poisson processes, see `cpunet.electronics.chain`.
+    """Draw the other pulses of each trace, see `cpunet.electronics.chain`.
 
     Parameters
     ----------
     pulses
-        Of the traces; second pulses have the shapes of these.
+        Pulses of the traces. Second pulses take their shapes.
     electronics
-        The chain, with the rates.
+        The readout chain with the rates.
     rng
-        Of everything drawn.
+        Random generator.
     """
     remains, second, slow = rng.spawn(3)
     added_kev = _remains(len(pulses), electronics, remains)
-    # before the slow wave and the second pulses come on top
+    # before hum and second pulses are added
     remains_kev = added_kev[:, 0].copy()
     n_piled, piled_kev, piled_ns = _add_second(pulses, electronics, added_kev, second)
     if electronics.hum is not None:
@@ -69,7 +69,7 @@ def _remains(n: int, electronics: Electronics, rng: np.random.Generator) -> Floa
     row, kev, before_us = earlier_pulses(
         n, electronics.earlier_pulses.rate_kHz, longest_us, electronics.other_pulses_kev, rng
     )
-    # a step response is a sum of exponentials, and so is what is left of many steps
+    # a step response is a sum of exponentials, and so is the sum of many tails
     weights = transfer.residues / transfer.poles
     modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
     heights = np.zeros((n, len(weights)), np.complex128)
@@ -82,7 +82,7 @@ def _remains(n: int, electronics: Electronics, rng: np.random.Generator) -> Floa
 def _add_second(
     pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Add second pulses, anywhere in the record and of the shape of any other of the set."""
+    """Add second pulses anywhere in the record, with shapes of randomly chosen pulses."""
     n, dt_ns = len(pulses), electronics.dt_ns
     length_us = 1e-3 * electronics.length * dt_ns
     row, kev, time_us = earlier_pulses(
@@ -99,8 +99,8 @@ def _add_second(
 
 
 def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
-    """A wave of the mains at any phase, in keV, shape ``(n, length)``."""
-    assert electronics.hum is not None  # asked before
+    """Mains hum with random phases in keV, shape ``(n, length)``."""
+    assert electronics.hum is not None  # checked by the caller
     phase = rng.uniform(0, 2 * np.pi, size=(n, 1))
     turns = np.arange(electronics.length) * electronics.dt_ns * 1e-9
     wave = np.sin(2 * np.pi * electronics.hum.frequency_Hz * turns + phase)

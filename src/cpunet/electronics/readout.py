@@ -1,4 +1,4 @@
-"""Ideal pulses become raw traces, as a digitiser would write them, with a known answer."""
+"""From ideal pulses to raw traces as a digitiser writes them, with the truth kept."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from cpunet.pulses.container import Pulses
 from cpunet.simulation.gammas import with_resolution
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
-"""Bits of the flags of a trace; a baseline decays if more than the noise's RMS is left."""
+"""Bits of a trace's flags. A baseline decays if its remainder exceeds the noise RMS."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawTraces:
-    """Raw traces, and what is known of them.
+    """Raw traces and the truth behind them.
 
     Parameters
     ----------
     waveforms
-        Uint16 array of shape ``(n, length)``, ADC counts.
+        ADC counts, uint16, shape ``(n, length)``.
     dt_ns
         Sampling period in ns.
     energy_kev
-        Calibrated energies, with the resolution.
+        Calibrated energies in keV, including the energy resolution.
     event_number
-        The source's own numbers.
+        Event numbers of the source.
     flags
-        Uint8: 1 decaying baseline, 2 pile-up, 4 saturated, added up.
+        Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
-        Float32 ``(n, length)``: the noise-free pulse at its own clock phase in units of
-        the full charge, without baseline, earlier or second pulses.
+        Noise-free pulses at their own clock phase in units of the full charge, without
+        baseline and without earlier or second pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
-        What scales and lifts it.
+        Scale in keV and offset in ADC counts of each pulse.
     remains_kev, n_piled, piled_kev, piled_ns
-        Of other pulses, see `cpunet.electronics.other_pulses.OtherPulses`.
+        Properties of other pulses, see `cpunet.electronics.other_pulses.OtherPulses`.
     """
 
     waveforms: npt.NDArray[np.uint16]
@@ -67,17 +67,17 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     Parameters
     ----------
     pulses
-        Charge from 0 to 1, sampled more finely than the digitiser (1 to 4 ns), with true
-        energies.  A set is held as a whole: give large ones in blocks.
+        Charge pulses from 0 to 1 with true energies, sampled more finely than the digitiser
+        (1 to 4 ns). All are held in memory: split large sets into blocks.
     electronics
-        The chain.
+        The readout chain.
     seed
-        The same seed gives the same traces.
+        Seed of the random generator. The same seed gives the same traces.
 
     Raises
     ------
     CpunetError
-        As `cpunet.electronics.response.respond` and `noise_of`.
+        For the reasons of `cpunet.electronics.response.respond` and `noise_of`.
 
     Examples
     --------
@@ -131,6 +131,6 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
 
 
 def _shift_ns(electronics: Electronics, n: int, rng: np.random.Generator) -> FloatArray:
-    """When pulses begin, after `n_pre` samples: any phase of the clock, and the trigger's."""
+    """Start of the pulses after `n_pre` samples: a uniform clock phase plus trigger jitter."""
     phase = rng.uniform(0, electronics.dt_ns, size=n)
     return phase + rng.normal(0, electronics.trigger_jitter_ns, size=n)

@@ -1,10 +1,11 @@
-"""What earlier pulses have left under each raw trace, from level and slope of its baseline.
+r"""Tails of earlier pulses under raw traces, from the level and slope of their baselines.
 
-A remainder of height A over the level of an empty baseline is A exp(-t/tau): it lifts the
-baseline and tilts it.  Where the amplifier is coupled through, the *level* tells it better
-than the slope, since levels differ by little from trace to trace; both are weighted by their
-errors, which the side of each distribution shows that remains leave alone.  Large remains
-tell the decay, as the two halves of their baselines differ in height by exp(h/tau).
+A tail of height :math:`A` above the level of an empty baseline follows
+:math:`A e^{-t/\tau}`. It raises the baseline and tilts it. With a DC-coupled amplifier the
+*level* is the more precise measure, since levels vary little between traces. Level and slope
+are weighted by their errors. These come from the lower side of each distribution, which the
+tails do not affect. Large tails also give the decay time: the means of the two halves of
+their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
 """
 
 from __future__ import annotations
@@ -30,52 +31,54 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-LEAST_SAMPLES = 64  # of a baseline
-MOST = 16384  # traces that the law is fitted to
-# Remains from which the decay is taken: so many errors high, and so many traces.
+LEAST_SAMPLES = 64  # minimum length of a baseline
+MOST = 16384  # traces used in the fit of the law
+# Remainders used for the decay time: minimum height in errors, and minimum number of traces.
 LARGE, FEWEST_LARGE = 12.0, 20
-# What lies higher or lower than its tilt says, by this factor, is no remainder's level.
+# A baseline whose level differs by more than this factor from what its tilt implies is not
+# that of a remainder.
 COUPLED = 2.5
-LEVEL_TELLS = 0.2  # the weight of a level that tells which baselines are empty
-# Gaussian deviations of what is left of a baseline without its remainder: beyond, there is
-# another pulse in it.
+LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
+# Number of Gaussian standard deviations of the residual RMS beyond which a baseline holds
+# another pulse.
 DISTURBED = 6.0
-# The rate is known if the likelihood says so, and if it is this many times its error.
+# The rate is significant if it is SURE errors large and the log-likelihood gain is SURE_GAIN.
 SURE, SURE_GAIN = 4.0, 12.0
-MOST_FULL = 0.97  # of the traces may have remains of more than an error
-LEAST_EXPECTED = 1e-3  # pulses in a decay time, below which there is no rate
-SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # sizes whose shares are told
+MOST_FULL = 0.97  # maximum fraction of traces with a remainder larger than the error
+LEAST_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
+SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
 
 
 @dataclass(frozen=True, eq=False)
 class Remains:
-    """What tells the remains of a channel's traces, and their law.
+    """Remainders measured under the traces of a channel, and their law.
 
     Parameters
     ----------
     kev
-        What is left at the first sample of the traces that were measured; NaN where that
-        cannot be told.
+        Remainder at the first sample of each measured trace in keV. NaN where it cannot be
+        determined.
     error_kev
-        Its standard deviation.
+        Standard deviation of the remainders in keV.
     coupled
-        Whether levels count, and not slopes alone.
+        Whether the levels are used in addition to the slopes.
     level_weight
-        Of the remainder that the level tells; the rest is that of the slope.
+        Weight of the remainder from the level. That of the slope is the complement.
     level_error_kev
-        Error of what the level tells alone.
+        Standard deviation of the remainder from the level alone, in keV.
     decay_us, decay_error_us
-        Of the remains; the latter None if it is that of the pulses' tails.
+        Decay time of the remainders and its error in us. The error is None if the decay time
+        is that of the pulses' tails.
     baseline_adc, adc_per_kev
-        Level without any remainder, and the height of a keV.
+        Level of an empty baseline in ADC counts, and gain in ADC counts per keV.
     widest_adc
-        RMS about its remainder of a baseline without another pulse, at most.
+        Maximum RMS, about its remainder, of a baseline without another pulse.
     fit
-        Of the law.
+        Fit of the law.
     samples
-        Of each baseline that were looked at.
+        Number of samples used of each baseline.
     dt_ns
-        Sampling period.
+        Sampling period in ns.
     """
 
     kev: FloatArray
@@ -93,9 +96,9 @@ class Remains:
     dt_ns: float
 
     def empty(self, raw: Pulses) -> npt.NDArray[np.bool_]:
-        """Which traces are about as low as an empty baseline; all if levels tell little.
+        """Select traces about as low as an empty baseline; all if levels are imprecise.
 
-        Nothing is asked of their slopes, so that these stay what noise makes them.
+        No condition is placed on the slopes, so that noise alone determines them.
         """
         if not self.coupled or self.level_weight < LEVEL_TELLS:
             return np.ones(len(raw), bool)
@@ -106,7 +109,7 @@ class Remains:
 
     @property
     def law(self) -> RemainsLaw | None:
-        """The law, if the traces surely have remains."""
+        """The law, or None if the remainders are not significant."""
         sure = self.fit.law.rate_khz > SURE * self.fit.rate_error_khz
         return self.fit.law if sure and self.fit.gain_of_law > SURE_GAIN else None
 
@@ -118,24 +121,25 @@ class Remains:
         decay_us: float | None = None,
         most: int = MOST,
     ) -> Remains:
-        """Measure the remains under raw traces, and fit their law.
+        """Measure the remainders under raw traces and fit their law.
 
         Parameters
         ----------
         blocks
-            Measured traces of one channel with their energies, any mixture of peaks.
+            Measured traces of one channel with their energies, from any mixture of peaks.
         config
-            How they are prepared.
+            Preparation settings.
         decay_us
-            Of the preamplifier, if it is known; else large remains tell it, or, if there are
-            none, the tails of the pulses.
+            Decay time of the preamplifier in us, if known. Otherwise it is taken from large
+            remainders or, if there are none, from the tails of the pulses.
         most
-            Traces that are looked at.
+            Maximum number of traces to use.
 
         Raises
         ------
         CpunetError
-            If baselines are too short, energies are not known, or too few traces can be used.
+            If the baselines are too short, the energies are unknown, or too few traces can
+            be used.
         """
         seen = _gathered(blocks, config, most)
         decay = decay_us or seen.tail_decay_us
@@ -179,7 +183,15 @@ class Remains:
         )
 
     def measure(self, raw: Pulses) -> FloatArray:
-        """What is left at the first sample of raw traces in keV, NaN where that is not told."""
+        r"""Remainder at the first sample of raw traces in keV; NaN where undetermined.
+
+        It is the weighted mean of the remainders from slope and level,
+
+        .. math:: A = (1 - w)\, A_{\mathrm{slope}} + w\, \frac{\bar{b} - b_0}{\bar{e}},
+
+        with the mean :math:`\bar{b}` of the baseline, the level :math:`b_0` of an empty one and
+        the mean :math:`\bar{e}` of :math:`e^{-t/\tau}` over the baseline.
+        """
         baselines = np.asarray(raw.waveforms[:, : self.samples], float)
         mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
         kev = (1 - self.level_weight) * left / self.adc_per_kev
@@ -192,9 +204,10 @@ class Remains:
         return np.where(width <= self.widest_adc, kev, np.nan)
 
     def describe(self) -> dict[str, Any]:
-        """What is told of them: the law's number, its error, and shares by size.
+        """Summary: the rate, its error, and fractions of traces above several thresholds.
 
-        The shares of the traces measured hold what the error makes; those of the law do not.
+        The measured fractions include the effect of the measurement error. Those of the law
+        do not.
         """
         told = self.kev[np.isfinite(self.kev)]
         law, surely = self.fit.law, self.law is not None
@@ -219,7 +232,7 @@ class Remains:
         }
 
     def subtracted_from(self, raw: Pulses) -> Pulses:
-        """The traces without their remains; those whose remainder is not known stay."""
+        """Traces with their remainders subtracted; unchanged where these are undetermined."""
         decay = _shape(raw.length, self.dt_ns, self.decay_us)
         heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
         less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
@@ -228,7 +241,7 @@ class Remains:
 
 @dataclass(frozen=True, eq=False)
 class _Gathered:
-    """What is kept of traces: their first samples and numbers."""
+    """What is kept of the traces: their first samples and scalar properties."""
 
     baselines: FloatArray
     energy_kev: FloatArray
@@ -267,8 +280,8 @@ def _gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) ->
 
 
 def _require_empty(fit: RateFit) -> None:
-    """Raise a `CpunetError` if there is no empty baseline to tell anything from."""
-    # no curvature where there is a rate: the fit has not found the level of empty baselines
+    """Raise a `CpunetError` if no baseline is empty, so that there is no reference level."""
+    # no curvature despite a rate: the fit did not find the level of empty baselines
     blind = fit.law.expected > LEAST_EXPECTED and not fit.rate_error_khz > 0
     if blind or float(fit.law.share_above(fit.sigma_kev)) > MOST_FULL:
         raise CpunetError(
@@ -278,7 +291,7 @@ def _require_empty(fit: RateFit) -> None:
 
 
 def _length(raw: Pulses, prepared: Prepared, config: PreparationConfig) -> int:
-    """How many first samples precede nearly all pulses."""
+    """Number of initial samples that precede nearly all pulses."""
     if len(prepared) < FEWEST:
         raise CpunetError(
             f"only {len(prepared)} of {len(raw)} traces can be prepared "
@@ -296,13 +309,13 @@ def _length(raw: Pulses, prepared: Prepared, config: PreparationConfig) -> int:
 
 
 def _reasons(prepared: Prepared) -> str:
-    """Why traces cannot be prepared; by reason."""
+    """Counts of the reasons why traces cannot be prepared."""
     told = [f"{n} {reason}" for reason, n in prepared.rejections.items()]
     return ", ".join(told) or "there are no more"
 
 
 def _gain(ratios: FloatArray) -> float:
-    """ADC counts per keV of the pulses' heights."""
+    """Gain in ADC counts per keV from the heights of the pulses."""
     known = ratios[np.isfinite(ratios) & (ratios > 0)]
     if len(known) < FEWEST:
         raise CpunetError(
@@ -313,7 +326,7 @@ def _gain(ratios: FloatArray) -> float:
 
 
 def _tail_decay_us(slopes: FloatArray) -> float:
-    """Of the tails of pulses."""
+    """Decay time in us of the tails of pulses."""
     slope = float(np.median(slopes))
     if not slope < 0:
         raise CpunetError(
@@ -324,14 +337,42 @@ def _tail_decay_us(slopes: FloatArray) -> float:
 
 
 def _shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:
-    """What a remainder of 1 at the first sample becomes, shape ``(length,)``."""
+    """Decay of a remainder that is 1 at the first sample, shape ``(length,)``."""
     return np.asarray(np.exp(-np.arange(length) * dt_ns * 1e-3 / decay_us), float)
 
 
 def read_baselines(
     baselines: FloatArray, dt_ns: float, decay_us: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean of each baseline, the remainder that its tilt shows, and the RMS about it."""
+    r"""Mean of each baseline, the remainder from its tilt, and the residual RMS.
+
+    The remainder is the least-squares height :math:`A` of
+
+    .. math:: b_j = c + A e^{-t_j / \tau},
+
+    with a free level :math:`c`. Its height refers to the first sample.
+
+    Parameters
+    ----------
+    baselines
+        First samples of the traces, shape ``(n, samples)``.
+    dt_ns
+        Sampling period in ns.
+    decay_us
+        Decay time in us.
+
+    Returns
+    -------
+    tuple of array
+        Mean, remainder and RMS in the units of the baselines, each of shape ``(n,)``.
+
+    Examples
+    --------
+    >>> tail = 100 + 7 * np.exp(-np.arange(500) * 0.016 / 50)
+    >>> _, left, width = read_baselines(tail[np.newaxis], 16.0, 50.0)
+    >>> round(float(left[0]), 6), bool(width[0] < 1e-9)
+    (7.0, True)
+    """
     shape = _shape(baselines.shape[1], dt_ns, decay_us)
     lever = shape - shape.mean()
     with np.errstate(invalid="ignore", over="ignore"):
@@ -342,7 +383,7 @@ def read_baselines(
 
 
 def _widest(width: FloatArray) -> float:
-    """The RMS beyond which there is another pulse in a baseline."""
+    """RMS beyond which a baseline holds another pulse."""
     finite = width[np.isfinite(width)]
     if len(finite) < FEWEST:
         raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
@@ -352,7 +393,7 @@ def _widest(width: FloatArray) -> float:
 
 
 def _mode(values: FloatArray) -> float:
-    """The densest place of a one-sided distribution: by halving its shortest half."""
+    """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
     ordered = np.sort(values)
     while len(ordered) > 8:
         half = len(ordered) // 2
@@ -364,13 +405,13 @@ def _mode(values: FloatArray) -> float:
 
 
 def _lower_spread(values: FloatArray, centre: float) -> float:
-    """Standard deviation of the side below the centre, which remains leave alone."""
+    """Standard deviation of the side below the centre, which remainders do not affect."""
     below = centre - values[values <= centre]
     return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
 
 
 def _lifted(above: FloatArray, left: FloatArray) -> bool:
-    """Whether tilted baselines lie as high as their tilt says: what decays is there."""
+    """Whether tilted baselines are as high as their tilt implies, as with DC coupling."""
     if len(above) < FEWEST_LARGE:
         return False
     ratio = float(np.median(above[:, : above.shape[1] // 4].mean(axis=1) / left))
@@ -378,7 +419,7 @@ def _lifted(above: FloatArray, left: FloatArray) -> bool:
 
 
 def _own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
-    """The decay that the halves of tilted baselines show, and its error."""
+    """Decay time from the two halves of tilted baselines, and its error, in us."""
     half = above.shape[1] // 2
     first, second = above[:, :half].mean(axis=1), above[:, half : 2 * half].mean(axis=1)
     whole = (first > 0) & (second > 0)

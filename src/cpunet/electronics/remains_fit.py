@@ -1,13 +1,13 @@
-"""The rate of earlier pulses from what they left under many traces: a likelihood fit.
+"""Likelihood fit of the rate of earlier pulses to the remainders under many traces.
 
-What is measured of each trace is its remainder and an error, about the level of a baseline
-without any.  The law's density, blurred by that error, is known, so that rate, level and error
-follow together.  Real noise is no Gaussian: the side below 0, which remains leave alone, shows
-its wings, which would be taken for small remains otherwise.
+Each trace contributes one measured remainder with an error, relative to the level of an empty
+baseline. The density of the law, convolved with the error, is known. Rate, level and error are
+therefore fitted together. Real noise is not Gaussian: its wings would be mistaken for small
+remainders. They are determined from the side below 0, which remainders do not affect.
 
-The energies are those of the file, or, where these cannot be (as of a file that holds a few
-gamma lines only), a log-normal spectrum up to the highest of them, which the remains
-themselves tell.
+The energies are those of the file. Where these cannot describe the rate (for example, in a file
+with a few gamma lines only), they follow a log-normal spectrum up to the maximum energy, which
+is fitted to the remainders.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ from cpunet.electronics.remains_law import RemainsLaw, characteristic_exponents
 
 Function = Callable[[FloatArray], float]
 
-# Energies that a spectrum is made of, from the lowest that leave anything to be seen.
+# Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
-QUANTILES = 41  # of the spectrum that is given out
+QUANTILES = 41  # quantiles of the returned spectrum
 GRID = 16384  # points of the density
 STEPS_OF_SIGMA = 4.0
-OUTLIERS = 2e-3  # share of traces that no law has to explain
-# A spectrum that is learned has two parameters more, so much must the likelihood gain.
+OUTLIERS = 2e-3  # fraction of traces that the law need not explain
+# Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
 WORTH = 5.0
-# Of the noise at most, in wings that are wider than the rest, and traces to tell these.
+# Maximum fraction of the noise in its wings, and minimum number of traces to determine them.
 MOST_WINGS, FEWEST_BELOW = 0.5, 100
-# Start and width of the priors: of the median energy and the spectrum's width, in logarithms.
+# Mean and width of the priors on the logarithms of the median energy and of the spectral width.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 
 
 @dataclass(frozen=True, eq=False)
 class RateFit:
-    """What a set of remains says of their law.
+    """Result of a fit of the law to a set of remainders.
 
     Parameters
     ----------
     law, rate_error_khz
-        The law, and the error of its rate.
+        The law, and the standard error of its rate in kHz.
     level_kev, sigma_kev
-        Where a trace without any remainder lies, and the spread of traces about it.
+        Level of an empty baseline and spread of traces about it, in keV.
     recorded
-        Whether the law has the energies of the file, and not a spectrum learned.
+        Whether the law uses the energies of the file rather than a fitted spectrum.
     gain_of_law
-        Logarithm of the likelihood above that of no remains at all.
+        Log-likelihood relative to that without any remainders.
     """
 
     law: RemainsLaw
@@ -65,18 +65,25 @@ class RateFit:
 def fit_rate(
     kev: FloatArray, sigma_kev: float, decay_us: float, energies_kev: FloatArray
 ) -> RateFit:
-    """Fit rate, level and error to measured remains.
+    r"""Fit rate, level and error to measured remainders.
+
+    The log-likelihood of the remainders :math:`x_i` is
+
+    .. math:: \ln L = \sum_i \ln\left[(1 - \epsilon)\, p(x_i) + \epsilon u\right],
+
+    where :math:`p` is the density of the law convolved with the noise and :math:`u` a uniform
+    density for a small fraction :math:`\epsilon` of outliers.
 
     Parameters
     ----------
     kev
-        Measured remains, of about 0 where there are none.
+        Measured remainders in keV, near 0 for empty baselines.
     sigma_kev
-        A first guess of their error.
+        Initial estimate of their standard deviation in keV.
     decay_us
-        Of the tails.
+        Decay time of the tails in us.
     energies_kev
-        Of the file's pulses.
+        Energies of the pulses of the file in keV.
     """
     known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
     highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
@@ -102,7 +109,7 @@ def fit_rate(
 
 
 class _Likelihood:
-    """Of remains, as a function of rate, level, error and spectrum."""
+    """Likelihood of the remainders as a function of rate, level, error and spectrum."""
 
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
         self.kev, self.sigma, self.energies = kev, sigma_kev, energies
@@ -127,7 +134,7 @@ class _Likelihood:
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
     def without(self) -> float:
-        """The highest of traces that differ by their error alone."""
+        """Maximum log-likelihood without any remainders."""
         weights = np.zeros(len(self.energies))
         spread = max(float(self.kev.std()), self.sigma)
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
@@ -136,7 +143,7 @@ class _Likelihood:
 
 
 def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
-    """Share and relative width of a second, wider Gaussian that the side below 0 asks for."""
+    """Fraction and relative width of a second, wider Gaussian fitted to the side below 0."""
     below = kev[kev < 0]
 
     def cost(vector: FloatArray) -> float:
@@ -158,7 +165,7 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The best law with some kind of spectrum."""
+    """Best-fit law for one kind of spectrum."""
 
     likelihood: _Likelihood
     fixed: FloatArray | None
@@ -190,12 +197,12 @@ class _Candidate:
 
     @property
     def weights(self) -> FloatArray:
-        """Of the energies."""
+        """Weights of the energies."""
         return _weights(self.likelihood.energies, self.fixed, self.vector)
 
     @property
     def expected(self) -> tuple[float, float]:
-        """Pulses in a decay time, and the error."""
+        """Expected number of pulses per decay time, and its standard error."""
         expected = float(np.exp(self.vector[0]))
         curvature = _curvature(
             lambda v: -_value(self.likelihood, self.fixed, v), self.vector, self.likelihood
@@ -246,14 +253,14 @@ def _curvature(function: Function, at: FloatArray, likelihood: _Likelihood) -> F
 
 
 def _edges(energies: FloatArray) -> FloatArray:
-    """Of bins about the logarithms of energies, the outer ones open."""
+    """Edges of bins around the logarithms of the energies; the outer bins are open."""
     logs = np.log(energies)
     inner = 0.5 * (logs[1:] + logs[:-1])
     return np.concatenate([[-np.inf], inner, [np.inf]])
 
 
 def _quantiles(energies: FloatArray, weights: npt.NDArray[np.float64]) -> tuple[float, ...]:
-    """Evenly spaced quantiles of a spectrum."""
+    """Quantiles of a spectrum, evenly spaced in probability."""
     edges = _edges(energies)
     edges[[0, -1]] = np.log(energies[[0, -1]])
     share = np.concatenate([[0.0], np.cumsum(weights)]) / weights.sum()

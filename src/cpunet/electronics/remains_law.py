@@ -1,15 +1,19 @@
-r"""What earlier pulses leave of themselves under a trace, as a law with one number: their rate.
+r"""Distribution of the tails that earlier pulses leave under a trace.
 
-Pulses come at random, at a rate R, with energies E of a spectrum; each decays with a time
-:math:`\tau`. One alone leaves more than x if it came at most :math:`\tau \ln(E/x)` ago, so that
+Pulses arrive at random with a rate :math:`R` and energies :math:`E` from a spectrum. Each
+decays with a time constant :math:`\tau`. A single pulse leaves more than :math:`x` if it
+arrived at most :math:`\tau \ln(E/x)` ago. Therefore
 
 .. math:: P(>x) = 1 - \exp(-R \tau \langle \max(0, \ln(E/x)) \rangle)
 
-is the share of traces with a single remainder above x. What is left of all of them together is
-shot noise (Campbell 1909), whose characteristic function has an exponent in closed form,
+is the fraction of traces with at least one remainder above :math:`x`. The sum of all
+remainders is shot noise (Campbell 1909). The logarithm of its characteristic function is
 
 .. math:: \ln \varphi(u) = R \tau \left\langle \int_0^E \frac{e^{iux} - 1}{x} dx \right\rangle
     = R \tau \left\langle i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE) \right\rangle .
+
+"Remains" are these tails; a "remainder" is their height under one trace. The only free
+parameter of the law is the rate.
 """
 
 from __future__ import annotations
@@ -24,10 +28,10 @@ import scipy.special
 
 from cpunet.electronics.exponentials import FloatArray
 
-# After so many decay times nothing is left that noise would not hide: 0.02 keV of 2615.
+# After this many decay times the remainder is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
 _LEAST_KEV = 1e-3
-_ENERGIES = 64  # of a spectrum, in sums over it
+_ENERGIES = 64  # energies that represent a spectrum in sums over it
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +41,12 @@ class RemainsLaw:
     Parameters
     ----------
     rate_khz
-        Of the pulses.
+        Rate of the pulses in kHz.
     decay_us
-        Of their tails.
+        Decay time of their tails in us.
     energies_kev
-        Quantiles of their energies, evenly spaced from the lowest to the highest; between
-        them the logarithm is taken as linear.
+        Quantiles of their energies in keV, evenly spaced in probability from the minimum to
+        the maximum. The logarithm is interpolated linearly between them.
 
     Examples
     --------
@@ -57,16 +61,27 @@ class RemainsLaw:
 
     @property
     def expected(self) -> float:
-        """Pulses within a decay time."""
+        r"""Expected number of pulses per decay time, :math:`R \tau`."""
         return self.rate_khz * 1e-3 * self.decay_us
 
     @property
     def mean_kev(self) -> float:
-        """Mean of what is left, by Campbell's theorem."""
+        r"""Mean remainder in keV, :math:`R \tau \langle E \rangle` (Campbell's theorem)."""
         return self.expected * float(_some(self.energies_kev).mean())
 
     def share_above(self, kev: npt.ArrayLike) -> FloatArray:
-        """Share of traces on which one earlier pulse leaves more than `kev`."""
+        r"""Fraction of traces on which a single earlier pulse leaves more than `kev`.
+
+        .. math:: P(>x) = 1 - \exp(-R \tau \langle \max(0, \ln(E/x)) \rangle)
+
+        Examples
+        --------
+        With a single energy, :math:`x = E/e` lies one decay time back.
+
+        >>> law = RemainsLaw(1.0, 100.0, (300.0, 300.0))
+        >>> bool(abs(law.share_above(300.0 / np.e) - (1 - np.exp(-0.1))) < 1e-12)
+        True
+        """
         ratio = _some(self.energies_kev) / np.asarray(kev, float)[..., np.newaxis]
         lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
         return np.asarray(-np.expm1(-self.expected * lives), float)
@@ -74,19 +89,30 @@ class RemainsLaw:
     def density(
         self, step_kev: float, n: int, sigma_kev: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Density of a measured remainder, of all pulses together, per keV.
+        r"""Probability density of a measured remainder, summed over all pulses, per keV.
+
+        .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du
 
         Parameters
         ----------
         step_kev, n
-            Of the grid, of which the first quarter lies below 0.
+            Step in keV and number of points of the grid. Its first quarter lies below 0.
         sigma_kev
-            Standard deviation of the measurement, a few steps of the grid or more.
+            Standard deviation of the measurement in keV, at least a few steps of the grid.
 
         Returns
         -------
         tuple
-            Values in keV, and the density there, both of shape ``(n,)``.
+            Values in keV and the density at them, both of shape ``(n,)``.
+
+        Examples
+        --------
+        Its mean is that of Campbell's theorem.
+
+        >>> law = RemainsLaw(1.0, 100.0, (300.0, 300.0))
+        >>> kev, density = law.density(1.0, 4096, 5.0)
+        >>> round(float(kev @ density), 2), round(law.mean_kev, 2)
+        (30.0, 30.0)
         """
         u = 2 * np.pi * scipy.fft.rfftfreq(n, step_kev)
         per_pulse = characteristic_exponents(u, _some(self.energies_kev)).mean(axis=1)
@@ -98,7 +124,7 @@ class RemainsLaw:
         return kev, np.asarray(np.maximum(density, 0.0), float)
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw what is left in keV, of all earlier pulses together, for `n` traces."""
+        """Draw the remainder in keV, summed over all earlier pulses, for `n` traces."""
         row, kev, before_us = earlier_pulses(
             n, self.rate_khz, LIFETIMES * self.decay_us, self.energies_kev, rng
         )
@@ -109,12 +135,28 @@ class RemainsLaw:
 def characteristic_exponents(
     u: FloatArray, energies_kev: FloatArray
 ) -> npt.NDArray[np.complex128]:
-    """Logarithm of the characteristic function at `u` (1/keV), per expected pulse.
+    r"""Logarithm of the characteristic function per expected pulse.
+
+    .. math:: \int_0^E \frac{e^{iux} - 1}{x} dx = i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE)
+
+    Parameters
+    ----------
+    u
+        Arguments in 1/keV.
+    energies_kev
+        Pulse energies in keV.
 
     Returns
     -------
     array
-        For pulses of each energy, shape ``(len(u), len(energies_kev))``.
+        Complex, shape ``(len(u), len(energies_kev))``.
+
+    Examples
+    --------
+    To first order it is :math:`iuE`.
+
+    >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
+    [[0.001]]
     """
     phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
     sine, cosine = scipy.special.sici(phase)
@@ -128,13 +170,24 @@ def earlier_pulses(
     energies_kev: Sequence[float],
     rng: np.random.Generator,
 ) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
-    """Draw pulses by a Poisson process within a time, for each of `n` traces.
+    """Draw pulses of a Poisson process within a time interval, for each of `n` traces.
+
+    Parameters
+    ----------
+    n
+        Number of traces.
+    rate_khz, longest_us
+        Rate in kHz and length of the interval in us.
+    energies_kev
+        Quantiles of the energies in keV, see `RemainsLaw`.
+    rng
+        Random generator.
 
     Returns
     -------
     tuple
-        Which trace each belongs to, its energy in keV, and its time in us, from 0 to
-        `longest_us`; all of shape ``(pulses,)``.
+        Index of the trace, energy in keV and time in us (0 to `longest_us`) of each pulse,
+        all of shape ``(pulses,)``.
     """
     counts = rng.poisson(rate_khz * 1e-3 * longest_us, size=n)
     row = np.repeat(np.arange(n), counts)
@@ -143,12 +196,15 @@ def earlier_pulses(
 
 
 def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
-    """Energies in keV below which a `share` of a spectrum lies, given its quantiles."""
+    """Energies in keV below which a fraction `share` of a spectrum lies.
+
+    The spectrum is given by its quantiles, see `RemainsLaw`.
+    """
     logs = np.log(np.maximum(np.asarray(energies_kev, float), _LEAST_KEV))
     at = np.linspace(0, 1, len(logs))
     return np.asarray(np.exp(np.interp(share, at, logs)), float)
 
 
 def _some(energies_kev: Sequence[float]) -> FloatArray:
-    """Equally likely energies that stand for the spectrum."""
+    """Equally probable energies that represent the spectrum."""
     return energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, energies_kev)

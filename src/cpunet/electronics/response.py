@@ -1,4 +1,4 @@
-"""Charge pulses through the chain, exactly: what the digitiser would see without noise."""
+"""Exact response of the chain to charge pulses: digitiser samples without noise."""
 
 from __future__ import annotations
 
@@ -18,30 +18,47 @@ from cpunet.pulses.container import Pulses
 def respond(
     pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
 ) -> npt.NDArray[np.float32]:
-    """The noise-free traces of charge pulses, in units of the full charge.
+    r"""Noise-free traces of charge pulses, in units of the full charge.
 
-    Each sample of a pulse is taken as the charge during its period, which the chain's
-    exponentials follow without approximation; the digitiser's samples are means over its
-    own period.  Before a pulse there is no charge; after its last sample it stays.
+    Each sample of a pulse :math:`q` is the constant charge during its period. The chain's
+    exponentials follow it without approximation. A digitiser sample is the mean over the
+    digitiser's own period :math:`\Delta t`,
+
+    .. math:: s_k = \frac{1}{\Delta t} \int_{k \Delta t}^{(k+1) \Delta t} (h * q)(t)\,dt,
+
+    with the impulse response :math:`h` of the chain. The charge is zero before a pulse and
+    constant after its last sample.
 
     Parameters
     ----------
     pulses
-        Ideal pulses, 0 to 1, with energies; their period must divide the digitiser's.
+        Ideal pulses from 0 to 1 with energies. Their sampling period must divide that of the
+        digitiser.
     electronics
-        The chain.
+        The readout chain.
     shift_ns
-        How much later than `n_pre` samples each pulse begins; ``(n,)`` or a number, in ns.
+        Start of each pulse after `n_pre` samples, in ns; shape ``(n,)`` or a number.
 
     Returns
     -------
     array
-        Float32 of shape ``(n, electronics.length)``.
+        Float32, shape ``(n, electronics.length)``.
 
     Raises
     ------
     CpunetError
         If the pulses are sampled too coarsely for the chain, hold NaN, or lack energies.
+
+    Examples
+    --------
+    A step through one pole without decay approaches the full charge.
+
+    >>> from cpunet.electronics.presets import read_electronics
+    >>> step = Pulses.of(np.ones((1, 10)), dt_ns=4, energy_kev=[1592.5])
+    >>> chain = read_electronics("legend200")
+    >>> trace = respond(step, chain)[0]
+    >>> trace.shape, bool(trace[: chain.n_pre].any())
+    ((1400,), False)
     """
     linear = linear_response(pulses, electronics, shift_ns)
     if electronics.non_linearity is None:
@@ -57,7 +74,7 @@ def required_energy_kev(pulses: Pulses) -> FloatArray:
     Raises
     ------
     CpunetError
-        If one is not known or not above 0.
+        If an energy is unknown or not positive.
     """
     bad = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
     if bad.any():
@@ -72,14 +89,14 @@ def required_energy_kev(pulses: Pulses) -> FloatArray:
 def linear_response(
     pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
 ) -> FloatArray:
-    """As `respond`, by the linear part of the chain alone, in float64."""
+    """Response of the linear part of the chain, as `respond` but in float64."""
     per_sample = _fine_per_sample(pulses, electronics)
     n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
     shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
     start = electronics.n_pre * dt + shift
     first = np.floor(start / dt).astype(np.int64)
     phase = start - first * dt
-    # where in a fine sample the digitiser's clock ticks, and in which one it does so first
+    # position of the first clock tick within a fine sample, and the index of that sample
     tick = np.mod(-phase, fine)
     first_tick = np.rint((dt - phase - tick) / fine).astype(np.int64)
     transfer = electronics.transfer
@@ -99,7 +116,28 @@ def linear_response(
 
 
 def distorted(signal_kev: FloatArray, figures: NonLinearity, dt_ns: float) -> FloatArray:
-    """Signals in keV, shape ``(n, samples)``, as a chain that is not linear gives them."""
+    r"""Apply the non-linearity of the chain to signals.
+
+    .. math:: s' = s\,(1 + q s / E_0), \qquad |s_k - s_{k-1}| \le v\,\Delta t,
+
+    with the quadratic fraction :math:`q`, :math:`E_0 = 2614.5` keV and the slew rate
+    :math:`v`, which is applied first.
+
+    Parameters
+    ----------
+    signal_kev
+        Signals in keV, shape ``(n, samples)``.
+    figures
+        The non-linearity.
+    dt_ns
+        Sampling period in ns.
+
+    Examples
+    --------
+    >>> quadratic = NonLinearity(quadratic_fraction=0.01, slew_kev_per_ns=None)
+    >>> distorted(np.array([[0.0, 2614.5]]), quadratic, 16.0).round(3).tolist()
+    [[0.0, 2640.645]]
+    """
     if figures.slew_kev_per_ns is not None:
         signal_kev = _slewed(signal_kev, figures.slew_kev_per_ns * dt_ns)
     return signal_kev * (1 + figures.quadratic_fraction * signal_kev / REFERENCE_KEV)
@@ -127,10 +165,10 @@ def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
 
 
 def _steps(poles: ComplexArray, h_ns: FloatArray) -> ComplexArray:
-    """Factors of steps of `h_ns`, shape ``(steps, poles, 3)``, under a constant input.
+    """Propagation factors over steps of `h_ns` at constant input.
 
-    For ``y' = p y + x``: y gains ``e y + a x`` (with ``e = exp(p h) - 1``), and its integral
-    over the step is ``a y + b x``.
+    The shape is ``(steps, poles, 3)``. For ``y' = p y + x``, y changes by ``e y + a x`` with
+    ``e = exp(p h) - 1``, and its integral over the step is ``a y + b x``.
     """
     h = h_ns[:, None]
     gain = np.expm1(poles * h)
@@ -168,7 +206,7 @@ def _follow(
     per_sample: int,
     traces: Any,
 ) -> None:  # pragma: no cover - compiled
-    """Fill each trace: fine steps as long as charge moves, then whole samples."""
+    """Fill each trace: fine steps while charge moves, then whole samples."""
     n_fine, length = pulses.shape[1], traces.shape[1]
     for i in prange(len(pulses)):
         state = np.zeros(len(weights), np.complex128)

@@ -1,1 +1,1 @@
-"""From energy deposits to charge pulses: hits, detector, fields, drift, signals."""
+"""From energy deposits to charge pulses: hits, detector, fields, drift and signals."""

@@ -1,4 +1,4 @@
-"""The same hits again, with other physics: what a calibration of a detector is made of."""
+"""Repeated simulation of the same hits with other physics, as a calibration needs it."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
 
-# Of quick pulses; merged within 0.2 mm, what self-repulsion changes is off by 15 %.
+# For quick pulses. Merging within 0.2 mm changes the effect of self-repulsion by 15 %.
 _QUICK_MERGING_MM, _QUICK_STRIDE = 0.1, 4
-# Detectors of other shapes, as with another lithium layer, whose potentials are kept.
+# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are kept.
 _MOST_SHAPES = 4
 
 
 class SameHits:
-    """Hits of some events, to be simulated again and again with other physics.
+    """Hits of a set of events, for repeated simulation with other physics.
 
-    Another temperature, bias, scale or tilt of the impurities, velocity, cloud or trapping
-    takes no new solution of the fields.  Another shape of the active germanium, such as
-    another ``li_thickness``, takes one (seconds, then cached) and merges the hits anew.
+    Another temperature, bias, velocity, cloud or trapping, or another scale or tilt of the
+    impurities, needs no new solution of the fields. Another shape of the active germanium,
+    such as another ``li_thickness``, needs one (seconds, then cached) and merges the hits
+    anew.
 
     Parameters
     ----------
     hits
-        Events, in the crystal's frame; merged or not.
+        Events in the frame of the crystal, merged or not.
     cluster_mm
-        Hits nearer than this are merged, see `cpunet.simulation.clustering.merge_hits`;
-        0 for hits that are merged already, as those kept beside simulated pulses.
+        Distance in mm within which hits are merged, see
+        `cpunet.simulation.clustering.merge_hits`. 0 for hits that are merged already, such as
+        those stored with simulated pulses.
 
     Examples
     --------
@@ -57,21 +59,21 @@ class SameHits:
         *,
         mode: Literal["exact", "quick", "library"] = "exact",
     ) -> EventPulses:
-        """The events' pulses with the physics of `detector` and `settings`.
+        """Pulses of the events with the physics of `detector` and `settings`.
 
         Parameters
         ----------
         detector, settings
-            The physics.
+            Detector and simulation settings.
         mode
-            ``"exact"`` and ``"library"`` as in `simulate_events`.  ``"quick"``: more hits
-            merged and longer steps, for differences between two physics; its errors are
-            nearly the same in both.  See docs/simulation.md for how good and how fast.
+            ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` merges more hits
+            and takes longer steps, for differences between two sets of physics: its errors
+            are nearly equal in both. See docs/simulation.md for accuracy and speed.
 
         Raises
         ------
         CpunetError
-            If the detector is not depleted, or a hit is no finite number.
+            If the detector is not depleted, or a hit is not finite.
         """
         solution, hits, fewer, repelling = self._of(detector)
         fields = superposed_fields(
@@ -93,8 +95,8 @@ class SameHits:
     def _of(self, detector: Detector) -> tuple[Superposition, Hits, Hits, float]:
         """Potentials of a detector, its hits, and its hits merged more coarsely.
 
-        These repel themselves more: the last number is the factor that undoes it on
-        average.
+        Coarser hits repel themselves more strongly. The last value is the factor that
+        compensates for this on average.
         """
         key = detector.fingerprint(exclude=NOT_IN_PARTS)
         if key not in self._shapes:
@@ -102,7 +104,7 @@ class SameHits:
             fine = merge_hits(self._hits, detector, distance)
             coarse = merge_hits(fine, detector, max(_QUICK_MERGING_MM, distance))
             if len(self._shapes) == _MOST_SHAPES:
-                # not the first, to which all others are compared
+                # keep the first, with which all others are compared
                 del self._shapes[list(self._shapes)[1]]
             repelling = (fine.edep_kev**2).sum() / max((coarse.edep_kev**2).sum(), 1e-9)
             self._shapes[key] = solve(detector), fine, coarse, float(repelling)

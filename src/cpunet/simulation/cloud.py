@@ -1,7 +1,7 @@
-"""The charge cloud: its growth on the way of the holes, and what it does to the pulse.
+"""Growth of the charge cloud along the path of the holes, and its effect on the pulse.
 
-The cloud is a Gaussian whose width follows the holes' path; the pulse of a point charge
-is smeared by the time the cloud needs to pass into the contact.
+The cloud is a Gaussian whose width evolves along the path of the holes. The pulse of a point
+charge is convolved with a Gaussian as long as the cloud takes to enter the contact.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cpunet.kernels import kernel
 FloatArray = npt.NDArray[np.float64]
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-# siggen's rounded value, in all that is compared with it
+# siggen's rounded value, in everything that is compared with it
 _SIGGEN_FWHM_PER_SIGMA = 2.355
 # 2.355**2 times 0.12 V mm/cm, rounded there
 _SIGGEN_DIFFUSION = 0.67
@@ -27,10 +27,29 @@ _CUT_FWHM = 2.0
 
 
 def diffusion_constant(chosen: float | str, temperature_K: float) -> float:
-    """Growth of FWHM**2 / 2 per ns in units of v/E: mm2/ns over (mm/ns)/(V/cm).
+    r"""Diffusion constant of the cloud in units of v/E: mm2/ns over (mm/ns)/(V/cm).
 
-    ``chosen`` is D/(v/E) in V mm/cm, ``"temperature"`` (Einstein relation, kT/e) or
-    ``"siggen"``; see `cpunet.simulation.settings.SimulationSettings`.
+    The FWHM :math:`s` of a diffusing Gaussian cloud follows
+
+    .. math:: \frac{ds^2}{dt} = 2\, D_s, \qquad D_s = 8 \ln 2 \cdot D, \qquad
+        \frac{D}{v/E} = \frac{kT}{e} \quad \mathrm{(Einstein)},
+
+    and the function returns :math:`D_s / (v/E)`.
+
+    Parameters
+    ----------
+    chosen
+        D/(v/E) in V mm/cm, ``"temperature"`` (Einstein relation, kT/e) or ``"siggen"``; see
+        `cpunet.simulation.settings.SimulationSettings`.
+    temperature_K
+        Crystal temperature in K.
+
+    Examples
+    --------
+    At 90 K, kT/e is 7.76 mV, or 0.0776 V mm/cm.
+
+    >>> round(diffusion_constant("temperature", 90.0) / FWHM_PER_SIGMA**2, 4)
+    0.0776
     """
     if chosen == "siggen":
         return _SIGGEN_DIFFUSION
@@ -40,16 +59,33 @@ def diffusion_constant(chosen: float | str, temperature_K: float) -> float:
 
 
 def repulsion_constant(energy_kev: float) -> float:
-    """Siggen's self-repulsion constant K: ds/dt = K (dv/dE) / s**2 with s in mm.
+    r"""Self-repulsion constant :math:`K` of siggen.
 
-    Energy per electron-hole pair 0.003 keV, relative permittivity 16.
+    .. math:: \frac{ds}{dt} = \frac{K}{s^2} \frac{dv}{dE}
+
+    with the FWHM :math:`s` in mm. :math:`K` is proportional to the charge of the cloud, with
+    0.003 keV per electron-hole pair and a relative permittivity of 16.
+
+    Parameters
+    ----------
+    energy_kev
+        Energy deposit in keV.
+
+    References
+    ----------
+    D. C. Radford, siggen.
+
+    Examples
+    --------
+    >>> bool(repulsion_constant(2000.0) == 2 * repulsion_constant(1000.0))
+    True
     """
     charge = energy_kev / 0.003 / 6.241e18
     return charge * 0.67**3 * 9e13 / 16 * _SIGGEN_FWHM_PER_SIGMA**3
 
 
 def starting_fwhm_mm(fwhm_mm: float, diffusion: bool) -> float:
-    """Width of the cloud when it is set free; a growing one cannot start from zero."""
+    """Initial FWHM of the cloud in mm; above zero if it grows."""
     return max(fwhm_mm, _SMALLEST_FWHM_MM) if diffusion else fwhm_mm
 
 
@@ -65,10 +101,15 @@ def cloud_after_step(
     step_ns: float,
     step: int,
 ) -> float:
-    """FWHM (mm) of the cloud after one step; it is stretched where the charges speed up.
+    r"""FWHM (mm) of the cloud after one step.
 
-    ds/dt = D/s + R with D the diffusion and R the repulsion; long strides of a small
-    cloud are integrated as powers of s, since ds would overshoot.
+    The cloud is stretched in proportion to the speed, then grows by diffusion and repulsion,
+
+    .. math:: \frac{ds}{dt} = \frac{D}{s} + R.
+
+    Large steps of a small cloud, which would overshoot, are integrated in powers of s,
+
+    .. math:: s_{k+1}^2 = 2 D\, \Delta t + \left[s_k^2 (s_k + 3 R\, \Delta t)\right]^{2/3}.
     """
     if diffusion == 0.0 and repulsion == 0.0:
         return size
@@ -94,18 +135,24 @@ def smear_and_sample(
     weight: float,
     out: FloatArray,
 ) -> None:
-    """Add `weight` times the smeared, block-averaged signal to `out`.
+    r"""Convolve a signal with a Gaussian, average it over blocks and add it to `out`.
+
+    .. math:: o_j \leftarrow o_j + \frac{w}{n} \sum_{k=jn}^{(j+1)n-1} (g_\sigma * S)_k
 
     Parameters
     ----------
     signal
-        Pulse of a point charge, one value per step; zero before the record.
+        Pulse :math:`S` of a point charge, one value per step; zero before the record.
     per_sample
-        Steps per sample of `out`.
+        Number of steps :math:`n` per sample of `out`.
     sigma
-        Standard deviation of the Gaussian, in steps.
+        Standard deviation of the Gaussian in steps.
     last
-        Step from which on the signal keeps its value.
+        Step after which the signal is constant.
+    weight
+        Factor :math:`w` of the signal.
+    out
+        Samples to which the result is added.
     """
     reach = 0 if sigma < 0.3 else int(_CUT_FWHM * FWHM_PER_SIGMA * sigma) + 1
     kernel = _gaussian_block(per_sample, sigma, reach)
@@ -127,7 +174,7 @@ def smear_and_sample(
 
 @kernel
 def _gaussian_block(per_sample: int, sigma: float, reach: int) -> FloatArray:
-    """A Gaussian of `sigma` steps, cut at `reach`, summed over a block and normalised."""
+    """Gaussian of `sigma` steps, truncated at `reach`, summed over a block and normalised."""
     kernel = np.zeros(per_sample + 2 * reach)
     total = 0.0
     for d in range(-reach, reach + 1):

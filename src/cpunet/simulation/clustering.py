@@ -1,4 +1,4 @@
-"""Hits that lie close together merged into one, so that fewer pulses need a drift."""
+"""Merge hits that lie close together, so that fewer charges need to be drifted."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ Integers = npt.NDArray[np.int64]
 
 
 def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
-    """Merge the hits of each event that are nearer than a distance to each other.
+    r"""Merge hits of an event that are closer together than a distance.
 
-    Single linkage: hits joined by a chain of neighbours at most `distance_mm` apart
-    become one, at their energy-weighted mean position and with the sum of their energies.
+    Single linkage: hits connected by a chain of neighbours at most `distance_mm` apart become
+    one hit with the sum of their energies at their energy-weighted mean position,
+
+    .. math:: E = \sum_i E_i, \qquad \mathbf{x} = \frac{1}{E} \sum_i E_i \mathbf{x}_i.
+
     Clusters keep the order of their first hits.
 
     Parameters
@@ -28,7 +31,7 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     hits
         Events as read or simulated.
     distance_mm
-        In mm; 0 merges only hits at the same place.
+        Maximum distance between neighbours in mm. 0 merges only hits at the same position.
 
     Raises
     ------
@@ -50,11 +53,11 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
 
 
 def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
-    """Merge near hits (see `cluster_hits`), but none across the edge of the active germanium.
+    """Merge nearby hits (see `cluster_hits`), but not across the edge of the active germanium.
 
-    A hit in the lithium layer gives no signal; merged with its neighbours in the bulk it
-    would, or take theirs away: at 0.1 mm that changed the collected energy of a gamma's
-    event by 4.5 keV on average.
+    A hit in the lithium layer gives no signal. Merged with neighbours in the bulk it would
+    give one, or suppress theirs: at 0.1 mm this changed the collected energy of a gamma event
+    by 4.5 keV on average.
     """
     if distance_mm == 0:
         return hits
@@ -115,7 +118,7 @@ def _average(position: Array, energy: Array, members: Integers, row: Array) -> N
     for member in members:
         row[3] += energy[member]
     for axis in range(3):
-        # relative to the first, so that equal positions stay exactly what they are
+        # relative to the first, so that equal positions are preserved exactly
         origin = position[members[0], axis]
         shift = 0.0
         for member in members:

@@ -1,9 +1,10 @@
-"""Depletion voltage from the linearity of the potential in the bias.
+r"""Depletion voltage from the linearity of the potential in the bias.
 
-With space charge everywhere, the potential at a bias ``b`` is ``b w + u`` (`w`: 1 on the
-lithium contact; `u`: of the impurities).  That is the true potential as long as no
-pocket is left in which holes would gather, that is, no local minimum besides the
-electrodes (there, as in any place with a potential below 0, germanium is not depleted).
+With space charge everywhere, the potential at a bias :math:`b` is :math:`b w + u`, where
+:math:`w` is the potential of a unit bias on the lithium and :math:`u` that of the impurities.
+This is the true potential if it has no pocket in which holes would collect: no local minimum
+apart from the electrodes. At such a minimum, or wherever the potential is below 0, germanium
+is not depleted.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from scipy.ndimage import minimum_filter
 
 from cpunet.simulation.geometry import GERMANIUM, FloatArray, RegionArray
 
-# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is below what
-# the grid resolves
+# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
+# grid
 POCKET_DEPTH_V = 0.01
 HIGHEST_BIAS_V = 20_000.0
 _RESOLUTION_V = 0.5
@@ -24,14 +25,25 @@ _NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)
 
 
 def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
-    """Smallest bias in V at which the potential has no pocket; infinite if there is none.
+    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
 
     Parameters
     ----------
     bias, impurities
-        Potential of a unit bias and of the impurities in V, (nr, nz).
+        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
     region
-        What is at each node, as from `Detector.region`.
+        Region of each node, as from `Detector.region`.
+
+    Examples
+    --------
+    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
+
+    >>> import numpy as np
+    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
+    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
+    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
+    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
+    True
     """
     low, high = 0.0, HIGHEST_BIAS_V
     if has_pocket(high * bias + impurities, region):
@@ -61,16 +73,16 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
     minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
         region == GERMANIUM
     )
-    # deepest first: a true pocket is found at once
+    # deepest first: a true pocket is found early
     where = np.argwhere(minima)
     order = np.argsort(potential[minima])
     return any(_holds(potential, region, *map(int, where[k])) for k in order)
 
 
 def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
-    """Whether a climb of more than `POCKET_DEPTH_V` is needed to get out of a minimum.
+    """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
 
-    Floods from the minimum, lowest node first, until it finds a lower one.
+    Floods from the minimum, lowest node first, until a lower node or a contact is reached.
     """
     start = potential[row, column]
     heap = [(float(start), row, column)]

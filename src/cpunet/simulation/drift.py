@@ -1,4 +1,4 @@
-"""Drift of one electron and one hole through the field maps, step by step."""
+"""Drift of one electron and one hole through the field maps by explicit Euler steps."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from cpunet.simulation.velocity import (
     carrier_velocity,
 )
 
-# A carrier is collected where its signal can no more change by this share of full scale.
+# A carrier is collected once its signal can change by less than this fraction of full scale.
 _COLLECTED = 5e-5
-# Holes that creep along the contact's edge are collected there as well.
+# Holes that move slowly along the edge of the contact also count as collected.
 _AT_CONTACT, _CREEPING = 0.999, 2e-4
 
 
 @dataclass(frozen=True, eq=False)
 class DriftPaths:
-    """Positions (n, steps, 3) in mm of both carriers at every step, NaN after the end."""
+    """Positions (n, steps, 3) in mm of both carriers at each step; NaN after collection."""
 
     electrons: FloatArray
     holes: FloatArray
@@ -50,27 +50,42 @@ def drift(
     signal: FloatArray,
     path: FloatArray,
 ) -> tuple[int, bool, float, float, float]:
-    """Move one charge until it is collected; add what it induces to `signal`.
+    r"""Drift one charge until it is collected, and add its induced signal to `signal`.
+
+    With explicit Euler steps :math:`\mathbf{x}_{k+1} = \mathbf{x}_k + \mathbf{v}_k \Delta t`,
+    a hole (+) or electron (-) induces (Shockley-Ramo)
+
+    .. math:: S_k = \pm \sum_{j=1}^{k} e^{-(j - 1/2)\, \Delta t / \tau}
+        \left[\phi_w(\mathbf{x}_j) - \phi_w(\mathbf{x}_{j-1})\right]
+
+    with the weighting potential :math:`\phi_w` and the trapping time :math:`\tau`. Without
+    trapping this is the change of the weighting potential since the start.
 
     Parameters
     ----------
+    maps
+        Field maps and velocities.
+    carrier
+        `ELECTRON` or `HOLE`.
+    start
+        Starting point x, y, z in mm.
     step_ns, stride
-        Duration of one step, and how many short ones it stands for: it goes as far as they
-        would at a velocity that goes on changing as it did.
+        Duration of one step in ns, and the number of short steps it replaces. The velocity
+        is extrapolated linearly to the mean over these.
     cloud
-        FWHM in mm at the start (0: a point), diffusion constant D/(v/E) and repulsion
-        constant (see `cpunet.simulation.cloud`).
+        Initial FWHM in mm (0: a point), diffusion constant D/(v/E) and repulsion constant
+        (see `cpunet.simulation.cloud`).
     signal
-        Record of one value per step, to which the weighting potential gained (hole) or
-        lost (electron) is added; the caller fills the rest of the record.
+        Record with one value per step. The weighting potential gained (hole) or lost
+        (electron) is added to it, up to the end of the record.
     path
-        Positions (steps, 3) to fill, or an empty array.
+        Array for the positions (steps, 3), or an empty array.
 
     Returns
     -------
     tuple
-        Last step, whether the charge was collected, FWHM (mm) and speed (mm/ns) there,
-        and what trapped charge would have added to the signal.
+        Last step, whether the charge was collected, FWHM (mm) and speed (mm/ns) there, and
+        the signal lost to trapping.
     """
     x, y, z = start
     ahead = (stride - 1) / (2 * stride)
@@ -79,7 +94,7 @@ def drift(
     size, diffusion, repulsion = cloud
     first = last = speed = induced = 0.0
     rate = maps.trapping_per_ns[carrier]
-    # of the charge, half a step ago
+    # surviving charge, half a step earlier
     left, survival = math.exp(0.5 * rate * step_ns), math.exp(-rate * step_ns)
     n = len(signal)
     k, collected = 0, False
@@ -87,7 +102,7 @@ def drift(
         r = math.hypot(x, y)
         er, ez, wp, potential, usable = look_up(maps, r, z)
         if not usable:
-            # beyond the contact's surface: the rest of the signal comes in this step
+            # beyond the surface of a contact: the remaining signal is induced in this step
             wp = 1.0 if last > 0.3 else 0.0
             collected = True
         if k == 0:
@@ -129,7 +144,7 @@ def drift(
                     vz + ahead * (vz - uz),
                 )
             ux, uy, uz = wx, wy, wz
-        # no charge leaves through the passivated face: it slides along
+        # no charge leaves through the passivated face: it slides along the face
         x, y, z = x + vx * step_ns, y + vy * step_ns, max(z + vz * step_ns, 0.0)
         k += 1
     for later in range(k + 1, n):
@@ -144,7 +159,22 @@ def drift_paths(
     z_mm: npt.ArrayLike,
     settings: SimulationSettings,
 ) -> DriftPaths:
-    """Trajectories of both carriers from each starting point, one position per step."""
+    """Trajectories of both carriers from each starting point, one position per step.
+
+    Parameters
+    ----------
+    fields
+        Field maps of the detector.
+    x_mm, y_mm, z_mm
+        Starting points in mm.
+    settings
+        Simulation settings.
+
+    Returns
+    -------
+    DriftPaths
+        Positions (n, steps, 3) in mm of both carriers.
+    """
     start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
     maps = drift_maps(fields, settings)
     paths = np.full((2, len(start), settings.n_steps, 3), np.nan)

@@ -1,4 +1,4 @@
-"""Pulses of whole events: the sum of their hits' pulses, weighted by energy."""
+"""Pulses of whole events: sums of the pulses of their hits, weighted by energy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 # Events between two calls of `progress`.
 _BLOCK = 2000
-# Events that one thread does at a time.
+# Events per task of a thread.
 _CHUNK = 25
 # Outcomes of a hit.
 _COLLECTED, _NO_SIGNAL, _NOT_COLLECTED, _INTERPOLATED = 0, 1, 2, 3
@@ -42,16 +42,16 @@ class EventPulses:
     dt_ns
         Sampling period in ns.
     energy_kev
-        Energy deposited in each event.
+        Energy deposited in each event in keV.
     lost_kev
         Part of it in hits without a signal: in a contact or its dead layer, outside the
         crystal, or in germanium without a field.
     trapped_kev
-        Part of it whose signal is missing since charge was trapped on its way.
+        Part of it whose signal is lost to trapping.
     event_number
-        The source's own number of each event.
+        Event numbers of the source.
     counts
-        Hits and events by what became of them.
+        Numbers of hits and events by outcome.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -64,11 +64,11 @@ class EventPulses:
 
     @property
     def collected_kev(self) -> FloatArray:
-        """Energy that gives a signal: what a detector measures."""
+        """Energy in keV that gives a signal, which is what a detector measures."""
         return self.energy_kev - self.lost_kev - self.trapped_kev
 
     def pulses(self) -> Pulses:
-        """The events with a signal as `Pulses`, with the energy that is collected."""
+        """Events with a signal as `Pulses`, with their collected energies."""
         kept = self.collected_kev > 0
         return Pulses.of(
             self.waveforms[kept],
@@ -87,24 +87,36 @@ def simulate_events(
     library: Library | None = None,
     library_progress: Progress | None = None,
 ) -> EventPulses:
-    """Simulate the pulse of each event, in parallel over the events.
+    r"""Simulate the pulse of each event, in parallel over the events.
+
+    The pulse is the energy-weighted mean of the pulses :math:`S_i` of its hits,
+
+    .. math:: S = \frac{\sum_i E_i S_i}{\sum_i E_i (1 - t_i)},
+
+    over all hits with a signal, with the trapped fractions :math:`t_i`.
 
     Parameters
     ----------
+    fields
+        Field maps of the detector.
+    hits
+        Energy deposits of the events.
+    settings
+        Simulation settings.
     mode
-        ``"exact"`` drifts every hit; ``"library"`` interpolates between pre-computed
-        pulses, and drifts only hits where these were found not to be good enough.
+        ``"exact"`` drifts every hit. ``"library"`` interpolates between pre-computed pulses
+        and drifts only the hits where these are not accurate enough.
     progress
-        Called now and then with the numbers of events done and in all.
+        Called regularly with the numbers of completed events and of all events.
     library
-        Pre-computed pulses of the same fields and settings; built if not given.
+        Pre-computed pulses for the same fields and settings; built if None.
     library_progress
-        Called while they are built; see `build_library`.
+        Progress of building them; see `build_library`.
 
     Raises
     ------
     CpunetError
-        If a hit's place or energy is no finite number.
+        If the position or energy of a hit is not finite.
     """
     table = hit_table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
     if mode == "exact":
@@ -192,7 +204,7 @@ def _sum_library(
     outcome: npt.NDArray[np.int8],
 ) -> None:
     n_events, n_samples = waveforms.shape
-    # work arrays serve a chunk of events
+    # work arrays are shared by a chunk of events
     for chunk in prange((n_events + _CHUNK - 1) // _CHUNK):
         out = np.empty(n_samples)
         quick = np.empty(n_samples, np.float32)
@@ -233,7 +245,7 @@ def _add_drifted(
     signal: FloatArray,
     out: FloatArray,
 ) -> tuple[int, float]:
-    """Add the pulse of one drifted hit to `out`; its outcome and the share trapped."""
+    """Add the pulse of one drifted hit to `out`; return its outcome and trapped fraction."""
     last, arrived, fwhm, trapped = point_signal(maps, hit, cloud, times[0], times[2], signal)
     smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, hit[3], out)
     return _COLLECTED if arrived else _NOT_COLLECTED, trapped

@@ -1,4 +1,4 @@
-"""Solved potentials on disk, so that each detector is solved once."""
+"""Disk cache of solved potentials, so that each detector is solved only once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cpunet.files import written_aside
 from cpunet.simulation.grid import Grid
 from cpunet.simulation.poisson import Potentials
 
-# part of the name: what an older solver found is not taken
+# part of the file name, so that results of an older solver are not used
 SOLVER_VERSION = 2
 
 _OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
@@ -24,15 +24,15 @@ _OF_NODES = ("point_contact", "bias", "impurities", "tilt", "surface")
 
 
 def cache_file(key: str) -> Path:
-    """Where the potentials of a detector with fingerprint `key` are kept."""
+    """Cache file of the potentials of a detector with the fingerprint `key`."""
     folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
     return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
 
 
 def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
-    """Take grid, potentials and depletion voltage (V) of `key` from the cache.
+    """Load grid, potentials and depletion voltage (V) of `key` from the cache.
 
-    None if they are not there or damaged.
+    Returns None if they are missing or damaged.
     """
     try:
         file = cache_file(key)
@@ -43,7 +43,7 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
         if not (_belong_together(axes, nodes) and np.isfinite([capacitance, depletion]).all()):
             return None
     except npz_files.DAMAGED:
-        return None  # solved anew, and written over
+        return None  # solved again and overwritten
     grid = Grid(step_mm=step_mm, **axes)
     return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
 
@@ -51,7 +51,7 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
 def _belong_together(
     axes: dict[str, npt.NDArray[Any]], nodes: dict[str, npt.NDArray[Any]]
 ) -> bool:
-    """Whether all arrays are of one grid, and their values numbers: loops trust both."""
+    """Whether all arrays match one grid and are finite, as the compiled loops require."""
     n_r, n_z = len(axes["r_mm"]), len(axes["z_mm"])
     shapes = {"r_mm": (n_r,), "z_mm": (n_z,), "region": (n_r, n_z)}
     shapes |= {"r_steps": (n_r - 1, n_z), "z_steps": (n_r, n_z - 1)}
@@ -64,7 +64,7 @@ def _belong_together(
 
 
 def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
-    """Keep them in the cache, whole or not at all; a cache that cannot be written is none."""
+    """Write to the cache atomically. A cache that cannot be written is ignored."""
     arrays = {name: getattr(grid, name) for name in _OF_GRID}
     arrays |= {name: getattr(potentials, name) for name in _OF_NODES}
     arrays["capacitance_pF"] = np.array(potentials.capacitance_pF)
@@ -73,4 +73,4 @@ def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> N
         with written_aside(cache_file(key)) as aside:
             np.savez(aside, allow_pickle=False, **arrays)
     except CpunetError:
-        return  # a read-only home must not stop a simulation
+        return  # a read-only home directory must not stop a simulation

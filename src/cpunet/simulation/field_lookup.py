@@ -1,9 +1,9 @@
-"""Field maps as the drift looks them up: refined, extrapolated, bilinear in (r, z).
+"""Field maps for the drift: extrapolated, refined and interpolated bilinearly in (r, z).
 
-Nodes inside a contact carry no field; the first layers of them are extrapolated from the
-germanium, so that a contact's surface lies where the potential reaches the contact's,
-between the nodes.  Maps coarser than a tenth of a millimetre are refined by cubic
-splines: bilinear steps would flatten the weighting potential beside the contact.
+Nodes inside a contact carry no field. The first layers of them are extrapolated from the
+germanium, so the surface of a contact lies between nodes where the potential reaches that of
+the contact. Maps coarser than 0.1 mm are refined by cubic splines, because bilinear
+interpolation would flatten the weighting potential near the contact.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ BoolArray = npt.NDArray[np.bool_]
 # Columns of `DriftMaps.values`.
 E_R, E_Z, WP, POTENTIAL = range(4)
 
-# Maps are refined to steps of at most this.
+# Maximum step of refined maps.
 _FINE_MM = 0.1
-# Nodes that splines see beyond the first ones in a contact, and beyond a mirror.
+# Extrapolated nodes used by the splines inside a contact and beyond a mirror plane.
 _SPLINE_GHOSTS, _SPLINE_MIRROR = 8, 6
 
 
 class Maps(Protocol):
-    """What a drift needs of `cpunet.simulation.fields.FieldMaps`."""
+    """Attributes of `cpunet.simulation.fields.FieldMaps` that the drift needs."""
 
     @property
     def grid_mm(self) -> float: ...
@@ -52,12 +52,12 @@ class Maps(Protocol):
 
 
 class DriftMaps(NamedTuple):
-    """Field maps and velocities as the compiled loops want them.
+    """Field maps and velocities in the form the compiled loops take.
 
-    ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential
-    (V); ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, and
-    ``ditch`` (nr, nz) the nodes that stop it.  ``trapping_per_ns`` holds the rates of
-    electrons and holes.
+    ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential (V).
+    ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, ``ditch``
+    (nr, nz) the nodes that stop it. ``trapping_per_ns`` holds the trapping rates of electrons
+    and holes.
     """
 
     values: FloatArray
@@ -71,9 +71,9 @@ class DriftMaps(NamedTuple):
 
 
 def drift_maps(fields: Maps, settings: SimulationSettings) -> DriftMaps:
-    """Arrange maps for the drift: extrapolated into the contacts, refined if coarse.
+    """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
-    Of the `settings`, the factors of the velocities and the trapping matter.
+    Of the `settings`, only the velocity factors and trapping rates are used.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def drift_maps(fields: Maps, settings: SimulationSettings) -> DriftMaps:
         ],
         axis=-1,
     ).astype(np.float64)
-    # nothing drifts in the ditch, and the field jumps at its walls
+    # nothing drifts in the ditch, and the field is discontinuous at its walls
     ditch = np.asarray(fields.point_type) == DITCH
     with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
     if not with_field.any():
@@ -131,7 +131,7 @@ def _nodes_of(cells: BoolArray) -> BoolArray:
 def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
     """Values (nr, nz, 4) on a grid `parts` times finer, by bicubic splines.
 
-    The axis is a mirror, and so is z = 0 if `mirror`: the field across it is odd.
+    The axis is a mirror, as is z = 0 if `mirror`: the field across it is odd.
     """
     n = _SPLINE_MIRROR
     odd_r, odd_z = np.ones(4), np.ones(4)
@@ -150,12 +150,20 @@ def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
 def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Extrapolate linearly by one node along r and z, then around the corners.
 
+    A node next to two known ones in line becomes twice the nearer value minus the farther.
+
     Parameters
     ----------
     values
         Array of shape ``(nr, nz, ...)``.
     known
-        Boolean array (nr, nz): nodes with a value of their own.
+        Boolean array (nr, nz): nodes with a value.
+
+    Examples
+    --------
+    >>> values, known = np.array([[1.0], [2.0], [0.0]]), np.array([[True], [True], [False]])
+    >>> with_ghost_nodes(values, known)[0].ravel().tolist()
+    [1.0, 2.0, 3.0]
     """
     for _ in range(2):
         total = np.zeros_like(values)
@@ -176,7 +184,7 @@ def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, 
 
 
 def _shifted(array: npt.NDArray[Any], by: int, axis: int) -> npt.NDArray[Any]:
-    """The array whose entry i is the old entry i + by; zeros come in at the end."""
+    """Shift an array: entry i is the old entry i + by. Zeros fill the end."""
     out = np.zeros_like(array)
     n = array.shape[axis]
     target = slice(0, n - by) if by > 0 else slice(-by, n)
@@ -215,6 +223,6 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
 
 @kernel
 def in_active_volume(maps: DriftMaps, x: float, y: float, z: float) -> bool:
-    """Whether a charge set free here drifts: germanium with a field, no contact."""
+    """Whether a charge released here drifts: germanium with a field, outside contacts."""
     _, _, _, potential, usable = look_up(maps, math.hypot(x, y), z)
     return usable and 0.0 < potential < maps.bias_V

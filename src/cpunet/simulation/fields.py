@@ -16,13 +16,13 @@ _V_PER_CM = 10.0  # of 1 V / mm
 
 @dataclass(frozen=True, eq=False)
 class FieldMaps:
-    """Fields at the nodes ``r_mm`` (nr) times ``z_mm`` (nz), `grid_mm` apart.
+    """Fields at the nodes ``r_mm`` (nr) times ``z_mm`` (nz), spaced by `grid_mm`.
 
-    Maps have shape (nr, nz).  The field is E = -grad V, in V/cm, and 0 in contacts and
-    outside; on walls of the ditch it is that of the germanium.  `point_type` is 0 in the
-    point contact, 1 in the lithium contact and outside, 2 in germanium, 3 there on the
-    passivated face z = 0, 5 in the ditch, 6 and 7 in germanium beside the ditch and
-    beside a contact.
+    Maps have shape (nr, nz). The field is E = -grad V in V/cm. It is 0 in contacts and
+    outside; on the walls of the ditch it is that of the germanium. `point_type` is 0 in the
+    point contact, 1 in the lithium contact and outside, 2 in germanium, 3 in germanium on the
+    passivated face z = 0, 5 in the ditch, 6 and 7 in germanium next to the ditch and next to
+    a contact.
     """
 
     r_mm: FloatArray
@@ -41,14 +41,14 @@ class FieldMaps:
 def compute_fields(
     detector: Detector, *, cache: bool = True, progress: Progress | None = None
 ) -> FieldMaps:
-    """Solve for the fields of a fully depleted detector, or take them from the cache.
+    """Solve for the fields of a fully depleted detector, or load them from the cache.
 
     Parameters
     ----------
     detector
         Geometry, impurities and bias.
     cache, progress
-        As for `cpunet.simulation.superposition.solve`.
+        See `cpunet.simulation.superposition.solve`.
 
     Raises
     ------
@@ -74,17 +74,17 @@ def superposed_fields(
     temperature_K: float,
     depletion: bool = True,
 ) -> FieldMaps:
-    """Fields at a bias, with scaled and tilted (1e10/cm4) impurities, without solving again.
+    """Fields at a bias, with scaled and tilted impurities, from an existing solution.
 
     Parameters
     ----------
     solution
-        Of the detector.
+        Solution of the detector.
     bias_V, impurity_scale, impurity_tilt, temperature_K
-        As in `Detector`; the tilt is in 1e10/cm4.
+        As in `Detector`. The tilt is in 1e10/cm4.
     depletion
-        Without it ``depletion_V`` is left NaN: with tilted impurities or a surface charge
-        finding it takes longer than all the rest.
+        Whether to determine ``depletion_V``; NaN otherwise. With tilted impurities or a
+        surface charge this takes longer than everything else.
 
     Raises
     ------
@@ -114,11 +114,10 @@ def superposed_fields(
 def scaled_to_depletion(
     detector: Detector, *, cache: bool = True, progress: Progress | None = None
 ) -> Detector:
-    """The detector with its impurities scaled so that it depletes at the measured voltage.
+    """Detector with its impurities scaled so that it depletes at the measured voltage.
 
-    The densities that a crystal's maker measures are good to some 10 %, while the
-    depletion voltage is known to a few volts.  `cache` and `progress` are those of
-    `compute_fields`.
+    Manufacturers measure impurity densities to about 10 %, while the depletion voltage is
+    known to a few volts. `cache` and `progress` are those of `compute_fields`.
 
     Raises
     ------
@@ -137,28 +136,41 @@ def scaled_to_depletion(
 
 
 def _charged_face(detector: Detector) -> bool:
-    """Whether the field on z = 0 has a component across it."""
+    """Whether the field on z = 0 has a component normal to the face."""
     return bool(detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
 
 
 def electric_field(
     potential: FloatArray, grid: Grid, *, mirror: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """E = -grad V in V/cm: central differences, with true distances beside contacts.
+    r"""Electric field :math:`\mathbf{E} = -\nabla V` in V/cm.
+
+    Central differences are used, with the true distances next to contacts.
 
     Parameters
     ----------
     potential
-        In V, (nr, nz).
+        Potential in V, shape (nr, nz).
     grid
-        The nodes it is given on.
+        Nodes of the potential.
     mirror
-        Whether z = 0 is a mirror, as the axis always is.
+        Whether z = 0 is a mirror plane, as the axis always is.
 
     Returns
     -------
     e_r, e_z
-        (nr, nz) each; 0 in contacts.
+        Field components, shape (nr, nz) each; 0 in contacts.
+
+    Examples
+    --------
+    A potential of 100 V/mm along z is a field of -1000 V/cm.
+
+    >>> nodes = Grid(r_mm=np.arange(3.0), z_mm=np.arange(4.0), step_mm=1.0,
+    ...     region=np.full((3, 4), 2, np.int8), r_steps=np.ones((2, 4)),
+    ...     z_steps=np.ones((3, 3)))
+    >>> e_r, e_z = electric_field(np.tile(100 * nodes.z_mm, (3, 1)), nodes, mirror=False)
+    >>> bool((e_r == 0).all()), e_z[1].tolist()
+    (True, [-1000.0, -1000.0, -1000.0, -1000.0])
     """
     e_r = -_V_PER_CM * _slope(potential, grid.r_steps * grid.step_mm, grid.region)
     e_z = -_V_PER_CM * _slope(potential.T, grid.z_steps.T * grid.step_mm, grid.region.T).T
@@ -171,8 +183,8 @@ def electric_field(
 
 
 def _slope(potential: FloatArray, steps: FloatArray, region: RegionArray) -> FloatArray:
-    """Derivative along the first axis of a node's parabola through its two neighbours."""
-    # across a wall of the ditch the slope jumps: only the germanium's side counts there
+    """Derivative along the first axis of the parabola through a node and its neighbours."""
+    # across a wall of the ditch the slope jumps: only the germanium side counts there
     ditch = region == DITCH
     vacuum = ditch[:-1] & ditch[1:]
     rise = np.diff(potential, axis=0) / steps

@@ -1,7 +1,7 @@
 """The detector: crystal, contacts, impurities and bias, all validated.
 
-Cylindrical coordinates with the axis at r = 0; z = 0 is the face with the point
-contact (p+), and a bore, if any, opens at z = ``crystal_length``.
+Cylindrical coordinates have their axis at r = 0. z = 0 is the face with the point contact
+(p+). A bore, if any, opens at z = ``crystal_length``.
 """
 
 from __future__ import annotations
@@ -23,34 +23,39 @@ BoolArray = npt.NDArray[np.bool_]
 RegionArray = npt.NDArray[np.int8]
 Angle = Annotated[float, Field(ge=0, lt=90)]
 _Size = Annotated[float, Field(gt=0, le=1000)]  # mm
-_Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either way
+_Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either sign
 _Density = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
 
-# mm: surfaces that a grid line is meant to meet are met in spite of rounding
+# mm: surfaces that coincide with a grid line do so despite rounding
 _TOLERANCE = 1e-6
 
 
 class Detector(Config):
-    """A p-type detector with a point contact (ICPC, BEGe or PPC); lengths in mm.
+    r"""A p-type detector with a point contact (ICPC, BEGe or PPC); lengths in mm.
 
-    What is 0 by default is absent.  Without a ``wrap_around_radius`` the lithium
-    contact ends where the outer wall meets z = 0.  ``taper_angle_deg`` holds for the
-    outer and, unless ``inner_taper_angle_deg`` is given, for the bore's taper.
-    ``vacuum_gap`` is the distance of a grounded plane below z = 0.
+    Features whose size is 0 are absent. Without a ``wrap_around_radius`` the lithium contact
+    ends where the outer wall meets z = 0. ``taper_angle_deg`` applies to the outer taper and,
+    unless ``inner_taper_angle_deg`` is given, to that of the bore. ``vacuum_gap`` is the
+    distance of a grounded plane below z = 0.
 
-    The net impurity is, in 1e10/cm3 with z and r in cm, ``z0 + gradient z
-    + quadratic (1 - (2 z / L - 1)^2) + exponential exp(-z / exponential_length)``, times
-    ``1 + (radial_mult - 1) (r/R)^radial_power``, plus ``radial_add (r/R)^radial_power``,
-    all times ``impurity_scale``, plus ``tilt (z - L/2)``, which adds to the gradient and not
-    to the mean; it is negative for p-type germanium.
-    ``measured_depletion_V`` is what that scale can be found from (0: not known).
+    The net impurity in 1e10/cm3 is negative for p-type germanium. It is
 
-    ``siggen_conventions`` places the lithium boundary on tapers, the ditch's walls (half
-    a grid step wider) and charge in the ditch as fieldgen does, so that pulses agree with
-    siggen's.  Without them the geometry is met exactly: docs/simulation.md has the
-    difference that it makes.
+    .. math:: N = s \left[N_a(z) \left(1 + (m - 1) (r/R)^p\right) + N_r (r/R)^p\right]
+        + t\, (z - L/2),
+
+    .. math:: N_a(z) = N_0 + g z + q \left[1 - (2z/L - 1)^2\right] + N_e e^{-z/\lambda},
+
+    where :math:`s` is ``impurity_scale``, :math:`N_0` is ``impurity_z0``, :math:`g` the
+    gradient, :math:`q` the quadratic and :math:`N_e`, :math:`\lambda` the exponential term,
+    :math:`m`, :math:`N_r`, :math:`p` are ``radial_mult``, ``radial_add`` and ``radial_power``.
+    The tilt :math:`t` adds to the gradient but not to the mean. Gradient and tilt are per cm
+    of :math:`z`. ``measured_depletion_V`` (0 if unknown) can be used to determine the scale.
+
+    ``siggen_conventions`` places the lithium boundary on tapers, the walls of the ditch (half
+    a grid step wider) and the charge in the ditch as fieldgen does, so that pulses agree with
+    siggen's. Without it the geometry is exact. docs/simulation.md gives the difference.
     """
 
     name: str = ""
@@ -165,13 +170,24 @@ class Detector(Config):
     @property
     def ditch_walls(self) -> tuple[float, float, float]:
         """Inner and outer radius and depth of the ditch in mm."""
-        # fieldgen's ditch owns the nodes on its walls, half a step more on each side
+        # fieldgen's ditch includes the nodes on its walls: half a step more on each side
         extra = self.grid_mm / 2 if self.siggen_conventions and self.ditch_depth else 0.0
         outer = self.wrap_around_radius
         return outer - self.ditch_thickness - extra, outer + extra, self.ditch_depth + extra
 
     def impurity_1e10_per_cm3(self, r: npt.ArrayLike, z: npt.ArrayLike) -> FloatArray:
-        """Net impurity at `r`, `z` in mm, in 1e10/cm3; negative for p-type."""
+        """Net impurity in 1e10/cm3 at `r`, `z` in mm; negative for p-type.
+
+        See `Detector` for the equation.
+
+        Examples
+        --------
+        >>> from cpunet.simulation.geometry_readers import read_detector
+        >>> icpc = read_detector("icpc")
+        >>> profile = icpc.impurity_1e10_per_cm3(0.0, [0.0, 10.0])  # 1 cm apart
+        >>> bool(abs(np.diff(profile)[0] - icpc.impurity_gradient_1e10_per_cm4) < 1e-12)
+        True
+        """
         r, z = np.asarray(r, float), np.asarray(z, float)
         axial = (
             self.impurity_z0_1e10_per_cm3
@@ -188,11 +204,11 @@ class Detector(Config):
         return np.asarray(self.impurity_scale * total + tilt)
 
     def per_tilt_cm(self, z: npt.ArrayLike) -> FloatArray:
-        """What ``impurity_tilt_1e10_per_cm4`` is multiplied by at `z` in mm: z - L/2 in cm."""
+        """Profile of a unit tilt at `z` in mm: z - L/2 in cm."""
         return (np.asarray(z, float) - self.crystal_length / 2) / 10
 
     def inside(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
-        """Where `r`, `z` (mm) lie in the germanium, lithium layer and surfaces included.
+        """Whether `r`, `z` (mm) lie in germanium, including lithium layer and surfaces.
 
         Examples
         --------
@@ -205,7 +221,7 @@ class Detector(Config):
         return np.asarray(germanium)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
-        """Where `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
+        """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
 
         Examples
         --------
@@ -216,7 +232,7 @@ class Detector(Config):
         return np.asarray(self.region(r, z) == GERMANIUM)
 
     def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
-        """At `r`, `z` (mm): 0 point contact, 1 lithium or outside, 2 germanium, 5 ditch
+        """Region at `r`, `z` (mm): 0 point contact, 1 lithium or outside, 2 germanium, 5 ditch.
 
         Surfaces belong to the contacts and to the ditch.
         """
@@ -230,18 +246,18 @@ class Detector(Config):
         return np.where(contact, POINT_CONTACT, choices).astype(np.int8)
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
-        """A hash of all values but those of `exclude`: equal detectors, equal hash."""
+        """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""
         values = self.model_dump(mode="json", exclude=set(exclude))
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
 
     def _ditch(self, r: FloatArray, z: FloatArray, margin: float) -> BoolArray:
-        """Where the ditch is, its walls moved outwards by `margin`."""
+        """Whether a point lies in the ditch with its walls moved outwards by `margin`."""
         inner, outer, depth = self.ditch_walls
         radial = (r >= inner - margin) & (r <= outer + margin)
         return (self.ditch_depth > 0) & radial & (z <= depth + margin)
 
     def _within(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
-        """Where the crystal is (ditch included), its lithium faces moved in by `shift`."""
+        """Whether a point lies in the crystal or ditch, lithium faces moved in by `shift`."""
         bottom = np.where(r > (self.wrap_around_radius or np.inf), shift, -_TOLERANCE)
         within = (z > bottom) & (z < self.crystal_length - shift)
         within &= (r < self._outer_radius(z, shift)) & ~self._bore(r, z, shift)
@@ -265,7 +281,7 @@ class Detector(Config):
         return straight
 
     def _taper(self, depth: FloatArray, angle: float, shift: float) -> FloatArray:
-        """Radius that a taper takes off a wall already moved by `shift`, at `depth` into it."""
+        """Reduction in radius by a taper, at `depth` into it, of a wall moved by `shift`."""
         if self.siggen_conventions:  # the taper's start is moved down with the top
             extra = shift * math.tan(angle)
         else:  # the taper itself is moved along its normal
@@ -273,7 +289,7 @@ class Detector(Config):
         return np.maximum(depth * math.tan(angle) + extra, 0)
 
     def _bore(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
-        """Where the bore is, its walls moved outwards by `shift`."""
+        """Whether a point lies in the bore with its walls moved outwards by `shift`."""
         if not self.bore_length:
             return np.zeros(np.broadcast(r, z).shape, bool)
         end, bullet = self.crystal_length - self.bore_length, self.bore_bullet_radius

@@ -1,4 +1,4 @@
-"""Detectors from files: this package's YAML, siggen configurations, LEGEND metadata."""
+"""Detectors from files: YAML of this package, siggen configurations, LEGEND metadata."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ _FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
 _Z0 = "impurity_z0_1e10_per_cm3"
 
-# why a file does not give a field
+# reasons why a file does not give a field
 _Hints = dict[str, str]
 
 
 def detector_names() -> list[str]:
-    """Names of the detectors that come with the package."""
+    """Names of the preset detectors."""
     return yaml_names(_FOLDER)
 
 
 def read_detector(
     path: str | Path, overrides: Iterable[str] = (), crystal: str | Path | None = None
 ) -> Detector:
-    """Read a detector, and add or override single values.
+    """Read a detector and apply overrides.
 
     Parameters
     ----------
     path
-        One of `detector_names`; a YAML or JSON file with the fields of `Detector`; a
-        LEGEND diode (YAML or JSON, with a ``geometry``), or, by any other suffix, a
-        siggen or fieldgen configuration.
+        Name of a preset (see `detector_names`), a YAML or JSON file with the fields of
+        `Detector`, a LEGEND diode (YAML or JSON with a ``geometry``), or, with any other
+        suffix, a siggen or fieldgen configuration.
     overrides
-        ``"bias_V=3500"`` and the like.  They also give what a file does not hold: LEGEND
-        diodes lack ``temperature_K``.
+        Values as ``"bias_V=3500"``. They also supply fields that a file lacks, such as
+        ``temperature_K`` of LEGEND diodes.
     crystal
-        LEGEND's file of the crystal that a diode was cut from, with its impurities.  By
-        default ``crystals/V99000.yaml`` beside the folder of ``V99000A.yaml``.
+        LEGEND file of the crystal from which a diode was cut, with its impurities. By
+        default ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``.
 
     Raises
     ------
     CpunetError
-        If a file cannot be read, or the detector is impossible.
+        If a file cannot be read or the detector is invalid.
 
     Examples
     --------
@@ -107,7 +107,7 @@ def _from_file(path: Path) -> dict[str, Any]:
 def _legend(
     diode: dict[str, Any], path: Path, crystal: str | Path | None
 ) -> tuple[dict[str, Any], _Hints]:
-    """Values of a LEGEND diode and its crystal, and why some are missing."""
+    """Values of a LEGEND diode and its crystal, and reasons why some are missing."""
     values = legend_values(diode, str(path))
     crystal_name, slice_name = crystal_and_slice(diode, path.stem)
     places = [
@@ -130,8 +130,8 @@ def _legend(
         return values, hints
     length = values["crystal_length"]
     if not isinstance(length, int | float):
-        return values, hints  # refused with the rest of the geometry
-    # the curve is of all the crystal: nothing of a line through a few points remains
+        return values, hints  # refused together with the rest of the geometry
+    # the curve describes the whole crystal and replaces a line through a few points
     values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
     return values | impurity_values(content, f"crystal {found}", slice_name, length), hints
 
@@ -146,7 +146,7 @@ def _mapping(text: str, source: str) -> dict[str, Any]:
 
 
 def _first_problem(error: ValidationError, hints: _Hints) -> str:
-    """The first of pydantic's complaints in a line that names the key."""
+    """First problem reported by pydantic, in one line that names the key."""
     first = error.errors(include_url=False)[0]
     key = ".".join(map(str, first["loc"]))
     if first["type"] == "missing" and key in hints:

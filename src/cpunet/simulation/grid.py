@@ -1,4 +1,4 @@
-"""The grid on which potentials are solved: its nodes, and how far contacts are from them."""
+"""The grid on which potentials are solved: its nodes and their distances to contacts."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from cpunet.simulation.geometry import (
     RegionArray,
 )
 
-# a direct solver's memory: about 1.5 GB at this many nodes
+# memory of a direct solver: about 1.5 GB at this number of nodes
 MAX_NODES = 1_500_000
 PASSIVATED, DITCH_EDGE, CONTACT_EDGE = 3, 6, 7
 
-# of a step: a contact nearer than this is as good as touched
+# minimum distance to a contact, as a fraction of a step
 _NEAREST = 1e-4
 _BISECTIONS = 14
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Nodes of a detector in r and z, and the length of each step between them.
+    """Nodes of a detector in r and z, and the lengths of the steps between them.
 
-    ``region`` (nr, nz) is `Detector.region` at the nodes.  ``r_steps`` (nr-1, nz) and
-    ``z_steps`` (nr, nz-1) are 1 between two nodes of the same medium, and the fraction
-    of a step to the surface between a node and a contact.
+    ``region`` (nr, nz) is `Detector.region` at the nodes. ``r_steps`` (nr-1, nz) and
+    ``z_steps`` (nr, nz-1) are 1 between two nodes of the same medium. Between a node and a
+    contact they are the fraction of a step to the surface.
     """
 
     r_mm: FloatArray
@@ -46,17 +46,17 @@ class Grid:
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Nodes (nr, nz) whose potential is to be found: germanium and ditch."""
+        """Nodes (nr, nz) with unknown potential: germanium and ditch."""
         return np.asarray(self.region > LI_CONTACT)
 
 
 def make_grid(detector: Detector) -> Grid:
-    """Lay the nodes over the crystal, up to the first ones on or beyond its surfaces.
+    """Place nodes over the crystal, up to the first ones on or beyond its surfaces.
 
     Raises
     ------
     CpunetError
-        If ``grid_mm`` would make too many nodes for the memory of a laptop.
+        If ``grid_mm`` gives more nodes than fit into the memory of a laptop.
     """
     h = detector.grid_mm
     nr, nz = (
@@ -68,7 +68,7 @@ def make_grid(detector: Detector) -> Grid:
             f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes; "
             f"give a coarser one (at most {MAX_NODES} nodes)"
         )
-    # rounded, so that 23 steps of 0.1 mm are 2.3 mm
+    # rounded, so that 23 steps of 0.1 mm are exactly 2.3 mm
     r, z = (np.round(np.arange(n) * h, 9) for n in (nr, nz))
     rr, zz = np.meshgrid(r, z, indexing="ij")
     region = detector.region(rr, zz)
@@ -114,10 +114,10 @@ def _ends(values: npt.NDArray[Any], axis: int) -> tuple[npt.NDArray[Any], npt.ND
 
 
 def point_types(grid: Grid) -> RegionArray:
-    """Kind of each node (nr, nz), in the numbers that fieldgen uses.
+    """Type of each node (nr, nz), in fieldgen's numbering.
 
     0 point contact, 1 lithium contact or outside, 2 germanium, 3 passivated face
-    (z = 0), 5 ditch, 6 germanium beside the ditch, 7 germanium beside a contact.
+    (z = 0), 5 ditch, 6 germanium next to the ditch, 7 germanium next to a contact.
     """
     types = grid.region.copy()
     germanium = grid.region == GERMANIUM
@@ -129,7 +129,7 @@ def point_types(grid: Grid) -> RegionArray:
 
 
 def _beside(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Nodes with one of their four neighbours in `where`."""
+    """Nodes with at least one of their four neighbours in `where`."""
     beside = np.zeros_like(where)
     beside[:-1] |= where[1:]
     beside[1:] |= where[:-1]

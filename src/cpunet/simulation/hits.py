@@ -1,4 +1,4 @@
-"""Energy deposits of events in a crystal, whatever made them."""
+"""Energy deposits of events in a crystal, from any source."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from cpunet.errors import CpunetError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# No laboratory is larger, and no event has more: compiled loops, which turn places into
-# indices, could not count so far.
+# Larger than any laboratory and any event. Compiled loops convert positions into indices and
+# would overflow beyond.
 FARTHEST_MM, MOST_KEV = 1e7, 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Hits of a set of events, flat: event i owns ``offsets[i]:offsets[i + 1]``.
+    """Hits of a set of events as flat arrays: event i owns ``offsets[i]:offsets[i + 1]``.
 
-    Coordinates are the crystal's: its axis is x = y = 0, the point-contact face z = 0,
-    and z grows to the crystal's length.
+    Coordinates are in the frame of the crystal: its axis is x = y = 0, the point-contact face
+    is z = 0, and z increases to the length of the crystal.
 
     Parameters
     ----------
     x_mm, y_mm, z_mm
-        Where, in mm; one value per hit.
+        Position of each hit in mm.
     edep_kev
         Energy of each hit in keV.
     offsets
         Int64 array of ``n_events + 1``, from 0 to the number of hits.
     event_number
-        The source's own number of each event.
+        Event numbers of the source.
 
     Raises
     ------
     CpunetError
-        If the lengths disagree, the offsets fall, or a hit lies beyond `FARTHEST_MM`.
+        If the lengths disagree, the offsets decrease, or a hit lies beyond `FARTHEST_MM`.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class Hits:
         offsets: npt.ArrayLike,
         event_number: npt.ArrayLike | None = None,
     ) -> Hits:
-        """Build from anything array-like; positions of shape ``(n_hits, 3)``."""
+        """Build from array-like input; positions have shape ``(n_hits, 3)``."""
         x, y, z = np.asarray(position_mm, float).reshape(-1, 3).T.copy()
         starts = np.asarray(offsets, np.int64)
         numbers = np.arange(len(starts) - 1) if event_number is None else event_number
@@ -93,7 +93,7 @@ class Hits:
 
     @property
     def n_events(self) -> int:
-        """Number of events, those without hits included."""
+        """Number of events, including those without hits."""
         return len(self.offsets) - 1
 
     def __len__(self) -> int:
@@ -106,7 +106,7 @@ class Hits:
 
     @property
     def energy_kev(self) -> FloatArray:
-        """Sum of the hits of each event in keV."""
+        """Energy of each event in keV, the sum over its hits."""
         return np.bincount(
             self.event_of_hit, weights=self.edep_kev, minlength=self.n_events
         ).astype(np.float64)
@@ -117,11 +117,11 @@ class Hits:
         return np.stack([self.x_mm, self.y_mm, self.z_mm], axis=1)
 
     def __getitem__(self, which: slice | npt.NDArray[np.bool_] | IntArray) -> Hits:
-        """The events of a slice, a mask or a list of rows."""
+        """Select events by a slice, a mask or a list of rows."""
         rows = np.arange(self.n_events)[which]
         counts = np.diff(self.offsets)[rows]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        # hit j of the result is hit j - offsets[i] of its old event
+        # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
         return Hits(
             self.x_mm[take],
@@ -133,7 +133,7 @@ class Hits:
         )
 
     def where(self, keep: npt.NDArray[np.bool_]) -> Hits:
-        """The same events with only the hits of a mask (an event may end up empty)."""
+        """The same events with only the hits of a mask. An event may become empty."""
         kept = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
         return Hits(
             self.x_mm[keep],
@@ -145,15 +145,15 @@ class Hits:
         )
 
     def of_events(self, event_number: npt.ArrayLike) -> Hits:
-        """The events with these numbers, in their order.
+        """Events with the given numbers, in their order.
 
-        A number that none of them has becomes an event without hits, so that the result
-        has one event for each.
+        A number without an event gives an event without hits, so the result has one event for
+        each number.
 
         Raises
         ------
         CpunetError
-            If several events have one of the numbers.
+            If several events share one of the numbers.
 
         Examples
         --------
@@ -179,7 +179,7 @@ class Hits:
 
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:
-        """Join sets into one, events in their order."""
+        """Concatenate several sets, keeping the order of events."""
         if not sets:
             raise CpunetError("no sets of hits to join")
         starts = np.cumsum([0, *(len(s.edep_kev) for s in sets)])

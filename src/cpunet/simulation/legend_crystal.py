@@ -1,11 +1,15 @@
-"""LEGEND metadata of crystals (``hardware/detectors/germanium/crystals``).
+r"""LEGEND metadata of crystals (``hardware/detectors/germanium/crystals``).
 
-A crystal's ``impurity_curve`` describes the boule that detectors were cut from.  As
-LegendDataManagement.jl reads it for SolidStateDetectors.jl (its boule impurity densities):
-net acceptors in 1e9/cm3 against the distance ``z`` from the boule's seed end in mm,
-``a + b z + c z^2 + n exp((z - l) / m)``; ``corrections`` make of it ``scale`` times the
-curve plus ``offset`` (1e9/cm3).  A slice's ``detector_offset_in_mm`` is where its point
-contact lies; from there the detector's own axis runs back to the seed end.
+The ``impurity_curve`` of a crystal describes the boule from which detectors were cut. As
+LegendDataManagement.jl reads it for SolidStateDetectors.jl (its boule impurity densities), it
+gives the net acceptors in 1e9/cm3 as a function of the distance :math:`z` from the seed end of
+the boule in mm,
+
+.. math:: N(z) = a + b z + c z^2 + n\, e^{(z - l)/m}.
+
+With ``corrections`` this becomes ``scale`` times the curve plus ``offset`` (1e9/cm3). The
+``detector_offset_in_mm`` of a slice is the position of its point contact. From there the axis
+of the detector runs back to the seed end.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from typing import Any
 
 from cpunet.errors import CpunetError
 
-# parameters of each model, in the curve above
+# parameters of each model in the curve above
 MODELS = {
     "constant_boule": ("value",),
     "linear_boule": ("a", "b"),
@@ -36,18 +40,29 @@ def impurity_values(
     Parameters
     ----------
     crystal
-        As in its file.
+        Content of the file of the crystal.
     source
-        What errors begin with: the file.
+        Name of the file for error messages.
     slice_name
-        Which of its ``slices`` the detector is, such as ``"A"``.
+        Slice from which the detector was cut, one of ``slices``, such as ``"A"``.
     length_mm
-        Of the detector along the axis.
+        Length of the detector along the axis in mm.
 
     Raises
     ------
     CpunetError
-        If the curve, a parameter or the slice is missing or not known.
+        If the curve, a parameter or the slice is missing or unknown.
+
+    Examples
+    --------
+    A constant 10 x 1e9/cm3 net acceptors are -1e10/cm3.
+
+    >>> crystal = {
+    ...     "impurity_curve": {"model": "constant_boule", "parameters": {"value": 10.0}},
+    ...     "slices": {"A": {"detector_offset_in_mm": 5.0}},
+    ... }
+    >>> impurity_values(crystal, "V99000.yaml", "A", 90.0)["impurity_z0_1e10_per_cm3"]
+    -1.0
     """
     curve = crystal.get("impurity_curve")
     if not isinstance(curve, Mapping):
@@ -67,8 +82,8 @@ def impurity_values(
     contact = _number(crystal, f"slices.{slice_name}.detector_offset_in_mm", source)
     scale = _number(crystal, "impurity_curve.corrections.scale", source, 1.0)
     offset = _number(crystal, "impurity_curve.corrections.offset", source, 0.0)
-    # z of the boule is that of the contact less the detector's z; 1e9 acceptors are -0.1 of
-    # our unit, and the scale does not act on the offset
+    # z of the boule is that of the contact minus the detector's z; 1e9 acceptors are -0.1 of
+    # our unit, and the scale does not apply to the offset
     unit = -0.1 * scale
     values = {
         "impurity_z0_1e10_per_cm3": unit * (a + b * contact + c * contact**2) - 0.1 * offset,
@@ -92,7 +107,7 @@ def impurity_values(
 def _number(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
-    """The number at a place such as ``"slices.A.detector_offset_in_mm"``."""
+    """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
     found: Any = values
     for key in place.split("."):
         found = found.get(key) if isinstance(found, Mapping) else None

@@ -10,7 +10,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.yaml_files import shown
 
-# where a diode says it: the detector's field
+# keys of a diode and the fields of the detector
 _GEOMETRY = {
     "height_in_mm": "crystal_length",
     "radius_in_mm": "crystal_radius",
@@ -39,7 +39,7 @@ _REQUIRED = (
     "pp_contact.radius_in_mm",
     "pp_contact.depth_in_mm",
 )
-# the detector's field, and where it is; the first that is above 0 counts
+# fields of the detector and their locations; the first value above 0 is used
 _MEASURED = {
     "bias_V": (
         "characterization.l200_site.recommended_voltage_in_V",
@@ -64,24 +64,24 @@ _IMPCC = (
 
 
 def why_missing(field: str) -> str:
-    """Why a diode does not give a field of `Detector`; empty for those it need not give."""
+    """Reason why a diode does not give a field of `Detector`; empty for optional fields."""
     if field in _MEASURED:
         return f"neither {' nor '.join(_MEASURED[field])} is above 0"
     return "LEGEND diodes do not tell it" if field == "temperature_K" else ""
 
 
 def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Fields of `Detector` from a LEGEND diode; those it does not hold are left out.
+    """Fields of `Detector` from a LEGEND diode. Fields it does not contain are omitted.
 
-    Bias, measured depletion voltage and the lithium's thickness (the full charge
-    collection depth, FCCD) come from ``characterization``, where 0 means unknown;
-    impurities from ``production.impcc`` (a straight line through its points, net
-    acceptors counted as negative), unless all its values are 0.
+    Bias, measured depletion voltage and lithium thickness (the full charge collection depth,
+    FCCD) come from ``characterization``, where 0 means unknown. Impurities come from
+    ``production.impcc`` (a straight line through its points, with net acceptors counted as
+    negative), unless all its values are 0.
 
     Raises
     ------
     CpunetError
-        If the geometry has a key that is not known (as without its unit), lacks one, or
+        If the geometry has an unknown key (for example, one without its unit), lacks one, or
         is not axially symmetric.
     """
     kind = diode.get("type")
@@ -115,7 +115,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
-    """Name of the crystal that a diode was cut from, and its slice: V99000A is A of V99000."""
+    """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
     diode_name = str(diode.get("name", name))
     return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
 
@@ -131,7 +131,7 @@ def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
     except (KeyError, ValueError, TypeError) as error:
         raise CpunetError(f"detector {name}: {_IMPCC}") from error
     if not np.any(value):
-        return {}  # placeholders: today's files have the impurities with the crystal
+        return {}  # placeholders: recent files have the impurities in the crystal's file
     alike = value.ndim == 1 and value.shape == z_cm.shape
     if not alike or len(np.unique(z_cm)) < len(z_cm):
         raise CpunetError(f"detector {name}: {_IMPCC}")
@@ -145,7 +145,7 @@ def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
 
 
 def _flat(values: Any, name: str, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one, its keys joined by dots."""
+    """Flatten nested mappings; keys are joined by dots."""
     if not isinstance(values, Mapping):
         raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
     flat: dict[str, Any] = {}

@@ -1,8 +1,8 @@
-"""Building the library of pre-computed pulses, and checking it against the exact drift.
+"""Build the library of pre-computed pulses and check it against the exact drift.
 
-A coarse grid of cells is laid over the detector.  Each cell's interpolated pulses are
-compared with drifted ones in its middle; cells that fail are halved, and what still fails
-in the finest ones is drifted hit by hit later on.
+A coarse grid of cells covers the detector. At the centre of each cell the interpolated pulses
+are compared with drifted ones. Cells that fail are halved. Hits in the finest cells that still
+fail are later drifted individually.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from cpunet.simulation.velocity import FloatArray
 
 Progress = Callable[[int, int], None]
 
-# Energies of the pulses of a self-repelling cloud: Chebyshev points of the squared width.
+# Energies of the pulses of a self-repelling cloud: Chebyshev points in the squared width.
 _ENERGIES_KEV = (0.0, 430.0, 1820.0, 2700.0)
-# Places between two calls of `progress`.
+# Grid points between two calls of `progress`.
 _BLOCK = 256
 _CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 
 
 class _Meter:
-    """Counts places done; their number grows as cells are halved."""
+    """Count completed grid points. Their total grows as cells are halved."""
 
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress
@@ -55,21 +55,21 @@ class _Meter:
 def build_library(
     fields: Maps, settings: SimulationSettings, progress: Progress | None = None
 ) -> Library:
-    """Simulate pulses on a grid that is as fine as its own checks demand, in parallel.
+    """Simulate pulses on an adaptive grid, in parallel.
 
-    In the middle of each cell, at azimuths between those of its nodes, the interpolated
-    pulse is compared with a drifted one.  Where samples differ by more than
-    ``library_tolerance`` of full scale, or the largest rise in one sample by more than
-    that relative to itself, the cell is halved, up to ``library_halvings`` times.
+    At the centre of each cell, at azimuths between those of its nodes, the interpolated pulse
+    is compared with a drifted one. The cell is halved, at most ``library_halvings`` times, if
+    samples differ by more than ``library_tolerance`` of full scale, or if the largest rise in
+    one sample differs by more than this relative to itself.
 
     Parameters
     ----------
     fields
         Field maps of the detector.
     settings
-        What is to be simulated, and the `library_...` settings.
+        Simulation settings, including those named `library_...`.
     progress
-        Called with the numbers of places done and known so far; the second grows.
+        Called with the numbers of grid points completed and known so far. The latter grows.
     """
     maps, task = drift_maps(fields, settings), _task(fields, settings)
     library = _empty(fields, settings)
@@ -132,7 +132,7 @@ def _empty(fields: Maps, settings: SimulationSettings) -> Library:
 
 
 def _phases(settings: SimulationSettings) -> int:
-    """Fine samples per sample: whole steps each, none longer than asked for."""
+    """Fine samples per sample: whole steps each, none longer than requested."""
     per_sample = settings.steps_per_sample
     wanted = settings.dt_ns / settings.library_step_ns - 1e-9
     return next(
@@ -146,14 +146,14 @@ def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
     """Corners (n, 2) of cells at which no charge has been drifted yet."""
     new = np.zeros(library.column.shape, np.bool_)
     new[tuple((cells[:, None] + size * _CORNERS).reshape(-1, 2).T)] = True
-    # in one layout: for another all that drifts is compiled again
+    # in a single memory layout: another would compile the whole drift again
     return np.ascontiguousarray(np.argwhere(new & (library.column == UNTRIED)))
 
 
 def _with_nodes(
     library: Library, maps: DriftMaps, task: Task, places: IntArray, meter: _Meter
 ) -> Library:
-    """The library with columns of pulses at more places (n, 2), in fine steps."""
+    """Add columns of pulses at further grid points (n, 2), given in fine steps."""
     azimuths = len(library.cos4)
     longest = library.margin + task.n_samples
     rows = len(library.energies_kev) * library.phases
@@ -189,15 +189,15 @@ def _with_nodes(
 
 
 def _sorted(library: Library, cells: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """Cells with pulses at all corners, and those at an edge, which are to be halved."""
+    """Cells with pulses at all corners, and cells at an edge, which are to be halved."""
     corners = library.column[tuple(np.moveaxis(cells[:, None] + size * _CORNERS, -1, 0))]
     known, outside, late = corners >= 0, corners == OUTSIDE, corners == LATE
-    # what is late stays late in smaller cells
+    # a late corner remains late in smaller cells
     return cells[known.all(1)], cells[known.any(1) & outside.any(1) & ~late.any(1)]
 
 
 def _with_cells(library: Library, cells: IntArray, size: int) -> Library:
-    """The library with cells in which pulses are interpolated."""
+    """Add cells in which pulses are interpolated."""
     _enter(library.cell, cells, size, np.full(len(cells), size))
     _enter(library.number, cells, size, len(library.bend_ns) + np.arange(len(cells)))
     bends = np.zeros((len(cells), *library.bend_ns.shape[1:]), np.float32)
@@ -216,7 +216,7 @@ def _deviations(
 
 
 def _enter(table: IntArray, cells: IntArray, size: int, values: IntArray) -> None:
-    """Give all fine cells of each cell its value."""
+    """Set all fine cells inside each cell to its value."""
     inside = cells[:, None] + _lattice(size, size)
     table[tuple(np.moveaxis(inside, -1, 0))] = values[:, None]
 

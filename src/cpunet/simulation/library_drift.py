@@ -1,4 +1,4 @@
-"""Compiled loops of the library's building: pulses at its nodes, and how good they are."""
+"""Compiled loops that build the library: pulses at its nodes, and their accuracy."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from cpunet.simulation.velocity import FloatArray
 IntArray = npt.NDArray[np.int64]
 
 MARGIN_NS = 64.0
-"""Pulses are stored from this long before the charge is set free.  Neighbours whose
-half-height times differ by more belong to different kinds (other path, other carrier)."""
+"""Time by which pulses are stored before the charge is released.  Neighbours whose half-maximum
+times differ by more are of different kinds (another path or another carrier)."""
 
 
 class Task(NamedTuple):
-    """What the compiled loops need, beside the maps, to drift a charge and smear its pulse.
+    """Parameters of the compiled loops, besides the maps, for drifting and smearing.
 
-    `rounding`: siggen rounds the cloud's duration to whole steps, by one up on average.
-    `stride` is that of `cpunet.simulation.drift.drift`; as a constant there it would have
-    the drift compiled again for it.
+    `rounding`: siggen rounds the duration of the cloud to whole steps, up by one on average.
+    `stride` is that of `cpunet.simulation.drift.drift`. As a constant there it would cause the
+    drift to be compiled again.
     """
 
     cloud_fwhm_mm: float
@@ -43,9 +43,9 @@ class Task(NamedTuple):
 
 @kernel
 def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> None:
-    """How far the half-height time bends in r and in z: ``bend u (1 - u)`` is added.
+    """Curvature of the half-maximum time in r and in z: ``bend u (1 - u)`` is added.
 
-    From the second differences at the corners, as far as both neighbours are there.
+    It is the mean second difference at the corners for which both neighbours exist.
     """
     nr, nz = library.column.shape
     azimuths = len(library.cos4)
@@ -83,8 +83,10 @@ def drift_nodes(
     rows: Float32Array,
     facts: FloatArray,
 ) -> None:
-    """Fill the rows of each node, and its state (0 or `OUTSIDE`, `LATE`), number of
-    samples, time of half height, final value and share trapped.
+    """Fill the rows and the facts of each node.
+
+    The facts are its state (0, `OUTSIDE` or `LATE`), number of samples, half-maximum time,
+    final value and trapped fraction.
     """
     azimuths, energies = len(library.cos4), library.energies_kev
     for place in prange(len(places)):
@@ -123,11 +125,11 @@ def _fine_pulse(
     signal: FloatArray,
     rows: Float32Array,
 ) -> tuple[int, bool, float]:
-    """Fill the rows (phases, samples) with a hit's smeared and averaged pulse.
+    """Fill the rows (phases, samples) with the smeared and averaged pulse of a hit.
 
-    `signal` takes the point charge's, with zeros for the margin before.  Returns the
-    number of samples up to one that is flat, whether the charge is collected, and the
-    share that is trapped.
+    `signal` receives the pulse of the point charge, with zeros for the margin before it.
+    Returns the number of samples up to the first constant one, whether the charge is
+    collected, and the trapped fraction.
     """
     before = library.margin * task.per_sample
     cloud = (task.cloud_fwhm_mm, task.diffusion, task.repulsion, False)
@@ -138,7 +140,7 @@ def _fine_pulse(
     group = task.per_sample // library.phases
     sample = np.empty(rows.shape[1])
     for p in range(library.phases):
-        # what is left out at the front is zero
+        # the samples left out at the front are zero
         late = p * group
         sample[:] = 0.0
         smear_and_sample(
@@ -149,16 +151,16 @@ def _fine_pulse(
             1.0,
             sample,
         )
-        for j in range(len(sample)):  # an assignment compiles what it would tell of shapes
+        for j in range(len(sample)):  # a slice assignment would compile its shape errors
             rows[p, j] = sample[j]
-    # two FWHM is where the cloud is cut
+    # the cloud is truncated at two FWHM
     end = (last + before + int(2.0 * fwhm) + 2) // task.per_sample + 2
     return min(end, rows.shape[1]), arrived, trapped
 
 
 @kernel
 def _half_time(signal: FloatArray, zero: int) -> float:
-    """Step, with its fraction, after `zero` at which a pulse first passes half its end."""
+    """Step, with its fraction, after `zero` at which a pulse first reaches half its end."""
     half = 0.5 * signal[-1]
     for k in range(zero + 1, len(signal)):
         if signal[k] >= half and signal[k] > signal[k - 1]:
@@ -170,7 +172,7 @@ def _half_time(signal: FloatArray, zero: int) -> float:
 def compare(
     library: Library, maps: DriftMaps, task: Task, places: FloatArray, worst: FloatArray
 ) -> None:
-    """Largest deviation at places (fine steps), at every other middle of two azimuths."""
+    """Largest deviation at points (fine steps), at every other midpoint of two azimuths."""
     for place in prange(len(places)):
         r, z = places[place, 0] / library.per_mm, places[place, 1] / library.per_mm
         signal = np.zeros(task.per_sample * (library.margin + task.n_samples))
@@ -193,7 +195,7 @@ def compare(
 
 @kernel
 def _between(energies: FloatArray, k: int) -> float:
-    """An energy in the middle between two of the library's; another two with each k."""
+    """Midpoint between two energies of the library; another pair for each k."""
     if len(energies) == 1:
         return float(energies[0])
     e = k % (len(energies) - 1)
@@ -202,7 +204,7 @@ def _between(energies: FloatArray, k: int) -> float:
 
 @kernel
 def _spread(library: Library, place: FloatArray, k: int) -> float:
-    """Difference (ns) between the half-height times of the corners around a place."""
+    """Range (ns) of the half-maximum times of the corners around a point."""
     size = library.cell[int(place[0]), int(place[1])]
     i, j = int(place[0]) // size * size, int(place[1]) // size * size
     low, high = np.inf, -np.inf
@@ -215,8 +217,9 @@ def _spread(library: Library, place: FloatArray, k: int) -> float:
 
 @kernel
 def _deviation(library: Library, hit: FloatArray, rows: Float32Array) -> float:
-    """Largest difference between interpolated and exact samples, and of their largest
-    rise relative to itself, whichever phase of a sample the record starts at.
+    """Largest deviation between interpolated and exact samples over all phases.
+
+    The largest rise in one sample also counts, relative to itself.
     """
     n = rows.shape[1] - library.margin
     worst = 0.0

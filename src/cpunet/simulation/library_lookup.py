@@ -1,9 +1,10 @@
-"""Pre-computed pulses of single charges, and the pulse of a charge anywhere among them.
+"""Pre-computed pulses of single charges, and their interpolation at any point.
 
 Each node holds the pulse already smeared by its cloud and averaged over one output sample,
-every few ns, so that a pulse moved in time is a cubic mix of four rows of samples.  Pulses
-of neighbouring nodes are moved to a common half-height time before they are averaged, and
-that time is interpolated on its own, more smoothly, so that edges stay as steep as they are.
+every few ns. A pulse shifted in time is therefore a cubic combination of four rows of samples.
+Pulses of neighbouring nodes are shifted to a common half-maximum time before they are
+averaged. That time is interpolated separately and more smoothly, which preserves the steepness
+of edges.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from cpunet.simulation.velocity import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
 
-# Entries of `Library.column` for places without pulses: not tried yet, no drift from
-# there, not collected within the record.
+# Entries of `Library.column` at grid points without pulses: not tried yet, outside the active
+# germanium, not collected within the record.
 UNTRIED, OUTSIDE, LATE = -3, -2, -1
 
-# From here on repulsion widens a typical cloud more than diffusion does.
+# Energy above which repulsion widens a typical cloud more than diffusion does.
 _REPELLING_KEV = 100.0
 
 
 class Library(NamedTuple):
-    """Pulses of point charges at columns of nodes: places in (r, z), each at all azimuths.
+    """Pulses of point charges at columns of nodes: points in (r, z), each at all azimuths.
 
-    Cells of 1, 2, 4, ... fine steps tile the (r, z) plane; the pulse inside a cell is
-    interpolated between its four corners and two azimuths.  Azimuths are equidistant from
-    0 to 45 degrees, to which cubic symmetry takes every other one.
+    Cells of 1, 2, 4, ... fine steps tile the (r, z) plane. The pulse inside a cell is
+    interpolated between its four corners and two azimuths. Azimuths are equidistant from 0 to
+    45 degrees; cubic symmetry maps all others onto these.
 
     ``cell`` (nr, nz): fine steps per side of the cell that covers each fine cell, 0 where
-    charges are drifted instead; ``number`` (nr, nz): its row in ``bend_ns``, which is
-    (cells, 2, azimuths).  ``column`` (nr + 1, nz + 1): number of the column at each
-    corner, negative where there is none.  Node ``column * azimuths + k`` has the pulse
-    ``pulses[start:]``, of shape (energies, phases, `samples`): sample j of phase p is at
-    time ``(j - margin + p / phases) * dt_ns``, and the last one is ``final`` in all
-    phases; ``trapped`` is what trapping took off it.  ``half_ns`` is the time of half
-    height; inside a cell it bends by
-    ``bend_ns u (1 - u)`` along r and z each.
+    charges are drifted instead. ``number`` (nr, nz): its row in ``bend_ns``, which is
+    (cells, 2, azimuths). ``column`` (nr + 1, nz + 1): number of the column at each corner,
+    negative where there is none. Node ``column * azimuths + k`` has the pulse
+    ``pulses[start:]``, of shape (energies, phases, `samples`). Sample j of phase p is at time
+    ``(j - margin + p / phases) * dt_ns``, and the last one is ``final`` in all phases.
+    ``trapped`` is the fraction lost to trapping. ``half_ns`` is the half-maximum time. Inside
+    a cell it varies by ``bend_ns u (1 - u)`` along r and z each, in addition to the linear
+    interpolation.
     """
 
     pulses: Float32Array
@@ -84,7 +85,7 @@ def add_pulse(
     out: Float32Array,
     steps: FloatArray,
 ) -> float:
-    """Add `weight` times the pulse of a hit that `covers` accepts; give what is trapped.
+    """Add `weight` times the pulse of a hit that `covers` accepts; return what is trapped.
 
     Parameters
     ----------
@@ -92,12 +93,14 @@ def add_pulse(
         Pulses of the detector.
     hit
         x, y, z in mm, energy in keV.
+    weight
+        Factor of the pulse.
     delay
-        Start of the record after the charge is set free, in phases of a sample.
+        Start of the record after the release of the charge, in phases of a sample.
     out
-        Samples of the record, to which the pulse is added until it is flat.
+        Samples of the record. The pulse is added to them until it is constant.
     steps
-        Array of one value more than `out`: what is added to all samples from one on.
+        Array one longer than `out`: values added to all samples from an index onwards.
     """
     r = math.hypot(hit[0], hit[1])
     p, q = r * library.per_mm, hit[2] * library.per_mm
@@ -105,7 +108,7 @@ def add_pulse(
     i, j = int(p) // size * size, int(q) // size * size
     u, v = (p - i) / size, (q - j) / size
     # cos 4 phi = 1 - 8 c^2 (1 - c^2) with c = x / r
-    c2 = (hit[0] / r) ** 2 if r > 0.0 else 1.0  # r * r may be too small a number
+    c2 = (hit[0] / r) ** 2 if r > 0.0 else 1.0  # r * r may underflow
     cos4 = 1.0 - 8.0 * c2 * (1.0 - c2)
     cosines = library.cos4
     azimuths = len(cosines)
@@ -145,9 +148,9 @@ def _smooth_half(
     uu: float,
     vv: float,
 ) -> float:
-    """Half-height time: a parabola in r and z each, and a polynomial through all azimuths.
+    """Half-maximum time: a parabola in r and z each, a polynomial through all azimuths.
 
-    The barycentric formula at Chebyshev points (Berrut and Trefethen, SIAM Review 46
+    Uses the barycentric formula at Chebyshev points (Berrut and Trefethen, SIAM Review 46
     (2004) 501).
     """
     last = len(library.cos4) - 1
@@ -167,10 +170,10 @@ def _smooth_half(
 
 @kernel
 def _energy_weight(energies: FloatArray, row: int, energy: float) -> float:
-    """Weight of a row's pulse: a polynomial through all, in the cloud's squared width.
+    """Weight of a row's pulse: a polynomial through all rows in the cloud's squared width.
 
-    A pulse follows the heat equation with that as the time.  Repulsion makes the cube of
-    the width grow with the energy.
+    A pulse obeys the heat equation with the squared width as time. With repulsion the cube of
+    the width grows with energy.
     """
     weight = 1.0
     for other in range(len(energies)):
@@ -182,7 +185,7 @@ def _energy_weight(energies: FloatArray, row: int, energy: float) -> float:
 
 @kernel
 def _cloud_scale(energy_kev: float) -> float:
-    """How the squared width of a self-repelling cloud goes with energy, roughly."""
+    """Approximate scaling of the squared width of a self-repelling cloud with energy."""
     return float((1.0 + energy_kev / _REPELLING_KEV) ** (2.0 / 3.0))
 
 
@@ -196,7 +199,7 @@ def _add_shifted(
     out: Float32Array,
     steps: FloatArray,
 ) -> None:
-    """Add a node's pulse, read `shift` phases later: a cubic through four fine samples."""
+    """Add a node's pulse, read `shift` phases later, by a cubic through four fine samples."""
     base = math.floor(shift)
     f = shift - base
     cubic = (
@@ -207,11 +210,11 @@ def _add_shifted(
     )
     length, phases = library.samples[node], library.phases
     pulse = library.start[node] + row * phases * length
-    # row and first sample of each tap; first samples differ by one at most
+    # row and first sample of each tap; first samples differ by at most one
     f0, f1, f2, f3 = base - 1, base, base + 1, base + 2
     s0, s1 = f0 // phases + library.margin, f1 // phases + library.margin
     s2, s3 = f2 // phases + library.margin, f3 // phases + library.margin
-    # before the record nothing has moved; the last sample of a row is flat already
+    # before the record the pulse is zero; the last sample of a row is already constant
     begin = max(0, -s0)
     end = min(max(length - s3, begin), len(out))
     n = end - begin

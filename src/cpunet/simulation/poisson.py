@@ -1,12 +1,16 @@
 r"""Poisson's equation in a detector, by finite volumes and a sparse direct solver.
 
-Every node owns the ring of half a step around it.  Gauss's law for the ring, per unit
-angle, reads :math:`\sum_f A_f \varepsilon_f (V - V_f) / d_f = \int \rho\,r\,dr\,dz`,
+.. math:: \nabla \cdot (\varepsilon \nabla V) = -\rho
+
+Each node owns the ring within half a step of it. Gauss's law for the ring, per unit angle, is
+
+.. math:: \sum_f A_f \varepsilon_f (V - V_f) / d_f = \int \rho\,r\,dr\,dz,
+
 where the distance :math:`d_f` ends at the surface of a contact (Gibou et al., J. Comput.
-Phys. 176 (2002) 205).  On the axis this is
-:math:`V = (V_{z+} + V_{z-} + 4 V_r)/6 + \rho h^2 / 6\varepsilon`, and faces on z = 0 carry
-no flux but that to a grounded plane.  The matrix is symmetric; it is factorised once, so
-that each further set of charges and electrodes costs hundredths of a second.
+Phys. 176 (2002) 205). On the axis this becomes
+:math:`V = (V_{z+} + V_{z-} + 4 V_r)/6 + \rho h^2 / 6\varepsilon`. Faces on z = 0 carry no flux
+except to a grounded plane. The matrix is symmetric and factorised once, so each further set of
+charges and electrode potentials takes only hundredths of a second.
 """
 
 from __future__ import annotations
@@ -31,12 +35,19 @@ PF_PER_MM = epsilon_0 * 1e12 * 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Potentials:
-    """What the electrodes and the charges add to the potential; arrays (nr, nz).
+    """Contributions of electrodes and charges to the potential; arrays (nr, nz).
 
-    ``point_contact`` is the potential with 1 on the point contact and 0 elsewhere (the
-    weighting potential), ``bias`` that with 1 on the lithium, ``impurities``, ``tilt`` and
-    ``surface`` those of the impurities, of a unit of their tilt and of a charge on z = 0
-    in V with all electrodes at 0, and ``capacitance_pF`` the point contact's own.
+    Parameters
+    ----------
+    point_contact
+        Potential with 1 on the point contact and 0 on the lithium: the weighting potential.
+    bias
+        Potential with 1 on the lithium and 0 on the point contact.
+    impurities, tilt, surface
+        Potentials in V with all electrodes at 0: of the impurities, of a unit of their tilt,
+        and of a charge on z = 0.
+    capacitance_pF
+        Capacitance of the point contact in pF.
     """
 
     point_contact: FloatArray
@@ -48,10 +59,27 @@ class Potentials:
 
 
 def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
-    """Solve for the two electrodes and for the charges on the nodes of `grid`."""
+    r"""Solve for both electrodes and for all charges on the nodes of `grid`.
+
+    The capacitance follows from the energy of the weighting field,
+
+    .. math:: C = \int \varepsilon\, |\nabla \phi_w|^2\, dV.
+
+    Examples
+    --------
+    The potentials of the two electrodes add up to 1 everywhere.
+
+    >>> from cpunet.simulation.geometry_readers import read_detector
+    >>> from cpunet.simulation.grid import make_grid
+    >>> detector = read_detector("ppc", ["grid_mm=0.5"])
+    >>> grid = make_grid(detector)
+    >>> parts = solve_potentials(detector, grid)
+    >>> bool(abs(parts.point_contact + parts.bias - 1)[grid.free].max() < 1e-9)
+    True
+    """
     r_flux, z_flux, to_ground = conductances(detector, grid)
     free = grid.free
-    # contacts are known: their columns go to the right-hand side
+    # the contacts are known: their columns are moved to the right-hand side
     to_contact, columns = _solver(r_flux, z_flux, to_ground, free)
 
     def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
@@ -78,7 +106,7 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
 def _solver(
     r_flux: FloatArray, z_flux: FloatArray, to_ground: FloatArray, free: Any
 ) -> tuple[Any, Any]:
-    """A function that gives the flux from given contacts, and the factorised matrix."""
+    """The function that gives the flux from the neighbours, and the factorised matrix."""
 
     def from_neighbours(values: FloatArray) -> FloatArray:
         flux = np.zeros(free.shape)
@@ -104,20 +132,20 @@ def _solver(
     matrix = sp.csc_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     )
-    # symmetric and diagonally dominant: no pivoting, and an ordering that uses it
+    # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
     options = {"SymmetricMode": True}
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     return from_neighbours, factors
 
 
 def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Area times permittivity over distance of each step, per unit angle, in mm.
+    r"""Conductance of each step, :math:`A \varepsilon / d` per unit angle, in mm.
 
     Returns
     -------
     r_flux, z_flux, to_ground
-        Of the steps in r (nr-1, nz), of those in z (nr, nz-1), and of z = 0 to a
-        grounded plane (nr).
+        Conductances of the steps in r (nr-1, nz), of those in z (nr, nz-1), and from z = 0 to
+        a grounded plane (nr).
     """
     h = grid.step_mm
     epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
@@ -138,13 +166,20 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
 
 
 def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
-    """Charge over the vacuum's permittivity in each ring, per rad, in V mm.
+    r"""Charge of each ring over the vacuum permittivity, per rad, in V mm.
 
-    `impurity` is that of the nodes, in 1e10/cm3.
+    .. math:: Q = \int \frac{e N}{\varepsilon_0}\, r\, dr\, dz
+
+    Parameters
+    ----------
+    detector, grid
+        Detector and nodes.
+    impurity
+        Net impurity at the nodes in 1e10/cm3.
     """
     germanium = _germanium_in_cells(detector, grid)
     if detector.siggen_conventions:
-        # there the ditch holds the charge that N / 16 of germanium would hold
+        # fieldgen's ditch holds the charge of N / 16 of germanium
         germanium = germanium + (1 - germanium) / EPSILON_GERMANIUM
     inner, outer = _half_rings(grid)
     by_column = np.zeros((len(grid.r_mm), germanium.shape[1]))
@@ -157,7 +192,7 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
 
 
 def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
-    """The same of the charge on the passivated face, z = 0."""
+    """Charge of each ring on the passivated face z = 0, in the units of `charges`."""
     inner, outer = _half_rings(grid)
     charge = np.zeros(grid.region.shape)
     face = (inner + outer) * (grid.region[:, 0] > LI_CONTACT)
@@ -167,14 +202,14 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
 
 
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:
-    """Area per unit angle, in mm2, of each node's half ring towards and off the axis."""
+    """Area per unit angle, in mm2, of each node's half ring towards the axis and away."""
     r, h = grid.r_mm, grid.step_mm
     inner = np.where(r > 0, (r**2 - (r - h / 2) ** 2) / 2, 0)
     return inner, ((r + h / 2) ** 2 - r**2) / 2
 
 
 def _germanium_in_cells(detector: Detector, grid: Grid) -> FloatArray:
-    """Share (nr-1, nz-1) of each cell between four nodes that is not in the ditch."""
+    """Fraction (nr-1, nz-1) of each cell between four nodes that lies outside the ditch."""
 
     def covered(edges: FloatArray, low: float, high: float) -> FloatArray:
         overlap = np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)

@@ -17,51 +17,52 @@ _PerUs = Annotated[float, Field(ge=0, le=100)]
 
 
 class SimulationSettings(Config):
-    """How hits become pulses.
+    r"""Settings of the pulse simulation.
 
     Parameters
     ----------
     step_ns
-        Time step of the pulses, and of the drift.
+        Time step of the pulses and of the drift in ns.
     stride
-        Steps that a drifted charge takes at once; its pulse is interpolated in between.
+        Number of time steps per drift step. The pulse is interpolated in between.
     dt_ns
-        Sampling period of the pulses; each sample is the mean of the steps in it.
+        Sampling period of the pulses in ns. Each sample is the mean over its time steps.
     length_ns
-        Length of the record, which starts when the charge is set free.
+        Length of the record in ns. It starts when the charge is released.
     diffusion
-        Let the charge cloud grow by diffusion.
+        Whether the charge cloud grows by diffusion.
     diffusion_constant
-        D/(v/E), diffusivity over mobility, in V mm/cm.  Siggen's 0.12 was set to the
-        diffusion measured (of electrons: Jacoboni et al., PRB 24 (1981) 1014) at the
-        fields of a detector, where carriers are hotter than the crystal.  ``"temperature"``:
-        kT/e at the crystal's temperature (0.078 at 90 K), the limit of weak fields;
-        ``"siggen"``: 0.12 with siggen's roundings, of the number and of the cloud's duration
+        D/(v/E), the ratio of diffusivity to mobility, in V mm/cm. Siggen's 0.12 was set to the
+        diffusion measured (for electrons: Jacoboni et al., PRB 24 (1981) 1014) at the fields
+        of a detector, where carriers are hotter than the crystal. ``"temperature"`` is kT/e at
+        the temperature of the crystal (0.078 at 90 K), the limit of weak fields.
+        ``"siggen"`` is 0.12 with siggen's rounding of the number and of the cloud's duration
         to whole steps.
     cloud_fwhm_mm
-        Width of the charge cloud when it is set free.
+        Initial FWHM of the charge cloud in mm.
     self_repulsion
-        Let the cloud grow by the repulsion of its charges, hit by hit: a factor of
-        siggen's; 0 (or false) is none of it, 1 (or true) all.
+        Strength of the self-repulsion of the cloud of each hit, as a factor of siggen's: 0 (or
+        false) for none, 1 (or true) for all of it.
     electron_velocity_low_factor, electron_velocity_high_factor
-        Factors of the electrons' speed below 250 V/cm and above 1000 V/cm; in between
-        it goes smoothly with the logarithm of the field.
+        Factors of the electron speed below 250 V/cm and above 1000 V/cm. In between the
+        factor varies smoothly with the logarithm of the field.
     hole_velocity_low_factor, hole_velocity_high_factor
-        The same of the holes.
+        The same for holes.
     electron_trapping_per_us, hole_trapping_per_us
-        Rate at which charges are trapped for good, 1 over their lifetime in us; a
-        trapped charge induces no more, and lowers the energy collected.
+        Rate of permanent trapping, the inverse of the lifetime in us. A trapped charge induces
+        no further signal, which lowers the collected energy.
     library_grid_mm, library_halvings
-        Spacing in r and z of the coarsest pre-computed pulses, and how often a cell of
-        them is halved where it is not good enough.
+        Spacing in r and z of the coarsest pre-computed pulses in mm, and the maximum number of
+        times a cell is halved where the interpolation is not accurate enough.
     library_angles
         Number of azimuths from 0 to 45 degrees.
     library_step_ns
-        Longest sampling of the pre-computed pulses; that of the pulses if it is shorter.
+        Maximum sampling period of the pre-computed pulses in ns; that of the pulses if
+        shorter.
     library_tolerance
-        What a cell may be wrong by in its middle: any sample, of full scale, and the
-        largest rise in one sample, relative to itself.  Where cells of the smallest size
-        miss it, hits are drifted.
+        Maximum deviation at the centre of a cell: of any sample relative to full scale, and of
+        the largest rise in one sample relative to itself. Hits in the smallest cells that
+        exceed it are drifted individually.
     """
 
     switches = ("self_repulsion",)
@@ -88,22 +89,22 @@ class SimulationSettings(Config):
 
     @property
     def n_steps(self) -> int:
-        """Steps of the drift in one record."""
+        """Drift steps per record."""
         return self.n_samples * self.steps_per_sample
 
     @property
     def n_samples(self) -> int:
-        """Samples of one pulse."""
+        """Samples per pulse."""
         return int(self.length_ns / self.dt_ns + 1e-9)
 
     @property
     def steps_per_sample(self) -> int:
-        """Steps of the drift in one sample."""
+        """Drift steps per sample."""
         return round(self.dt_ns / self.step_ns)
 
     @property
     def velocity_factors(self) -> VelocityFactors:
-        """Factors of the speed at low and at high fields, of electrons and of holes."""
+        """Speed factors at low and high fields, of electrons and of holes."""
         return (
             (self.electron_velocity_low_factor, self.electron_velocity_high_factor),
             (self.hole_velocity_low_factor, self.hole_velocity_high_factor),
@@ -111,7 +112,7 @@ class SimulationSettings(Config):
 
     @property
     def trapping_per_ns(self) -> tuple[float, float]:
-        """Rates of trapping of electrons and of holes."""
+        """Trapping rates of electrons and holes in 1/ns."""
         return self.electron_trapping_per_us / 1000, self.hole_trapping_per_us / 1000
 
     @field_validator("diffusion_constant", mode="before")

@@ -1,4 +1,4 @@
-"""A detector that is not quite the one simulated, as a real one is."""
+"""A detector that deviates from its simulation, as a real one does."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Shift(Config):
-    """How a detector and its charge clouds differ from their simulation.
+    """Deviations of a detector and its charge clouds from their simulation.
 
-    By default in nothing.
+    There are none by default.
 
     Parameters
     ----------
     temperature_K, bias_V, li_thickness_mm, impurity_tilt_1e10_per_cm4
-        Added to the detector's.
+        Offsets added to the values of the detector.
     impurity_factor
-        All impurities are scaled by it.
+        Factor of all impurities.
     electron_velocity_low_factor, electron_velocity_high_factor, \
 hole_velocity_low_factor, hole_velocity_high_factor
-        The settings are multiplied by them.
+        Factors of the same settings.
     electron_trapping_per_us, hole_trapping_per_us
-        Added to the settings.
+        Offsets added to the same settings.
     cloud_fwhm_mm, diffusion_constant, self_repulsion
-        Instead of the settings; None leaves them as they are.
+        Replacements of the same settings. None keeps them.
 
     Examples
     --------
@@ -69,7 +69,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
 
     @classmethod
     def default(cls) -> Shift:
-        """The shift of the package."""
+        """Default shift of the package."""
         text = (files("cpunet.simulation") / "shifted_detector.yaml").read_text(
             encoding="utf-8"
         )
@@ -77,7 +77,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
 
     @classmethod
     def of(cls, parts: Iterable[str]) -> Shift:
-        """The shift of YAML files and of ``"KEY=VALUE"``, the later ones on top.
+        """Combine YAML files and ``"KEY=VALUE"`` strings. Later ones take precedence.
 
         Raises
         ------
@@ -105,12 +105,12 @@ hole_velocity_low_factor, hole_velocity_high_factor
             raise CpunetError(f"shift: {_problem(error, cls)}") from error
 
     def detector(self, detector: Detector) -> Detector:
-        """The detector as it is, of the detector as it is simulated.
+        """Shifted detector for a detector as simulated.
 
         Raises
         ------
         CpunetError
-            If there can be no such detector.
+            If the shifted detector is invalid.
         """
         values = detector.model_dump()
         values["impurity_scale"] *= self.impurity_factor
@@ -127,12 +127,12 @@ hole_velocity_low_factor, hole_velocity_high_factor
             ) from error
 
     def settings(self, settings: SimulationSettings) -> SimulationSettings:
-        """The settings of its pulses, of those of the simulation.
+        """Shifted settings for the settings of the simulation.
 
         Raises
         ------
         CpunetError
-            If a value is beyond what the settings allow.
+            If a value is outside the allowed range.
         """
         values = settings.model_dump()
         for name in ("cloud_fwhm_mm", "diffusion_constant", "self_repulsion"):
@@ -166,9 +166,9 @@ def _file_values(path: Path) -> Mapping[str, Any]:
 
 
 def _problem(error: ValidationError, kind: type[Config]) -> str:
-    """The first complaint in a line that names the key."""
+    """First problem in one line that names the key."""
     first = error.errors()[0]
-    # unions name their member, too
+    # for a union the location includes its member
     key = str(first["loc"][0]) if first["loc"] else ""
     if first["type"] == "extra_forbidden":
         return f"no such key {key}; there are {', '.join(kind.model_fields)}"

@@ -1,4 +1,4 @@
-"""Configuration files of siggen and fieldgen: lines of a key and a number."""
+"""Configuration files of siggen and fieldgen: lines with a key and a number."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _FIELDS = {
     "xtal_temp": "temperature_K",
     "xtal_grid": "grid_mm",
 }
-# values that stand for something else's absence, or are worked out below
+# alternative or neutral values, evaluated below
 _DERIVED = ("hole_length_gap", "outer_taper_width", "inner_taper_width", "bulletize_PC")
-# of the drift and of the program's own files
+# settings of the drift, and names of the program's files
 _NOT_OF_THE_DETECTOR = (
     "drift_name",
     "field_name",
@@ -62,12 +62,12 @@ _NOT_OF_THE_DETECTOR = (
 
 
 def detector_values(text: str, name: str) -> dict[str, Any]:
-    r"""Fields of `Detector` from the `text` of the configuration file `name`.
+    r"""Fields of `Detector` from the content `text` of the configuration file `name`.
 
     Raises
     ------
     CpunetError
-        If a key is unknown, or has no number.
+        If a key is unknown or has no number.
 
     Examples
     --------
@@ -102,7 +102,7 @@ def detector_values(text: str, name: str) -> dict[str, Any]:
         width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
         if width and length and "taper_angle" not in values:
             fields[angle] = math.degrees(math.atan(width / length))
-    # siggen keeps the radius and the end's rounding of a hole that is not there
+    # siggen keeps the radius and the rounding of a hole that does not exist
     if not fields.get("bore_length"):
         fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}
     return fields

@@ -26,7 +26,7 @@ from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Pulses of single hits, in units of the hit's charge.
+    """Pulses of single hits, in units of the charge of the hit.
 
     Parameters
     ----------
@@ -35,16 +35,17 @@ class Signals:
     dt_ns
         Sampling period in ns.
     valid
-        Hits that give a signal; the others lie in a contact, outside the crystal or in
-        germanium without a field.
+        Whether a hit gives a signal. Hits in a contact, outside the crystal or in germanium
+        without a field do not.
     collected
-        Hits whose carriers both arrived within the record.
+        Whether both carriers were collected within the record.
     collection_time_ns
-        Time at which the last carrier arrived, or the record ended; NaN if not valid.
+        Time in ns at which the last carrier was collected or the record ended; NaN if not
+        valid.
     cloud_fwhm_ns
-        Duration (FWHM) by which the charge cloud smears the pulse; NaN if not valid.
+        FWHM in ns of the smearing by the charge cloud; NaN if not valid.
     trapped
-        What trapping takes off the end of the pulse; NaN if not valid.
+        Fraction of the signal lost to trapping; NaN if not valid.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -64,29 +65,55 @@ def hit_signals(
     edep_kev: npt.ArrayLike,
     settings: SimulationSettings,
 ) -> Signals:
-    """Simulate the charge pulse of each hit, in parallel over the hits.
+    r"""Simulate the charge pulse of each hit, in parallel over the hits.
 
-    Electron and hole drift from the same place in explicit steps; the pulse is the
-    change of the weighting potential at both (Shockley-Ramo), smeared by a Gaussian as
-    long as the cloud takes into the contact, and averaged over each sample.
+    An electron and a hole drift from the same point in explicit steps. By the Shockley-Ramo
+    theorem the induced charge, in units of the charge of the hit, is the difference of the
+    weighting potential :math:`\phi_w` between hole and electron,
+
+    .. math:: S(t) = \phi_w(\mathbf{x}_h(t)) - \phi_w(\mathbf{x}_e(t)).
+
+    The pulse is convolved with a Gaussian as long as the charge cloud takes to enter the
+    contact, and averaged over each sample.
 
     Parameters
     ----------
     fields
         Field maps of the detector.
     x_mm, y_mm, z_mm
-        Places of the hits in the crystal's coordinates.
+        Positions of the hits in mm in the frame of the crystal.
     edep_kev
-        Energies; they matter for the self-repulsion of the cloud only.
+        Energies of the hits in keV. They affect only the self-repulsion of the cloud.
+    settings
+        Simulation settings.
 
     Raises
     ------
     CpunetError
-        If a coordinate or an energy is no finite number, or their numbers differ.
+        If a coordinate or an energy is not finite, or their numbers differ.
 
     References
     ----------
     Z. He, NIM A 463 (2001) 250 (Shockley-Ramo); D. C. Radford, siggen.
+
+    Examples
+    --------
+    In a planar detector of thickness :math:`d` the pulse rises by :math:`(v_e + v_h)/d`.
+
+    >>> from types import SimpleNamespace
+    >>> from cpunet.simulation.velocity import drift_velocity, velocity_table
+    >>> height = np.tile(np.arange(11.0), (11, 1))  # z in mm
+    >>> planar = SimpleNamespace(
+    ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,
+    ...     e_r_V_per_cm=0 * height, e_z_V_per_cm=0 * height - 1000,
+    ...     point_type=np.full((11, 11), 2, np.int8), temperature_K=90.0)
+    >>> point = SimulationSettings(dt_ns=1, length_ns=200, diffusion=False, cloud_fwhm_mm=0)
+    >>> pulse = hit_signals(planar, 0.0, 0.0, [5.0], 100.0, point).waveforms[0]
+    >>> along_z = [[0.0, 0.0, -1000.0]]
+    >>> v_e, v_h = (
+    ...     abs(drift_velocity(velocity_table(90), along_z, c)[0, 2]) for c in (ELECTRON, HOLE))
+    >>> bool(abs(pulse[20] - 20 * (v_e + v_h) / 10) < 1e-3), round(float(pulse[-1]), 3)
+    (True, 1.0)
     """
     hits = hit_table(x_mm, y_mm, z_mm, edep_kev)
     n = len(hits)
@@ -111,7 +138,7 @@ def hit_signals(
 def hit_table(
     x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
 ) -> FloatArray:
-    """Hits as rows x, y, z (mm), energy (keV); see `hit_signals` for what is refused."""
+    """Hits as rows x, y, z (mm), energy (keV); `hit_signals` lists what is refused."""
     try:
         columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
     except ValueError as error:
@@ -125,14 +152,14 @@ def hit_table(
 
 
 def time_numbers(settings: SimulationSettings) -> tuple[float, int, int]:
-    """Step in ns, steps per sample and at once, as the compiled loops want them."""
+    """Step in ns, steps per sample and stride, in the form the compiled loops take."""
     return settings.step_ns, settings.steps_per_sample, settings.stride
 
 
 def cloud_numbers(
     fields: Maps, settings: SimulationSettings
 ) -> tuple[float, float, float, bool]:
-    """First width (mm), diffusion constant, repulsion per keV, siggen's rounding."""
+    """Initial FWHM (mm), diffusion constant, repulsion per keV, and siggen's rounding."""
     siggen = settings.diffusion_constant == "siggen"
     constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
     growing = settings.diffusion or settings.self_repulsion > 0
@@ -153,8 +180,10 @@ def point_signal(
     stride: int,
     signal: FloatArray,
 ) -> tuple[int, bool, float, float]:
-    """Fill `signal` with the pulse of a point charge; give last step, whether all is
-    collected, the FWHM in steps by which the cloud smears it, and the share trapped.
+    """Fill `signal` with the pulse of a point charge.
+
+    Returns the last step, whether all charge is collected, the FWHM in steps of the smearing
+    by the cloud, and the fraction trapped.
     """
     record = signal if stride == 1 else np.empty(len(signal) // stride + 2)
     record[:] = 0.0
@@ -181,7 +210,7 @@ def point_signal(
 
 @kernel
 def cloud_steps(size: float, speed: float, step_ns: float, whole: bool) -> float:
-    """Steps (FWHM) a cloud takes into the contact; siggen counts them in `whole` ones."""
+    """FWHM in steps of the cloud entering the contact. `whole` rounds it as siggen does."""
     if speed <= 0.0:
         return 0.0
     fwhm = size / (speed * step_ns)

@@ -1,11 +1,14 @@
-"""One solution of a detector for every bias and every scale of its impurities.
+r"""One solution of a detector for every bias and every scale of its impurities.
 
-With space charge everywhere the potential is linear in its causes,
-``V = bias w + scale u + tilt t + q`` (`w`: 1 on the lithium contact; `u`: of the impurities
-as given; `t`: of a unit of their tilt; `q`: of a charge on the surface), so that none of
-bias, scale and tilt needs another solution.  Where a part of the detector is not depleted
-this does not hold: such a potential has a pocket (see `cpunet.simulation.depletion`), and is
-refused.
+With space charge everywhere the potential is linear in its sources,
+
+.. math:: V = b\, w + s\, u + t\, v + q,
+
+with the bias :math:`b`, the scale :math:`s` and the tilt :math:`t` of the impurities. The parts
+are :math:`w` (1 on the lithium contact), :math:`u` (impurities as given), :math:`v` (unit
+tilt) and :math:`q` (surface charge). Bias, scale and tilt therefore need no new solution. This
+does not hold if part of the detector is not depleted. Such a potential has a pocket (see
+`cpunet.simulation.depletion`) and is refused.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from cpunet.simulation.poisson import Potentials, solve_potentials
 
 Progress = Callable[[str], None]
 
-# none of them matters to the parts of the potential
+# fields that do not affect the parts of the potential
 NOT_IN_PARTS = (
     "name",
     "temperature_K",
@@ -41,17 +44,17 @@ _LARGEST_SCALE = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Superposition:
-    """What the bias, the impurities and a surface charge each add to the potential.
+    """Contributions of the bias, the impurities and a surface charge to the potential.
 
     Parameters
     ----------
     detector
-        As solved for; its bias does not enter, and its impurities are neither scaled nor
+        Detector as solved. Its bias is irrelevant, and its impurities are neither scaled nor
         tilted.
     grid, potentials
-        The nodes, and the parts of the potential on them.
+        Nodes, and the parts of the potential at them.
     unit_depletion_V
-        Depletion voltage with the impurities as given, ``impurity_scale`` 1.
+        Depletion voltage in V for an ``impurity_scale`` of 1.
     """
 
     detector: Detector
@@ -62,12 +65,16 @@ class Superposition:
     def potential_V(
         self, bias_V: float, impurity_scale: float = 1.0, impurity_tilt: float = 0.0
     ) -> FloatArray:
-        """Potential (nr, nz) at a bias, with all impurities scaled, and tilted (1e10/cm4).
+        r"""Potential (nr, nz) in V for a bias in V and scaled and tilted impurities.
+
+        .. math:: V = b\, w + s\, u + t\, v + q
+
+        The tilt is in 1e10/cm4.
 
         Raises
         ------
         CpunetError
-            If the detector is not depleted: nothing can be superposed there.
+            If the detector is not depleted, so that the superposition does not hold.
         """
         potential = self._sum(bias_V, impurity_scale, impurity_tilt)
         if has_pocket(potential, self.grid.region):
@@ -75,9 +82,9 @@ class Superposition:
         return potential
 
     def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
-        """Smallest bias that depletes the detector; infinite if there is none."""
+        """Smallest bias in V that depletes the detector; infinite if there is none."""
         if not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0:
-            # without another charge all of V scales together
+            # without another charge, all of V scales together
             return impurity_scale * self.unit_depletion_V
         return depletion_voltage(
             self.potentials.bias,
@@ -86,12 +93,12 @@ class Superposition:
         )
 
     def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
-        """Scale of the impurities with which the detector just depletes at `depletion_V`.
+        """Scale of the impurities at which the detector just depletes at `depletion_V`.
 
         Raises
         ------
         CpunetError
-            If no scale does that.
+            If there is no such scale.
         """
         low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
         what = f"detector {self.detector.name}: {depletion_V:g} V"
@@ -138,18 +145,18 @@ class Superposition:
 def solve(
     detector: Detector, *, cache: bool = True, progress: Progress | None = None
 ) -> Superposition:
-    """Solve for the parts of a detector's potential, or take them from the cache.
+    """Solve for the parts of a detector's potential, or load them from the cache.
 
     Parameters
     ----------
     detector
         Geometry and impurities.
     cache
-        Keep the parts on disk (in ``$CPUNET_CACHE``, or the user's cache folder) and
-        take them from there if the same detector was solved before, at any bias and with
-        any scale and tilt of its impurities.
+        Whether to keep the parts on disk (in ``$CPUNET_CACHE`` or the user's cache folder)
+        and to load them if the same detector was solved before, at any bias and any scale and
+        tilt of its impurities.
     progress
-        Called with a few words as each part starts.
+        Called with a short description when each part starts.
 
     Raises
     ------

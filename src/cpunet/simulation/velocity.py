@@ -1,8 +1,11 @@
-"""Drift velocity of electrons and holes in cubic germanium, fast enough for every step.
+r"""Drift velocity of electrons and holes in cubic germanium.
 
-A table along three crystal axes at 77 K, scaled to the crystal's temperature, and the
-anisotropic velocity for any direction of the field.  The velocity is the gradient, in
-the space of fields, of the integral of the speed over the field strength.
+Speeds measured along three crystal axes at 77 K are scaled to the crystal temperature. The
+anisotropic velocity for any direction of the field is the gradient, with respect to the
+field, of the integral of the speed over the field strength,
+
+.. math:: \mathbf{v}(\mathbf{E}) = \pm \nabla_E \int_0^{|\mathbf{E}|}
+    v(E' \hat{\mathbf{n}})\, dE', \qquad \hat{\mathbf{n}} = \mathbf{E} / |\mathbf{E}|.
 """
 
 from __future__ import annotations
@@ -32,19 +35,19 @@ _MOBILITY = (5.66e7, 1.63e9)
 _POWER = (-1.680, -2.398)
 _SPEED = (1.3e7, 1.2e7)
 _THETA_K = 200.0
-# V/cm: below the first the low factor of the speed holds, above the second the high one
+# V/cm: the low-field factor applies below the first, the high-field factor above the second
 _LOW_FIELD, _HIGH_FIELD = 250.0, 1000.0
 
-# Factors of the speed at low and at high fields, of electrons and of holes.
+# Speed factors at low and high fields, of electrons and of holes.
 VelocityFactors = tuple[tuple[float, float], tuple[float, float]]
 AS_MEASURED: VelocityFactors = ((1.0, 1.0), (1.0, 1.0))
 
 
 class VelocityTable(NamedTuple):
-    """Anisotropy coefficients at equidistant field strengths, linear in between.
+    """Anisotropy coefficients at equidistant field strengths, interpolated linearly.
 
-    ``coefficients`` has shape ``(2 carriers, n fields, 6)`` in mm/ns: a, b, c, the means
-    of b and c from field 0 on, and the speed along <100>.
+    ``coefficients`` has shape ``(2 carriers, n fields, 6)`` in mm/ns: a, b, c, the means of
+    b and c over fields from 0 upwards, and the speed along <100>.
     """
 
     coefficients: FloatArray
@@ -52,7 +55,7 @@ class VelocityTable(NamedTuple):
 
 
 def measured_table() -> FloatArray:
-    """The 77 K table: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
+    """Speeds at 77 K: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
     lines = files("cpunet.simulation").joinpath("drift_velocity.csv").read_text("utf-8")
     rows = [row for row in csv.reader(lines.splitlines()) if not row[0].startswith("#")]
     return np.array(rows[1:], dtype=np.float64)
@@ -61,14 +64,30 @@ def measured_table() -> FloatArray:
 def velocity_table(
     temperature_K: float, factors: VelocityFactors = AS_MEASURED
 ) -> VelocityTable:
-    """Anisotropy coefficients at a crystal temperature.
+    r"""Anisotropy coefficients at a crystal temperature.
+
+    The speeds at 77 K along <100>, <110> and <111> are multiplied by :math:`f(T)/f(77)` with
+
+    .. math:: f = \frac{v_s x}{\sqrt{1 + x^2}}, \qquad x = \frac{\mu_0 E}{v_s}, \qquad
+        v_s = B \sqrt{\tanh\frac{\theta}{2T}}, \qquad \mu_0 = A T^p,
+
+    and combined into the coefficients of `drift_velocity`,
+
+    .. math:: a = \frac{v_{100}}{2} - 4 v_{110} + \frac{9 v_{111}}{2}, \quad
+        b = -\frac{5 v_{100}}{2} + 16 v_{110} - \frac{27 v_{111}}{2}, \quad
+        c = 3 v_{100} - 12 v_{110} + 9 v_{111}.
 
     Parameters
     ----------
     temperature_K
-        Limited to 40-120 K, the range of the temperature model.
+        Crystal temperature in K. It is limited to 40-120 K, the range of the model.
     factors
-        Of the speeds along all axes, see `velocity_factor`.
+        Speed factors common to all axes, see `velocity_factor`.
+
+    References
+    ----------
+    M. A. Omar and L. Reggiani, Solid-State Electronics 30 (1987) 1351, with the values of
+    D. C. Radford (2015).
 
     Examples
     --------
@@ -95,9 +114,33 @@ def velocity_table(
 
 
 def drift_velocity(table: VelocityTable, field: npt.ArrayLike, carrier: int) -> FloatArray:
-    """Velocity vectors (n, 3) in mm/ns for field vectors (n, 3) in V/cm.
+    r"""Velocity vectors (n, 3) in mm/ns for field vectors (n, 3) in V/cm.
 
-    The <100> axes are x, y and z.  `carrier` is `ELECTRON` or `HOLE`.
+    With the direction :math:`n_i = E_i/|E|` of the field, :math:`S_k = \sum_i n_i^k` and the
+    coefficients :math:`a`, :math:`b`, :math:`c` of `velocity_table`,
+
+    .. math:: v_i = \pm n_i \left[a + b S_4 + c S_6 + 4 \bar{b} (n_i^2 - S_4)
+        + 6 \bar{c} (n_i^4 - S_6)\right], \qquad \bar{b} = \frac{1}{E} \int_0^E b\, dE',
+
+    positive for holes and negative for electrons. The <100> axes are x, y and z.
+
+    Parameters
+    ----------
+    table
+        Coefficients at the crystal temperature.
+    field
+        Field vectors in V/cm, shape ``(n, 3)``.
+    carrier
+        `ELECTRON` or `HOLE`.
+
+    Examples
+    --------
+    Along <100> the speed is that of the table.
+
+    >>> row = measured_table()[8]
+    >>> speed = drift_velocity(velocity_table(77.0), [[row[0], 0.0, 0.0]], HOLE)[0]
+    >>> bool(abs(speed[0] - row[4]) < 1e-12), speed[1:].tolist()
+    (True, [0.0, 0.0])
     """
     vectors = np.ascontiguousarray(field, dtype=np.float64)
     velocity: FloatArray = _velocities(table, vectors, carrier)
@@ -105,9 +148,10 @@ def drift_velocity(table: VelocityTable, field: npt.ArrayLike, carrier: int) -> 
 
 
 def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> FloatArray:
-    """Factor of the speed: `low` up to 250 V/cm, `high` from 1000 V/cm on.
+    r"""Speed factor: `low` up to 250 V/cm, `high` from 1000 V/cm.
 
-    In between it goes smoothly with the logarithm of the field.
+    .. math:: f = f_l + (f_h - f_l)\, x^2 (3 - 2x), \qquad
+        x = \frac{\ln(E / 250\ \mathrm{V/cm})}{\ln 4} \in [0, 1]
 
     Examples
     --------
@@ -133,7 +177,7 @@ def _speed_model(carrier: int, field: FloatArray, temperature_K: float) -> Float
 
 
 def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
-    """Mean of `values` from field 0 to each field, by trapezoids."""
+    """Mean of `values` over fields from 0 to each field, by the trapezoidal rule."""
     areas = np.diff(field) * (values[1:] + values[:-1]) / 2
     integral = np.concatenate([[0.0], np.cumsum(areas)])
     mean: FloatArray = np.divide(integral, field, out=values.copy(), where=field > 0)
@@ -151,7 +195,7 @@ def carrier_velocity(
 ) -> tuple[float, float, float, float, float, float]:
     """Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
 
-    Beyond the last field of the table its last interval goes on.
+    Beyond the last field of the table, its last interval is extrapolated linearly.
     """
     strength = math.sqrt(ex * ex + ey * ey + ez * ez)
     if strength <= 0.0:

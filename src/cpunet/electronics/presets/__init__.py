@@ -1,4 +1,4 @@
-"""Readout chains from files: those of the package, and the user's own."""
+"""Readout chains from YAML files: the presets of the package and the user's own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FOLDER = files("cpunet.electronics.presets")
 
 
 def electronics_names() -> list[str]:
-    """Names of the readout chains that come with the package.
+    """Names of the preset readout chains.
 
     Examples
     --------
@@ -33,12 +33,13 @@ def read_electronics(path: str | Path) -> Electronics:
     Parameters
     ----------
     path
-        One of `electronics_names`, or a YAML file with the fields of `Electronics`.
+        Name of a preset (see `electronics_names`) or a YAML file with the fields of
+        `Electronics`.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read, or the chain is impossible; it names the field.
+        If the file cannot be read or the chain is invalid. The message names the field.
 
     Examples
     --------

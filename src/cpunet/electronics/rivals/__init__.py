@@ -1,1 +1,1 @@
-"""What a user would pick instead of a network: each method fitted to the same unpaired sets."""
+"""Baseline methods a user would choose instead of a network, fitted to the same datasets."""

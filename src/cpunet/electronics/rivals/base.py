@@ -1,4 +1,4 @@
-"""What every rival can do, and what it may be given."""
+"""Interface of the baseline methods, and checks of their input."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-FEWEST = 50  # pulses on either side, below which no response is fitted
+FEWEST = 50  # minimum number of pulses of either dataset for a fit
 
 
 class Rival(Protocol):
-    """A causal, linear response of the electronics, fitted to unpaired pulses."""
+    """A baseline method: a causal linear response fitted to unpaired pulses."""
 
     name: ClassVar[str]
 
     @property
     def dt_ns(self) -> float:
-        """Sampling period in ns of the pulses that it was fitted to."""
+        """Sampling period in ns of the pulses in the fit."""
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit to simulated and measured pulses of other events.
+        """Fit to simulated and measured pulses of different events.
 
         Parameters
         ----------
         sim, data
-            Prepared windows of shape ``(n, length)``, simulated ones 0…1.
+            Prepared windows, shape ``(n, length)``. Simulated ones range from 0 to 1.
         dt_ns
             Sampling period in ns.
         align
@@ -41,25 +41,26 @@ class Rival(Protocol):
         Raises
         ------
         CpunetError
-            If there are too few pulses, some are not finite, or the sets differ in length.
+            If there are too few pulses, if any is not finite, or if the datasets differ in
+            length.
         """
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Give the noise-free response to simulated windows.
+        """Noise-free response to simulated windows.
 
         Returns
         -------
         numpy.ndarray
-            Records with room on both sides of the window, see `response`, neither
-            aligned nor normalised; `finishing.finish` makes windows of them.
+            Records with padding on both sides of the window (see `response`), neither
+            aligned nor normalised. `finishing.finish` converts them into windows.
         """
 
     def describe(self) -> Mapping[str, float]:
-        """Fitted numbers by name, the unit at the end of the name."""
+        """Fitted values by name. Each name ends with the unit."""
 
 
 def check_sets(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> None:
-    """Raise a `CpunetError` unless a response can be fitted to the two sets."""
+    """Raise a `CpunetError` unless a response can be fitted to the two datasets."""
     for side, windows in (("simulated", sim), ("measured", data)):
         check_windows(windows, side)
         if len(windows) < FEWEST:
@@ -81,7 +82,7 @@ def check_sets(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> N
 
 
 def check_windows(windows: FloatArray, side: str) -> None:
-    """Raise a `CpunetError` unless these are finite waveforms, one a row."""
+    """Raise a `CpunetError` unless the waveforms are finite, with one waveform per row."""
     if windows.ndim != 2 or windows.shape[1] < 2:
         raise CpunetError(
             f"{side} waveforms have shape {windows.shape}; expected (pulses, samples)"

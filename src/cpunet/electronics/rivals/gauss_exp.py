@@ -1,7 +1,7 @@
 """Gaussian and exponential kernel fitted to superpulses: the method of LEGEND's production.
 
-The response to a step is the convolution of a Gaussian (sigma) with an exponential (tau)
-and a decay; sigma and tau are fitted to mean current pulses in slices of the rise time.
+The step response is the convolution of a Gaussian (sigma) with an exponential (tau), followed
+by a decay. Sigma and tau are fitted to mean current pulses in slices of rise time.
 """
 
 from __future__ import annotations
@@ -32,25 +32,27 @@ from cpunet.electronics.rivals.superpulses import (
 )
 from cpunet.pulses.container import FloatArray
 
-MOST = 2000  # pulses of either side that the fit is made on
-ROUNDS = 3  # of fit and of slices drawn again with what was fitted
-EDGE = 96  # samples before and after the half height that are compared
-START = 2.0  # sigma and tau at first, in samples
-LONGEST = 64.0  # the largest sigma and tau, in samples
+MOST = 2000  # maximum number of pulses of either dataset in the fit
+ROUNDS = 3  # iterations of the fit, each with slices by the response fitted so far
+EDGE = 96  # samples compared before and after the half maximum
+START = 2.0  # initial sigma and tau, in samples
+LONGEST = 64.0  # maximum sigma and tau, in samples
 
 
 @dataclass(frozen=True)
 class GaussExp:
-    """A Gaussian and an exponential kernel followed by an exponential decay.
+    r"""A Gaussian and an exponential kernel followed by an exponential decay.
+
+    .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
 
     Parameters
     ----------
     dt_ns
         Sampling period in ns.
     sigma_ns, tau_ns
-        Standard deviation of the Gaussian and constant of the exponential, in ns.
+        Standard deviation of the Gaussian and time constant of the exponential, in ns.
     tail_slope_per_ms
-        Slope of the logarithm of the tail, in 1/ms.
+        Logarithmic slope of the tail in 1/ms.
     """
 
     dt_ns: float
@@ -61,7 +63,7 @@ class GaussExp:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit superpulses in slices of the rise time, see `base.Rival.fit`."""
+        """Fit superpulses in slices of rise time, see `base.Rival.fit`."""
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
@@ -75,7 +77,7 @@ class GaussExp:
         for _ in range(ROUNDS):
             transfer = _transfer(length, 1.0, best[0], best[1])
             groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
-            # what is in no slice has no part in the fit
+            # pulses outside the slices do not enter the fit
             sliced = spectra[np.concatenate(groups)]
             ends = np.cumsum([len(group) for group in groups])
             places = np.split(np.arange(ends[-1]), ends[:-1])
@@ -93,14 +95,14 @@ class GaussExp:
         return cls(dt_ns, sigma, tau, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Smooth and let decay, see `base.Rival.translate`."""
+        """Apply the kernel and the decay, see `base.Rival.translate`."""
         check_windows(waveforms, "simulated")
         length = record_length(waveforms.shape[1])
         transfer = _transfer(length, self.dt_ns, self.sigma_ns, self.tau_ns)
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
 
     def describe(self) -> Mapping[str, float]:
-        """Widths of the kernel and tail slope."""
+        """Widths of the kernel, and tail slope."""
         return {
             "sigma_ns": self.sigma_ns,
             "tau_ns": self.tau_ns,
@@ -116,7 +118,7 @@ def _transfer(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spec
 
 
 def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
-    """Superpulses of currents around the half height, shape ``(slices, 2 * EDGE)``."""
+    """Superpulses of currents around the half maximum, shape ``(slices, 2 * EDGE)``."""
     steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
     means = superpulses(spectra, crossing(steps, 0.5), groups, length)
     return np.asarray(

@@ -1,4 +1,4 @@
-"""The simulation as it is: what no translation at all scores."""
+"""The untranslated simulation, as a reference for the scores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cpunet.pulses.container import FloatArray
 
 @dataclass(frozen=True)
 class Raw:
-    """No electronics: the window, extended."""
+    """No electronics: the window with padding."""
 
     dt_ns: float
     name: ClassVar[str] = "raw"
@@ -27,7 +27,7 @@ class Raw:
         return cls(dt_ns)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Extend the windows to records, see `base.Rival.translate`."""
+        """Pad the windows to records, see `base.Rival.translate`."""
         check_windows(waveforms, "simulated")
         before = np.zeros((len(waveforms), ROOM_BEFORE), np.float32)
         after = np.repeat(waveforms[:, -1:], ROOM_AFTER, axis=1)

@@ -1,8 +1,8 @@
-"""One RC integration and a decay: what the pulse simulation program siggen offers.
+"""One RC integration and a decay: the option of the pulse simulation program siggen.
 
-siggen (D. C. Radford) passes its output through s_j = s_{j-1} + (x_{j-1} - s_{j-1}) dt/tau;
-users match tau to the current amplitude of single-site events (100 ns in Bhimani et
-al. 2026, section 4.1).
+siggen (D. C. Radford) passes its output through s_j = s_{j-1} + (x_{j-1} - s_{j-1}) dt/tau.
+Users match tau to the current amplitude of single-site events (100 ns in Bhimani et al.
+2026, section 4.1).
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
 
-LONGEST = 64  # samples of the largest tau that is tried
-MOST = 4000  # pulses that the match is made on
-TOLERANCE = 1e-3  # of a sample
+LONGEST = 64  # maximum tau, in samples
+MOST = 4000  # maximum number of pulses in the fit
+TOLERANCE = 1e-3  # precision of tau, in samples
 
 
 @dataclass(frozen=True)
 class RC:
-    """A single RC integration followed by an exponential decay.
+    r"""A single RC integration followed by an exponential decay.
+
+    .. math:: s_j = s_{j-1} + (x_{j-1} - s_{j-1})\, \Delta t / \tau
 
     Parameters
     ----------
@@ -44,7 +46,7 @@ class RC:
     tau_ns
         Time constant of the integration in ns, at least one sampling period.
     tail_slope_per_ms
-        Slope of the logarithm of the tail, in 1/ms.
+        Logarithmic slope of the tail in 1/ms.
     """
 
     dt_ns: float
@@ -54,12 +56,13 @@ class RC:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Match the most frequent current amplitude and the tails, see `base.Rival.fit`.
+        """Match the mode of the current amplitudes and the tails, see `base.Rival.fit`.
 
         Raises
         ------
         CpunetError
-            As `base.Rival.fit`; also if the data are slower than any tau tried.
+            For the reasons of `base.Rival.fit`, or if the data are slower than the maximum
+            tau.
         """
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
@@ -84,7 +87,7 @@ class RC:
         return cls(dt_ns, tau * dt_ns, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Integrate and let decay, see `base.Rival.translate`."""
+        """Apply the integration and the decay, see `base.Rival.translate`."""
         check_windows(waveforms, "simulated")
         records = np.empty((len(waveforms), record_length(waveforms.shape[1])), np.float32)
         for rows in blocks(len(waveforms)):
@@ -98,9 +101,9 @@ class RC:
 
 
 def most_frequent(values: Values) -> float:
-    """Median of the shortest interval that holds half of the values.
+    """Median of the shortest interval that contains half of the values.
 
-    For current amplitudes that is the single-site part: its peak is the narrowest.
+    For current amplitudes this is the single-site peak, which is the narrowest.
 
     Examples
     --------
@@ -116,5 +119,5 @@ def most_frequent(values: Values) -> float:
 
 
 def _integration(current: Values, rate: float) -> Values:
-    """Pass through siggen's recursion; `rate` is the sampling period over tau."""
+    """Apply siggen's recursion. `rate` is the sampling period divided by tau."""
     return np.asarray(scipy.signal.lfilter([0.0, rate], [1.0, rate - 1.0], current), float)

@@ -1,4 +1,4 @@
-"""All rivals by name, from the simplest to the most free."""
+"""All baseline methods by name, from the simplest to the most flexible."""
 
 from __future__ import annotations
 

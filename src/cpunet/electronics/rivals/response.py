@@ -1,9 +1,8 @@
-"""Linear responses applied to windows: kernel on the current, then the decay.
+"""Linear responses applied to windows: a kernel on the current, then the decay.
 
-A window is extended before the response acts: no charge has moved before it, and all
-has been collected after it.  In the current both are zeros, so the extension costs
-nothing but room: for what the kernel adds before and after, and for the window that is
-cut out again around a later alignment.
+A window is padded before the response acts. Before it no charge has moved; after it all has
+been collected, so the current is zero on both sides. The padding holds what the kernel adds
+before and after the window, and allows a later alignment to cut the window again.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from cpunet.pulses.container import FloatArray
 
 Spectrum = npt.NDArray[np.complex128]
 
-# Samples of room; a window of 800 becomes a record of 1400, a fast length of the FFT.
+# Samples of padding. A window of 800 becomes a record of 1400, a fast length of the FFT.
 ROOM_BEFORE = 200
 ROOM_AFTER = 400
 
 
 def record_length(window: int) -> int:
-    """Samples of the record that a window of so many becomes."""
+    """Number of samples of the record that a window of `window` samples becomes."""
     return ROOM_BEFORE + window + ROOM_AFTER
 
 
@@ -40,18 +39,36 @@ def currents(windows: FloatArray) -> Values:
 
 
 def frequencies_mhz(length: int, dt_ns: float) -> Values:
-    """Frequencies of the spectrum of so many samples, in MHz."""
+    """Frequencies in MHz of the real FFT of `length` samples."""
     return np.asarray(scipy.fft.rfftfreq(length, dt_ns * 1e-3), float)
 
 
 def filtered(current: Values, transfer: Spectrum) -> Values:
-    """Currents after a kernel given by its transfer function over the record."""
+    """Apply a kernel, given by its transfer function over the record, to currents."""
     spectrum = scipy.fft.rfft(current, axis=1) * transfer
     return np.asarray(scipy.fft.irfft(spectrum, current.shape[1], axis=1), float)
 
 
 def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Values:
-    """Charge pulses of currents, each step decaying with the slope of its logarithm."""
+    r"""Integrate currents to charge pulses, where each step decays exponentially.
+
+    .. math:: s_j = e^{\lambda \Delta t} s_{j-1} + x_j
+
+    Parameters
+    ----------
+    current
+        Charge collected per sample, shape ``(n, samples)``.
+    tail_slope_per_ms
+        Logarithmic slope :math:`\lambda` of the tail in 1/ms, negative for a decay.
+    dt_ns
+        Sampling period :math:`\Delta t` in ns.
+
+    Examples
+    --------
+    >>> charge = integrated(np.array([[0.0, 1.0, 0.0, 0.0]]), -20.0, 50_000.0)
+    >>> charge.round(3).tolist()  # a decay time of 50 us
+    [[0.0, 1.0, 0.368, 0.135]]
+    """
     kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -kept], current, axis=1), float)
 
@@ -59,7 +76,7 @@ def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Value
 def respond(
     windows: FloatArray, transfer: Spectrum, tail_slope_per_ms: float, dt_ns: float
 ) -> FloatArray:
-    """Response of a kernel and a decay to windows.
+    """Apply a kernel and a decay to windows.
 
     Parameters
     ----------
@@ -68,14 +85,14 @@ def respond(
     transfer
         Transfer function of the kernel at the frequencies of the record.
     tail_slope_per_ms
-        Slope of the logarithm of the tail in 1/ms, negative for a decay.
+        Logarithmic slope of the tail in 1/ms, negative for a decay.
     dt_ns
         Sampling period in ns.
 
     Returns
     -------
     numpy.ndarray
-        Float32, shape ``(n, record_length(length))``.
+        Records, float32, shape ``(n, record_length(length))``.
     """
     records = np.empty((len(windows), record_length(windows.shape[1])), np.float32)
     for rows in blocks(len(windows)):

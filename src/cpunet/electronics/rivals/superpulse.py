@@ -1,9 +1,9 @@
 """A free kernel from superpulses: the Wiener-regularised ratio of mean spectra.
 
-In each slice of the rise time the mean measured current is the mean simulated one
-passed through the kernel, so the kernel's transfer function is the ratio of their
-spectra, H = sum(D S*) / sum(|S|^2) over the slices.  Where the measured spectrum is no
-larger than its statistical error, a Wiener factor takes H to zero.
+In each slice of rise time the mean measured current is the mean simulated current convolved
+with the kernel. The transfer function of the kernel is therefore the ratio of their spectra,
+H = sum(D S*) / sum(|S|^2) over the slices. A Wiener factor suppresses H where the measured
+spectrum does not exceed its statistical error.
 """
 
 from __future__ import annotations
@@ -33,24 +33,30 @@ from cpunet.electronics.rivals.superpulses import (
 )
 from cpunet.pulses.container import FloatArray
 
-MOST = 4000  # pulses of either side that the kernel is made of
-ROUNDS = 4  # of the kernel and of half heights found again with it
-LEAD, LAG = 32, 256  # samples of the kernel before and after the half height
-FADE_IN, FADE_OUT = 8, 64  # of these, over how many it is faded in and out
+MOST = 4000  # maximum number of pulses of either dataset
+ROUNDS = 4  # iterations of the kernel, each with half maxima of the response found so far
+LEAD, LAG = 32, 256  # samples of the kernel before and after the half maximum
+FADE_IN, FADE_OUT = 8, 64  # samples over which the ends of the kernel are tapered
 
 
 @dataclass(frozen=True, eq=False)
 class Superpulse:
-    """A free kernel followed by an exponential decay.
+    r"""A free kernel followed by an exponential decay.
+
+    .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
+        W = \max\left(0, 1 - \frac{\sum \sigma_D^2}{\sum |D|^2}\right)
+
+    The sums run over the slices. :math:`D` and :math:`S` are the mean spectra of data and
+    simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors.
 
     Parameters
     ----------
     dt_ns
         Sampling period in ns.
     kernel
-        Weights of sum 1, `LEAD` samples before zero delay and `LAG` from it on.
+        Weights with a sum of 1: `LEAD` samples before zero delay and `LAG` from it on.
     tail_slope_per_ms
-        Slope of the logarithm of the tail, in 1/ms.
+        Logarithmic slope of the tail in 1/ms.
     """
 
     dt_ns: float
@@ -72,18 +78,18 @@ class Superpulse:
         kernel = np.zeros(LEAD + LAG)
         kernel[LEAD] = 1.0
         for _ in range(ROUNDS):
-            # The simulated pulses are placed by the half height of their response, which
-            # no shift of their own half height gives exactly.
+            # The simulated pulses are placed by the half maximum of their response. A shift
+            # of their own half maximum does not give this exactly.
             response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
             kernel = _kernel(wanted, _superpulses(spectra, response), length)
         found = cls(dt_ns, kernel, slope)
-        # what the late part of the kernel adds to the tail slope is taken from the decay
+        # the contribution of the kernel's late part to the tail slope is taken off the decay
         windows = found.translate(sim[:MOST])[:, ROOM_BEFORE : ROOM_BEFORE + sim.shape[1]]
         excess = fitted_tail_slope(windows, dt_ns, align) - slope
         return replace(found, tail_slope_per_ms=slope - excess)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Pass through the kernel and let decay, see `base.Rival.translate`."""
+        """Apply the kernel and the decay, see `base.Rival.translate`."""
         check_windows(waveforms, "simulated")
         transfer = _transfer(self.kernel, record_length(waveforms.shape[1]))
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
@@ -101,14 +107,14 @@ class Superpulse:
 
 
 def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
-    """Superpulses of currents that are placed and sliced by their responses."""
+    """Superpulses of currents, aligned and sliced by their responses."""
     steps = np.cumsum(response, axis=1)
     half_times = crossing(steps, 0.5)
     return superpulses(spectra, half_times, slices(response), response.shape[1])
 
 
 def _kernel(data: Superpulses, sim: Superpulses, length: int) -> Values:
-    """The regularised ratio as weights around zero delay, of sum 1."""
+    """Regularised ratio as weights around zero delay with a sum of 1."""
     power = (np.abs(data.spectra) ** 2).sum(axis=0)
     wiener = np.clip(1 - data.error.sum(axis=0) / power, 0, 1)
     below = (np.abs(sim.spectra) ** 2 + sim.error).sum(axis=0)

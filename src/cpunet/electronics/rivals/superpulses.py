@@ -1,8 +1,8 @@
-"""Superpulses: mean currents of pulses alike in rise time, aligned at half height.
+"""Superpulses: mean currents of pulses with similar rise times, aligned at half maximum.
 
-Simulated and measured pulses are of different events, so single pulses cannot be
-compared.  Their means can, once both sets are divided at the same quantiles of the
-rise time: pulses of one slice come from the same places of the detector.
+Simulated and measured pulses are of different events, so single pulses cannot be compared.
+Their means can, once both datasets are divided at the same quantiles of rise time. Pulses of
+one slice then originate from the same regions of the detector.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from cpunet.pulses.parameters import tail_slope
 Groups = list[npt.NDArray[np.int64]]
 
 SLICES = 8
-SINGLE_SITE = 0.35  # of the pulses of a slice are kept
+SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is kept
 TAIL_SHARE = 0.75  # of the samples after the alignment: 300 of 400, as in the paper
-RISE_START, RISE_END = 0.02, 0.95  # free of noise at the start, of the slow top at the end
+RISE_START, RISE_END = 0.02, 0.95  # above the noise at the start, below the slow top
 
 
 @dataclass(frozen=True, eq=False)
 class Superpulses:
     """Spectra of the mean currents, shape ``(slices, frequencies)``.
 
-    ``error`` is the expected square of the difference from the mean of infinitely many
-    pulses: noise, and the differences of the pulses within a slice.
+    ``error`` is the squared standard error of the mean. It includes noise and the differences
+    between pulses within a slice.
     """
 
     spectra: Spectrum
@@ -40,12 +40,12 @@ class Superpulses:
 
 
 def tail_samples(length: int, align: int) -> int:
-    """Samples at the end of a window that hold nothing but the decay."""
+    """Number of samples at the end of a window that contain only the decay."""
     return max(3, int(TAIL_SHARE * (length - align)))
 
 
 def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
-    """Median slope of the logarithm of the tails, in 1/ms.
+    """Median logarithmic slope of the tails, in 1/ms.
 
     Raises
     ------
@@ -62,18 +62,30 @@ def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
 def without_decay(
     data: FloatArray, tail_slope_per_ms: float, dt_ns: float, align: int
 ) -> Values:
-    """Undo the decay (pole-zero correction) and scale the pulses to unit height.
+    r"""Undo the decay (pole-zero correction) and scale the pulses to unit height.
+
+    .. math:: x_j = \sum_{k \le j} \left(s_k - e^{\lambda \Delta t} s_{k-1}\right)
+
+    with the logarithmic slope :math:`\lambda` of the tail.
 
     Parameters
     ----------
     data
         Windows of shape ``(n, length)`` with the baseline at 0.
     tail_slope_per_ms
-        Slope of the logarithm of the tail in 1/ms.
+        Logarithmic slope of the tail in 1/ms.
     dt_ns
         Sampling period in ns.
     align
-        Sample of the windows' alignment.
+        Sample at which the windows are aligned.
+
+    Examples
+    --------
+    An exponential decay becomes a step.
+
+    >>> decay = np.r_[np.zeros(10), np.exp(-np.arange(30) * 0.016 / 50)]  # 50 us
+    >>> without_decay(decay[np.newaxis], -20.0, 16.0, 10)[0, [9, 10, 39]].round(6).tolist()
+    [0.0, 1.0, 1.0]
     """
     kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
     current = data.astype(float)
@@ -84,9 +96,9 @@ def without_decay(
 
 
 def crossing(steps: Values, fraction: float) -> Values:
-    """Sample at which each pulse of unit height last rises through a fraction of it.
+    """Sample at which each pulse of unit height last rises through a fraction.
 
-    Interpolated linearly; NaN where there is no such crossing before `RISE_END`.
+    The sample is interpolated linearly. It is NaN if there is no crossing before `RISE_END`.
 
     Examples
     --------
@@ -106,15 +118,15 @@ def crossing(steps: Values, fraction: float) -> Values:
 
 
 def rise_times(steps: Values) -> Values:
-    """Samples from 2 to 95 % of pulses of unit height; NaN where one is missing."""
+    """Rise times from 2 to 95 % of pulses of unit height in samples; NaN if undefined."""
     return crossing(steps, RISE_END) - crossing(steps, RISE_START)
 
 
 def slices(current: Values) -> Groups:
-    """Rows of the single-site-like pulses between quantiles of the rise time.
+    """Rows of single-site-like pulses between quantiles of rise time.
 
-    Of each slice the pulses with the highest current are kept.  They differ far less
-    from each other than pulses of several sites, and so do their means between sets.
+    The pulses with the highest current in each slice are kept. They differ far less from
+    each other than multi-site pulses, and so do their means between datasets.
 
     Parameters
     ----------
@@ -133,7 +145,7 @@ def slices(current: Values) -> Groups:
             f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
             "check that they are prepared charge pulses"
         )
-    # Three samples: the peak then hardly depends on where on it the samples lie.
+    # Over three samples, the peak hardly depends on the sampling phase.
     height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
     ordered = rows[np.argsort(rise[rows], kind="stable")]
     return [
@@ -148,18 +160,22 @@ def superpulses(
     groups: Groups,
     length: int,
 ) -> Superpulses:
-    """Mean current spectra by slice after moving each pulse's half height to sample 0.
+    r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
+
+    .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
+
+    with the half maximum :math:`t_p` of pulse :math:`p` in samples.
 
     Parameters
     ----------
     spectra
         Spectra of the currents, shape ``(n, length // 2 + 1)``.
     half_times
-        Sample of the half height of each, finite in all groups.
+        Sample of the half maximum of each pulse, finite in all groups.
     groups
         Rows of each slice.
     length
-        Samples that the spectra stand for.
+        Number of samples of the records.
     """
     turn = 2j * np.pi * scipy.fft.rfftfreq(length)
     means = np.empty((len(groups), spectra.shape[1]), complex)

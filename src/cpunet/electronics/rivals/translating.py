@@ -1,4 +1,4 @@
-"""Simulated pulses through a rival, finished like data."""
+"""Translation of simulated pulses by a baseline method, prepared as the data."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ def translate_like_data(
     noise: BaselineNoise | TraceNoise | None = None,
     seed: int | np.random.Generator = 0,
 ) -> Pulses:
-    """Translate prepared simulated pulses and finish them like data.
+    """Translate prepared simulated pulses and prepare them as the data.
 
     Parameters
     ----------
     rival
-        A fitted method.
+        A fitted baseline method.
     pulses
         Prepared simulated pulses.
     config
-        The preparation of the run.
+        Preparation settings of the run.
     noise, seed
-        As for `finish`; the energies are the pulses' own.
+        As for `finish`, with the energies of the pulses.
 
     Returns
     -------
     Pulses
-        The same events; a row of NaN where a pulse cannot be prepared.
+        The same events. A row is NaN if the pulse cannot be prepared.
 
     Raises
     ------
     CpunetError
-        If the pulses are sampled otherwise than those of the fit, or as `finish`.
+        If the sampling period differs from that of the fit, or for the reasons of `finish`.
     """
     if not np.isclose(pulses.dt_ns, rival.dt_ns):
         raise CpunetError(

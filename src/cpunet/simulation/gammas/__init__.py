@@ -1,4 +1,4 @@
-"""Built-in Monte Carlo of Tl-208 gammas, for those without Geant4 hits of their own."""
+"""Built-in Monte Carlo of Tl-208 gammas, for users without Geant4 hits."""
 
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,

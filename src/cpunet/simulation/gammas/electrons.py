@@ -1,4 +1,4 @@
-"""Electrons and positrons slowing down: steps of the electron table, with hard photons."""
+"""Slowing down of electrons and positrons in tabulated steps, with hard photons."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 @kernel(error_model="numpy")
 def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> int:
-    """Append a deposit (mm, MeV) to the hits; the new number of hits."""
+    """Append a deposit (mm, MeV) to the hits; return the new number of hits."""
     if energy > 0.0 and n < len(hits):
         hits[n, 0], hits[n, 1], hits[n, 2], hits[n, 3] = x, y, z, energy
         return n + 1
@@ -35,7 +35,7 @@ def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> 
 def put_photon(
     stack: Array, n: int, x: float, y: float, z: float, direction: Direction, energy: float
 ) -> int:
-    """Put a photon on the stack of those still to be followed; the new height."""
+    """Push a photon onto the stack of pending photons; return the new height."""
     row = stack[n]
     row[0], row[1], row[2] = x, y, z
     row[3], row[4], row[5] = direction.x, direction.y, direction.z
@@ -45,7 +45,7 @@ def put_photon(
 
 @kernel(error_model="numpy")
 def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float) -> bool:
-    """Whether everything within `reach` (mm) surely is germanium: false nearby a surface."""
+    """Whether all points within `reach` (mm) are certainly germanium."""
     r = math.sqrt(x * x + y * y)
     if z - reach < shape.ditch_depth or z + reach > shape.length:
         return False
@@ -64,7 +64,7 @@ def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float)
 
 @kernel(error_model="numpy")
 def row_of(table: ElectronTable, kinetic: float) -> int:
-    """The step an energy (MeV) lies in, at its upper end or below."""
+    """Index of the step that contains an energy (MeV), from its upper end downwards."""
     if kinetic <= ELECTRON_CUT:
         return 0
     row = int((math.log(kinetic) - table.log_top) / table.log_ratio)
@@ -85,15 +85,15 @@ def slow_down(
     n_stack: int,
     rng: np.random.Generator,
 ) -> tuple[int, int]:
-    """Follow an electron until it stops or leaves; new numbers of hits and of photons.
+    """Follow an electron until it stops or escapes; return the numbers of hits and photons.
 
-    Each step goes straight to a random hinge, deposits its energy there, turns and goes
-    straight to its end (Baró et al., NIM B 100 (1995) 31), so that the mean and the
-    spread of the displacement are right although the step is long.
+    Each step runs straight to a random hinge, deposits its energy there, turns and runs
+    straight to its end (Baró et al., NIM B 100 (1995) 31). Mean and spread of the
+    displacement are therefore correct despite the long steps.
     """
     x, y, z = position
     row = row_of(table, kinetic)
-    # looked at once per track: most start deep inside, few get there later
+    # checked once per track: most tracks start deep inside, few get there later
     safe = kinetic > ELECTRON_CUT and deep_inside(shape, x, y, z, table.range[row])
     part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
     while kinetic > ELECTRON_CUT:

@@ -1,11 +1,11 @@
-"""Photon cross sections and electron slowing-down of germanium, tabulated once.
+"""Tabulated photon cross sections and electron slowing-down in germanium.
 
-Sources: photons, NIST XCOM (the csv beside this module); collision stopping power,
-Bethe formula with the density effect of Sternheimer, Berger and Seltzer, At. Data Nucl.
-Data Tables 30 (1984) 261; scattering, screened Rutherford with Molière's angle, Z. Naturf.
-2a (1947) 133; bremsstrahlung, Bethe and Heitler in the form of Koch and Motz, Rev. Mod.
-Phys. 31 (1959) 920, with the limit of complete screening; annihilation in flight,
-Heitler, The Quantum Theory of Radiation (1954), § 27.
+Sources: photons, NIST XCOM (the CSV file of this folder); collision stopping power, Bethe
+formula with the density effect of Sternheimer, Berger and Seltzer, At. Data Nucl. Data Tables
+30 (1984) 261; scattering, screened Rutherford with Molière's angle, Z. Naturf. 2a (1947) 133;
+bremsstrahlung, Bethe and Heitler in the form of Koch and Motz, Rev. Mod. Phys. 31 (1959) 920,
+with the limit of complete screening; annihilation in flight, Heitler, The Quantum Theory of
+Radiation (1954), § 27.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from scipy.optimize import brentq
 Array = npt.NDArray[np.float64]
 
 ELECTRON_MASS = 0.510998950
-"""MeV."""
+"""Electron mass in MeV."""
 K_BINDING = 0.0111031
-"""Binding energy of the K shell, MeV."""
+"""Binding energy of the K shell in MeV."""
 PHOTON_CUT = 0.010
-"""Photons below this energy (MeV) are absorbed where they are: their path is < 0.1 mm."""
+"""Photons below this energy (MeV) are absorbed locally: their path is < 0.1 mm."""
 ELECTRON_CUT = 0.030
-"""Electrons below this energy (MeV) stop where they are: their range is < 0.01 mm."""
+"""Electrons below this energy (MeV) stop locally: their range is < 0.01 mm."""
 
 _TOP = 2.7
 _LOSS_PER_STEP = 0.12
@@ -42,7 +42,7 @@ _STERNHEIMER = {"c": 5.1411, "x0": 0.3376, "x1": 3.6096, "a": 0.07188, "m": 3.33
 
 
 class PhotonTable(NamedTuple):
-    """On a grid equidistant in ln(energy): attenuation and shares of the processes."""
+    """Attenuation and fractions of the processes, on a grid equidistant in ln(energy)."""
 
     log_first: float
     per_log: float
@@ -52,13 +52,13 @@ class PhotonTable(NamedTuple):
 
 
 class ElectronTable(NamedTuple):
-    """One row per step, each losing the same share of the energy; lengths in mm.
+    """One row per step, each losing the same fraction of the energy; lengths in mm.
 
-    ``energy`` (MeV) is that before the step.  ``scattering`` is the scale b of the
-    distribution exp(-(1 - cos)/b) of the deflection, ``scattering_cut`` its integral's
-    value at cos = -1, ``brems`` and ``annihilation`` the
-    probabilities of a hard photon and of annihilation in flight within a step.
-    ``photon_share[row]`` holds quantiles of the hard photon's energy over the electron's.
+    ``energy`` (MeV) is the energy before the step. ``scattering`` is the scale b of the
+    distribution exp(-(1 - cos)/b) of the deflection, ``scattering_cut`` the value of its
+    integral at cos = -1. ``brems`` and ``annihilation`` are the probabilities of a hard photon
+    and of annihilation in flight within a step. ``photon_share[row]`` holds quantiles of the
+    energy of the hard photon relative to that of the electron.
     """
 
     log_top: float
@@ -75,7 +75,7 @@ class ElectronTable(NamedTuple):
 
 @functools.cache
 def photon_table() -> PhotonTable:
-    """Photon cross sections of XCOM, without coherent scattering, which deposits nothing."""
+    """Photon cross sections of XCOM without coherent scattering, which deposits no energy."""
     source = resources.files(__package__) / "ge_cross_sections.csv"
     with source.open() as lines:
         data = np.loadtxt(lines, delimiter=",", comments=("#", "E_MeV"))
@@ -84,7 +84,7 @@ def photon_table() -> PhotonTable:
     log = np.linspace(np.log(energy[0]), np.log(energy[-1]), _PHOTON_NODES)
     compton = np.exp(np.interp(log, np.log(energy), np.log(incoherent)))
     photo = np.exp(np.interp(log, np.log(energy), np.log(photoelectric)))
-    # the threshold has no logarithm: (1 - threshold / energy)^3 takes out its steepness
+    # the logarithm diverges at threshold: (1 - threshold / energy)^3 removes the steepness
     grid = np.exp(log)
     above = energy > 1.03
     smooth = pair[above] / (1 - 2 * ELECTRON_MASS / energy[above]) ** 3
@@ -109,7 +109,7 @@ def electron_table() -> ElectronTable:
     middle = energy * np.sqrt(ratio)
     stopping = _collision_loss(middle) + np.array([_soft_radiation(t) for t in middle])
     step = energy * _LOSS_PER_STEP / stopping
-    # what is below the last row is a few micrometres
+    # the range below the last row is a few micrometres
     to_go = np.cumsum(step[::-1])[::-1] + energy[-1] * ratio / stopping[-1]
     hard = np.array([_hard_photons(t) for t in middle])
     turned = 1 - np.exp(-step * _transport_per_mm(middle))
@@ -129,7 +129,7 @@ def electron_table() -> ElectronTable:
 
 
 def _collision_loss(kinetic: Array) -> Array:
-    """MeV/mm."""
+    """Collision stopping power in MeV/mm."""
     gamma = 1 + kinetic / ELECTRON_MASS
     tau = gamma - 1
     beta2 = 1 - gamma**-2
@@ -156,7 +156,7 @@ def _transport_per_mm(kinetic: Array) -> Array:
 
 
 def _scale_of(mean: float) -> float:
-    """The b for which exp(-x/b) on 0 < x < 2 has this mean (below 1)."""
+    """Scale b for which exp(-x/b) on 0 < x < 2 has this mean (below 1)."""
     return float(brentq(lambda b: b - 2 / np.expm1(2 / b) - mean, 3e-3, 1e4))
 
 
@@ -172,14 +172,14 @@ def _radiation(kinetic: float, photon: Array) -> Array:
 
 
 def _soft_radiation(kinetic: float) -> float:
-    """Energy lost to photons below the cut, MeV/mm."""
+    """Energy loss to photons below the cut in MeV/mm."""
     top = min(kinetic, PHOTON_CUT)
     photon = (np.arange(32) + 0.5) / 32 * top
     return float(_radiation(kinetic, photon).mean() * top)
 
 
 def _hard_photons(kinetic: float) -> float:
-    """Photons above the cut per mm."""
+    """Number of photons above the cut per mm."""
     if kinetic <= PHOTON_CUT:
         return 0.0
     log = np.linspace(np.log(PHOTON_CUT), np.log(kinetic), 256)
@@ -187,7 +187,7 @@ def _hard_photons(kinetic: float) -> float:
 
 
 def _photon_quantiles(kinetic: float) -> Array:
-    """Energy shares k/T of hard photons at equidistant probabilities."""
+    """Energy fractions k/T of hard photons at equidistant probabilities."""
     if kinetic <= PHOTON_CUT:
         return np.ones(_BREMS_NODES)
     log = np.linspace(np.log(PHOTON_CUT), np.log(kinetic), 256)

@@ -1,4 +1,4 @@
-"""Samplers of single interactions; energies in MeV, directions as unit vectors.
+"""Random sampling of single interactions. Energies are in MeV, directions are unit vectors.
 
 Compton: Klein and Nishina, sampled as in Nelson et al., SLAC-265 (1985), § 2.9.
 Annihilation in flight: Heitler's two-photon cross section.
@@ -25,7 +25,7 @@ class Direction(NamedTuple):
 
 @kernel(error_model="numpy")
 def isotropic(rng: np.random.Generator) -> Direction:
-    """A direction, all equally probable."""
+    """Draw an isotropic direction."""
     cosine = 2.0 * rng.random() - 1.0
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     azimuth = 2.0 * math.pi * rng.random()
@@ -34,7 +34,7 @@ def isotropic(rng: np.random.Generator) -> Direction:
 
 @kernel(error_model="numpy")
 def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
-    """The direction at a polar angle and an azimuth (rad) around an axis."""
+    """Direction at a polar angle and an azimuth (rad) relative to an axis."""
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
     across = math.sqrt(axis.x * axis.x + axis.y * axis.y)
@@ -49,10 +49,10 @@ def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
 
 @kernel(error_model="numpy")
 def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direction:
-    """A direction isotropic in the rest frame of an electron of this energy along the axis.
+    """Draw a direction that is isotropic in the rest frame of an electron along the axis.
 
-    The usual stand-in for the angles of photoelectrons, pairs and bremsstrahlung,
-    which multiple scattering forgets within a fraction of the range.
+    This is a common approximation of the angles of photoelectrons, pairs and bremsstrahlung.
+    Multiple scattering randomises them within a fraction of the range.
     """
     gamma = 1.0 + kinetic / ELECTRON_MASS
     beta = math.sqrt(max(1.0 - 1.0 / (gamma * gamma), 0.0))
@@ -63,7 +63,7 @@ def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direct
 
 @kernel(error_model="numpy")
 def remainder(total: float, axis: Direction, part: float, direction: Direction) -> Direction:
-    """Direction of what is left of a momentum along `axis` without a part of it."""
+    """Direction of the remaining momentum after a part is removed from one along `axis`."""
     x = total * axis.x - part * direction.x
     y = total * axis.y - part * direction.y
     z = total * axis.z - part * direction.z
@@ -75,7 +75,13 @@ def remainder(total: float, axis: Direction, part: float, direction: Direction) 
 
 @kernel(error_model="numpy")
 def compton_energy(energy: float, rng: np.random.Generator) -> float:
-    """Energy of a photon after Compton scattering on a free electron at rest."""
+    r"""Energy of a photon after Compton scattering on a free electron at rest.
+
+    The energy fraction :math:`\epsilon` follows Klein and Nishina,
+
+    .. math:: p(\epsilon) \propto \frac{1}{\epsilon} + \epsilon - \sin^2\theta, \qquad
+        1 - \cos\theta = \frac{m_e c^2}{E} \Big(\frac{1}{\epsilon} - 1\Big).
+    """
     k = energy / ELECTRON_MASS
     least = 1.0 / (1.0 + 2.0 * k)
     inverse_part = -math.log(least)
@@ -93,7 +99,7 @@ def compton_energy(energy: float, rng: np.random.Generator) -> float:
 
 @kernel(error_model="numpy")
 def pair_share(rng: np.random.Generator) -> float:
-    """Electron's share of a pair's kinetic energy: p+ p-, the phase space near threshold."""
+    """Electron's fraction of a pair's kinetic energy: p+ p-, the phase space at threshold."""
     while True:
         share = rng.random()
         if rng.random() < 2.0 * math.sqrt(share * (1.0 - share)):
@@ -102,7 +108,7 @@ def pair_share(rng: np.random.Generator) -> float:
 
 @kernel(error_model="numpy")
 def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Energy of one of the two photons and the cosine of its angle to the positron."""
+    """Energy of one of the two photons, and the cosine of its angle to the positron."""
     gamma = 1.0 + kinetic / ELECTRON_MASS
     half_width = 0.5 * math.sqrt((gamma - 1.0) / (gamma + 1.0))
     least, most = 0.5 - half_width, 0.5 + half_width

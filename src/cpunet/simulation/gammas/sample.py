@@ -18,14 +18,14 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 
 TL208_KEV = 2614.511
-"""Energy of the gamma line of Tl-208."""
+"""Energy of the gamma line of Tl-208 in keV."""
 
 _BLOCK_HITS = 1_000_000
 _BLOCK_EVENTS = 20_000
 
 
 class WantedLine(NamedTuple):
-    """How many events are wanted with an energy (keV) from `low_kev` to `high_kev`."""
+    """Requested number of events with an energy from `low_kev` to `high_kev` in keV."""
 
     low_kev: float
     high_kev: float
@@ -34,9 +34,9 @@ class WantedLine(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GammaStatistics:
-    """What became of all primaries, kept or not.
+    """Counts over all primaries, including events that were not kept.
 
-    ``spectrum`` counts the events with a deposit in bins of 1 keV from 0.
+    ``spectrum`` is the histogram of events with a deposit, in bins of 1 keV from 0.
     """
 
     n_primaries: int
@@ -44,11 +44,11 @@ class GammaStatistics:
 
     @property
     def hit_fraction(self) -> float:
-        """Share of the primaries that left energy in the crystal."""
+        """Fraction of the primaries that deposited energy in the crystal."""
         return float(self.spectrum.sum() / self.n_primaries)
 
     def fraction(self, low_kev: int, high_kev: int) -> float:
-        """Share of the primaries with an energy of `low_kev` up to `high_kev` (whole keV)."""
+        """Fraction of the primaries with an energy of `low_kev` to `high_kev` (whole keV)."""
         return float(self.spectrum[low_kev:high_kev].sum() / self.n_primaries)
 
 
@@ -62,42 +62,46 @@ def simulate_gammas(
     wanted: Mapping[str, WantedLine] | None = None,
     energy_kev: float = TL208_KEV,
 ) -> tuple[Hits, GammaStatistics]:
-    """Simulate gammas from a disc above the crystal, in vacuum.
+    r"""Simulate gammas from a disc above the crystal, in vacuum.
 
-    They are emitted isotropically into the cone around the axis that is as wide as
-    crystal and disc together, ``cos > h / hypot(h, R + r)``: the share of the full
-    solid angle that is simulated is ``(1 - cos) / 2``.  Photons undergo Compton
-    scattering (Klein-Nishina with the cross section of bound electrons), photoelectric
-    absorption and pair production; electrons and positrons slow down continuously,
-    scatter, and radiate; positrons annihilate at rest or in flight.
+    Gammas are emitted isotropically into the cone around the axis that is as wide as crystal
+    and disc together,
+
+    .. math:: \cos\theta > \frac{h}{\sqrt{h^2 + (R + r)^2}},
+
+    so that the simulated fraction of the full solid angle is :math:`(1 - \cos\theta)/2` at
+    the limit. Photons undergo Compton scattering (Klein-Nishina with the cross section of
+    bound electrons), photoelectric absorption and pair production. Electrons and positrons
+    slow down continuously, scatter and radiate. Positrons annihilate at rest or in flight.
 
     Parameters
     ----------
     detector
-        The crystal; its lithium layer is germanium like the rest.
+        The crystal. Its lithium layer is treated as germanium.
     source_height_mm, source_radius_mm
-        Height of the disc above the crystal's top (z = crystal length), and its radius.
+        Height of the disc above the top of the crystal (z = crystal length) and its radius,
+        in mm.
     n_primaries
-        Gammas in the cone; with `wanted`, the most that are tried.
+        Number of gammas in the cone; with `wanted`, the maximum number.
     seed
-        The same seed gives the same events.
+        Seed of the random generator. The same seed gives the same events.
     wanted
-        Windows by name.  Only events in a window are kept, until each has its count.
+        Energy windows by name. Only events in a window are kept, until each has its count.
     energy_kev
-        Energy of the gammas, from 50 to 2700 keV.
+        Energy of the gammas, 50 to 2700 keV.
 
     Returns
     -------
     Hits
-        The events with a deposit; ``event_number`` is the number of the primary.
+        Events with a deposit. ``event_number`` is the number of the primary.
     GammaStatistics
-        Counts over all primaries, also of the events not kept.
+        Counts over all primaries, including events that were not kept.
 
     Raises
     ------
     CpunetError
         If the source is not above the crystal, a window is empty or beyond the line, or
-        `n_primaries` do not give the wanted events.
+        `n_primaries` do not give the requested events.
     """
     _check(source_height_mm, source_radius_mm, n_primaries, energy_kev, wanted)
     shape = CrystalShape.of(detector)
@@ -105,7 +109,7 @@ def simulate_gammas(
     cosine = source_height_mm / math.hypot(source_height_mm, reach)
     source = Source(energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine)
     lines = list((wanted or {}).values())
-    # deposits add up to the line only within rounding
+    # the sum of deposits equals the energy of the line only up to rounding
     low = np.array([line.low_kev / 1e3 - 1e-9 for line in lines])
     high = np.array([line.high_kev / 1e3 + 1e-9 for line in lines])
     missing = np.array([line.events for line in lines], np.int64)
@@ -163,14 +167,31 @@ def _check(
 def with_resolution(
     energy_kev: npt.ArrayLike, *, noise_kev2: float, fano_kev: float, seed: int
 ) -> npt.NDArray[np.float64]:
-    """Energies as a detector reports them: Gaussian, FWHM² = noise_kev2 + fano_kev E (keV).
+    r"""Smear energies with the Gaussian resolution of a detector.
 
-    The hits stay as they are.
+    .. math:: \mathrm{FWHM}^2 = a + b E
+
+    with :math:`a` in keV² and :math:`b` in keV. The hits are not changed.
+
+    Parameters
+    ----------
+    energy_kev
+        True energies in keV.
+    noise_kev2, fano_kev
+        Coefficients :math:`a` of the electronic noise and :math:`b` of the Fano statistics.
+    seed
+        Seed of the random generator.
 
     Raises
     ------
     CpunetError
         If a coefficient is negative.
+
+    Examples
+    --------
+    >>> energies = with_resolution([1592.5] * 4000, noise_kev2=4.0, fano_kev=0.0, seed=1)
+    >>> bool(abs(energies.std() * 2.3548 - 2.0) < 0.1)
+    True
     """
     if noise_kev2 < 0 or fano_kev < 0:
         raise CpunetError(f"FWHM² = {noise_kev2} + {fano_kev} E; give numbers from 0 up")

@@ -1,4 +1,4 @@
-"""The crystal as the transport sees it: germanium or vacuum at (r, z)."""
+"""The crystal as the transport needs it: germanium or vacuum at (r, z)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from cpunet.simulation.geometry import Detector
 
 
 class CrystalShape(NamedTuple):
-    """Outline of the germanium in mm, z = 0 at the point-contact face.
+    """Outline of the germanium in mm, with z = 0 at the point-contact face.
 
-    A plain tuple of numbers, so that compiled code can take it.
+    A plain tuple of numbers, as compiled code requires.
     """
 
     length: float
@@ -34,7 +34,7 @@ class CrystalShape(NamedTuple):
 
     @classmethod
     def of(cls, detector: Detector) -> CrystalShape:
-        """The outline of a detector, lithium layer included: that of `Detector.inside`."""
+        """Outline of a detector including its lithium layer, as in `Detector.inside`."""
         length = detector.crystal_length
         outer, inner, bottom = (math.tan(angle) for angle in detector.taper_angles_rad)
         ditch_inner, ditch_outer, ditch_depth = detector.ditch_walls
@@ -73,7 +73,7 @@ def in_germanium(shape: CrystalShape, x: float, y: float, z: float) -> bool:
 
 @kernel(error_model="numpy")
 def _outer_wall(shape: CrystalShape, z: float) -> float:
-    """Radius of the crystal at a height; tapers and bullets are never on the same end."""
+    """Radius of the crystal at a height. Tapers and bullets never share an end."""
     into_top = z - shape.length + shape.top_bullet
     into_bottom = shape.bottom_bullet - z
     wall = shape.radius
@@ -88,7 +88,7 @@ def _outer_wall(shape: CrystalShape, z: float) -> float:
 
 @kernel(error_model="numpy")
 def _rounded_off(bullet: float, depth: float) -> float:
-    """What a quarter circle of radius `bullet` takes off a wall `depth` after it begins."""
+    """Reduction in radius by a quarter circle of radius `bullet`, `depth` after its start."""
     return bullet - math.sqrt(max(bullet * bullet - depth * depth, 0.0))
 
 
@@ -110,7 +110,7 @@ def _in_bore(shape: CrystalShape, r: float, z: float) -> bool:
 def way_to_cylinder(
     radius: float, length: float, x: float, y: float, z: float, u: float, v: float, w: float
 ) -> float:
-    """Distance in mm from a point above the crystal to the cylinder around it; -1: missed."""
+    """Distance in mm from a point above the crystal to its enclosing cylinder; -1 if missed."""
     if w >= 0.0:
         return -1.0
     t = (length - z) / w

@@ -1,4 +1,4 @@
-"""Compiled event loop: photons from the source followed until absorbed or gone."""
+"""Compiled event loop: photons from the source are followed until absorbed or lost."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ Integers = npt.NDArray[np.int64]
 
 STACK_HEIGHT = 256
 MOST_HITS = 2000
-"""Room for the hits of one event; Tl-208 makes some 200."""
+"""Maximum number of hits per event; Tl-208 gives about 200."""
 
 
 class Source(NamedTuple):
-    """A disc above the crystal, emitting into the cone around the crystal's top."""
+    """A disc above the crystal that emits into the cone around the top of the crystal."""
 
     energy: float
     height: float
@@ -54,11 +54,11 @@ def follow_photons(
     n_stack: int,
     rng: np.random.Generator,
 ) -> int:
-    """Empty the stack of photons; the number of hits they made.
+    """Follow all photons on the stack; return the number of hits.
 
-    The path to the next interaction is drawn as if germanium were everywhere; where it
-    ends in vacuum nothing happens and the photon goes on (Woodcock's method), so that
-    any outline will do.  What leaves the cylinder around the crystal does not return.
+    The path to the next interaction is drawn as if germanium filled all space. If it ends in
+    vacuum, nothing happens and the photon continues (Woodcock's method), so any outline is
+    possible. A photon that leaves the cylinder around the crystal does not return.
     """
     n_hits = 0
     while n_stack > 0:
@@ -120,7 +120,7 @@ def follow_photons(
 
 @kernel(error_model="numpy")
 def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Generator) -> int:
-    """Put a photon of the source where it meets the crystal's cylinder; 0: it misses."""
+    """Place a photon where it meets the cylinder of the crystal; return 0 if it misses."""
     r = source.radius * math.sqrt(rng.random())
     around = 2.0 * math.pi * rng.random()
     x, y, z = r * math.cos(around), r * math.sin(around), shape.length + source.height
@@ -129,7 +129,7 @@ def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Gener
     way = way_to_cylinder(shape.radius, shape.length, x, y, z, down.x, down.y, down.z)
     if way < 0.0:
         return 0
-    # rounding must not leave it a hair outside, where it would count as gone
+    # rounding must not leave it just outside, where it would count as lost
     way += 1e-9
     return put_photon(
         stack, 0, x + way * down.x, y + way * down.y, z + way * down.z, down, source.energy
@@ -152,12 +152,12 @@ def simulate_block(
     offsets: Integers,
     primaries: Integers,
 ) -> tuple[int, int]:
-    """Simulate until the primaries, the room for hits or what is wanted run out.
+    """Simulate until the primaries, the space for hits or the requested events run out.
 
-    Energies in MeV.  An event is kept if a window (low to high) that still wants events
-    holds it, or always if there are no windows.  `wanted` is counted down; `spectrum`
-    (1 keV bins) counts every event with a deposit.  Returns the numbers of primaries
-    done and of events kept.
+    Energies are in MeV. An event is kept if it lies in a window (low to high) that still
+    needs events, or always if there are no windows. `wanted` is counted down. `spectrum`
+    (1 keV bins) counts every event with a deposit. Returns the numbers of primaries done and
+    of events kept.
     """
     stack = np.empty((STACK_HEIGHT, 7))
     n_kept = 0

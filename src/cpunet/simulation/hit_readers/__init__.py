@@ -1,4 +1,4 @@
-"""Hits as users have them: remage LH5, Geant4 and g4simple CSV and HDF5, NPZ."""
+"""Readers of hits: remage LH5, Geant4 and g4simple CSV and HDF5, NPZ."""
 
 from cpunet.simulation.hit_readers.reading import read_hits
 from cpunet.simulation.hit_readers.steps import ReadHits, Transform

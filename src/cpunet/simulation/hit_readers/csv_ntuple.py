@@ -1,4 +1,4 @@
-"""CSV ntuples as Geant4's analysis manager writes them, a step a line."""
+"""CSV ntuples as Geant4's analysis manager writes them, one step per line."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _G4SIMPLE_TITLE = "steps data"
 
 
 def read_csv(path: Path, detector: str | None, units: Units) -> Steps:
-    """Steps of a CSV ntuple.
+    """Read the steps of a CSV ntuple.
 
-    A unit may stand behind a column's name in brackets.  Files of g4simple, known by
-    their title, are in MeV and mm; all others name no unit, and it must be given.
+    A column name may end with a unit in brackets. Files of g4simple, recognised by their
+    title, are in MeV and mm. All others name no unit, so it must be given.
     """
     title, columns = _header(path)
     place = {kind: _find(columns, names) for kind, names in _NAMES.items()}
@@ -87,7 +87,7 @@ def _find(columns: list[str], names: tuple[str, ...]) -> int | None:
 def _numbers(path: Path, n_columns: int) -> npt.NDArray[np.float64]:
     try:
         with path.open(encoding="utf-8") as lines:
-            # np.loadtxt warns of an empty table, which is said better below
+            # np.loadtxt warns about an empty table; the message below is clearer
             body = [line for line in lines if line.strip() and not line.startswith("#")]
         if not body:
             raise CpunetError(f"{path}: holds no steps; simulate again")

@@ -1,4 +1,4 @@
-"""Step-wise HDF5 ntuples of g4simple: Geant4's own units, MeV and mm."""
+"""Step-wise HDF5 ntuples of g4simple, in the Geant4 units MeV and mm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NTUPLE = "default_ntuples/g4sntuple"
 
 
 def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps:
-    """Steps in one volume, by its number ``volID``, or in all of the only one."""
+    """Read the steps in one volume, given by its number ``volID``, or in the only one."""
     edep = _column(path, ntuple, "Edep") * 1e3
     rows = len(edep)
     x, y, z, event = (_column(path, ntuple, name) for name in ("x", "y", "z", "event"))
@@ -36,8 +36,8 @@ def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps
 def of_detector(
     path: Path, steps: Steps, number: npt.NDArray[np.float64], detector: str | None
 ) -> Steps:
-    """The steps of a detector given by its number; of the only one if none is given."""
-    # where nothing is deposited there is no detector: world, holders of no interest
+    """Select the steps of a detector by its number, or of the only one if none is given."""
+    # a volume without deposits is no detector but, for example, the world or a holder
     volumes = whole_numbers(path, "the detector's number", number)
     there = sorted({int(n) for n in np.unique(volumes[steps.edep_kev > 0])})
     names = ", ".join(map(str, there))

@@ -1,4 +1,4 @@
-"""The hits that are kept beside simulated pulses: a flat LH5 table, a row per hit."""
+"""The hits stored with simulated pulses: a flat LH5 table with one row per hit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AXES = ("x", "y", "z")
 
 
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
-    """Columns of the table, name → (values, units), in the order of the events.
+    """Columns of the table as name → (values, units), in the order of the events.
 
     Examples
     --------
@@ -38,13 +38,13 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
 
 
 def read_hit_table(path: Path, units: Units) -> Steps:
-    """Steps of the table, in the crystal's frame in which they were written.
+    """Read the steps of the table, in the frame of the crystal in which they were written.
 
     Raises
     ------
     CpunetError
-        If the table cannot be read, lacks a column or a unit, its columns differ in
-        length, or it has no hits of an event whose pulse is in the file.
+        If the table cannot be read, lacks a column or a unit, has columns of different
+        lengths, or has no hits for an event whose pulse is in the file.
     """
     values, named = {}, {}
     with opened(path) as file:

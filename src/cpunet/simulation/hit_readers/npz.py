@@ -1,4 +1,4 @@
-"""Hits from a NumPy archive: one array per quantity, units in the names."""
+"""Hits from a NumPy archive: one array per quantity, with units in the names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")
 
 
 def read_npz(path: Path) -> Steps:
-    """Steps of an archive; event i owns the rows ``offsets[i]:offsets[i + 1]``."""
+    """Read the steps of an archive. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
     try:
         arrays = npz_files.read_arrays(path, _NEEDED)
     except npz_files.DAMAGED as error:

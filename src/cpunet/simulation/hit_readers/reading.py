@@ -1,4 +1,4 @@
-"""One way in for all formats of hits: recognised by what is in the file."""
+"""One entry point for all formats of hits, recognised by the content of the file."""
 
 from __future__ import annotations
 
@@ -31,28 +31,30 @@ def read_hits(
 ) -> ReadHits:
     """Read the energy deposits of one detector.
 
-    Formats: the hits kept beside simulated pulses (``geds/hits``), remage LH5 (``stp``
+    Formats: the hits stored with simulated pulses (``geds/hits``), remage LH5 (``stp``
     tables; the origin in ``detector_origins`` is subtracted), g4simple HDF5 and CSV
-    ntuples (MeV and mm, Geant4's own), other Geant4 CSV ntuples, and NPZ with ``x_mm``,
+    ntuples (Geant4 units, MeV and mm), other Geant4 CSV ntuples, and NPZ with ``x_mm``,
     ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``.
 
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     detector
-        Which detector: the table's name in remage files, the volume's number in g4simple
-        files, the detector's number in other CSV.  Not needed if there is only one.
+        Detector to read: the name of the table in remage files, the number of the volume in
+        g4simple files, the number of the detector in other CSV files. Not needed if there is
+        only one.
     transform
-        From the file's frame to the crystal's (z = 0 at the point contact).
+        Transformation from the frame of the file to that of the crystal (z = 0 at the point
+        contact).
     length_unit, energy_unit
-        For columns that name no unit; refused units and missing ones are an error.
+        Units of columns that name none. An unknown or missing unit is an error.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read, is of no known format, lacks a column, a unit or the
-        detector, or holds no energy deposit.
+        If the file cannot be read, has an unknown format, lacks a column, a unit or the
+        detector, or contains no energy deposit.
     """
     file = Path(path)
     units = Units(length_unit, energy_unit)

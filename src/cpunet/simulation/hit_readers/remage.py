@@ -19,7 +19,7 @@ _AXES = ("xloc", "yloc", "zloc")
 
 
 def read_remage(path: Path, detector: str | None, units: Units) -> Steps:
-    """Steps of one table of ``stp``, relative to the detector's origin if the file has it."""
+    """Read the steps of one ``stp`` table, relative to the detector's origin if it is known."""
     name = _detector(path, detector)
     table = _read(path, f"stp/{name}")
     edep, counts = _flat(path, table, "edep")
@@ -55,7 +55,7 @@ def _detector(path: Path, detector: str | None) -> str:
 
 
 def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
-    """Origin of a detector in mm; zero if the file does not tell."""
+    """Origin of a detector in mm; zero if it is not in the file."""
     origin = np.zeros(3)
     with opened(path) as file:
         if f"detector_origins/{name}" not in file:
@@ -66,13 +66,13 @@ def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
             if not isinstance(number, h5py.Dataset) or number.size != 1:
                 raise CpunetError(f"{path}: {where} is no number; write the file again")
             unit = text_attribute(number, "units")
-            # an origin may come without a unit; all lengths of remage are in m
+            # an origin may lack a unit; all lengths of remage are in m
             origin[i] = float(number[()]) * units.to_mm(path, where, unit or "m")
     return origin
 
 
 def _read(path: Path, name: str) -> dict[str, Any]:
-    """The columns needed of a table, as LH5 objects."""
+    """Required columns of a table, as LH5 objects."""
     table = {}
     with opened(path) as file:
         for column in ("evtid", "edep", *_AXES):
@@ -89,7 +89,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
 def _flat(
     path: Path, table: Any, column: str
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """All steps' values of a column, and the number of steps per row."""
+    """Values of a column for all steps, and the number of steps per row."""
     vectors = table[column]
     if not hasattr(vectors, "cumulative_length"):
         values = _real(path, column, vectors)

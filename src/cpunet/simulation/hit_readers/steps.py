@@ -1,4 +1,4 @@
-"""Steps of a simulation as read, and how they become hits of the crystal."""
+"""Steps of a simulation as read, and their conversion to hits in the crystal."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
 
 @dataclass(frozen=True)
 class Transform:
-    """From the coordinates of a file to the crystal's.
+    """Transformation from the frame of a file to that of the crystal.
 
-    Subtract `origin_mm`, then, with `flip_z`, mirror z (and y, so that the frame stays
-    right-handed): for crystals placed with the point contact on top, `origin_mm` being
-    the centre of the contact's face.
+    Subtracts `origin_mm`. With `flip_z` it then mirrors z (and y, so that the frame remains
+    right-handed), for crystals with the point contact on top. `origin_mm` is the centre of
+    the face of the contact.
     """
 
     origin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flip_z: bool = False
 
     def apply(self, position_mm: FloatArray) -> FloatArray:
-        """Positions of shape ``(n, 3)`` in mm in the crystal's frame."""
+        """Transform positions of shape ``(n, 3)`` in mm to the frame of the crystal."""
         moved = position_mm - np.asarray(self.origin_mm)
         mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
         return np.asarray(moved * mirror, np.float64)
@@ -40,23 +40,23 @@ class Transform:
 
 @dataclass(frozen=True)
 class Units:
-    """Units to use for columns that name none; None if the user gave none."""
+    """Units of columns that name none; None if the user gave none."""
 
     length: str | None = None
     energy: str | None = None
 
     def to_mm(self, path: Path, column: str, named: str | None) -> float:
-        """Factor from a column's unit to mm."""
+        """Conversion factor from the unit of a column to mm."""
         return _factor(path, column, named or self.length, _MM, "length_unit")
 
     def to_kev(self, path: Path, column: str, named: str | None) -> float:
-        """Factor from a column's unit to keV."""
+        """Conversion factor from the unit of a column to keV."""
         return _factor(path, column, named or self.energy, _KEV, "energy_unit")
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps in a file's own frame, the detector's origin subtracted; any order of events."""
+    """Steps relative to the detector's origin in the frame of a file; events in any order."""
 
     event: npt.NDArray[np.int64]
     position_mm: FloatArray
@@ -65,21 +65,22 @@ class Steps:
 
 @dataclass(frozen=True)
 class ReadHits:
-    """Hits of a file, and the number of steps left out since they deposit nothing."""
+    """Hits of a file, and the number of steps without energy deposit, which are omitted."""
 
     hits: Hits
     steps_without_energy: int
 
 
 def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
-    """Group steps by event, in the order of the file, and bring them to the crystal's frame.
+    """Group steps by event, in the order of the file, in the frame of the crystal.
 
     Raises
     ------
     CpunetError
-        If a step has no finite position or energy, a negative energy, or none deposits.
+        If a step has no finite position or energy or a negative energy, or if no step
+        deposits energy.
     """
-    # written so that NaN is bad
+    # written so that NaN fails
     placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
     bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MOST_KEV))
     if bad.any():
@@ -96,7 +97,7 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
     in_file = np.argsort(first)
     rank = np.empty_like(in_file)
     rank[in_file] = np.arange(len(in_file))
-    # steps of one event may lie apart, as in files joined from several threads
+    # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(rank[label], kind="stable")
     counts = np.bincount(rank[label], minlength=len(numbers))
     hits = Hits.of(
@@ -109,12 +110,12 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
 
 
 def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """A column of whole numbers, also where they are stored as real ones.
+    """Convert a column of whole numbers, which may be stored as floats, to int64.
 
     Raises
     ------
     CpunetError
-        If one is not whole, or too large.
+        If a value is not a whole number or too large.
     """
     kind = values.dtype.kind
     fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MOST_NUMBER).all())
