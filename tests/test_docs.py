@@ -26,8 +26,8 @@ from cpunet.translation.translator import RejectionWarning
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-# Seconds of simulation each: their imports are tried only.
-TOO_LONG = {"simulation.md", "explorer.md"}
+# Seconds of simulation or training each: their imports are tried only.
+TOO_LONG = {"simulation.md", "explorer.md", "python.md"}
 KEV = 2614.511
 
 

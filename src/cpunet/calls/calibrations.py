@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -170,7 +170,7 @@ def calibrate(
     known = detector if isinstance(detector, Detector | None) else read_detector(str(detector))
     start = Start(
         sim=None if isinstance(sim, HitFile) else as_input(sim, "sim"),
-        hits=sim if isinstance(sim, HitFile) else None,
+        hits=replace(sim, path=Path(sim.path)) if isinstance(sim, HitFile) else None,
         detector=known,
         settings=settings,
     )

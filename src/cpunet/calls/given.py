@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -24,7 +25,7 @@ def as_input(file: File, name: str) -> InputFile:
         If it is neither a path nor an `InputFile`.
     """
     if isinstance(file, InputFile):
-        return file
+        return replace(file, path=Path(file.path))  # in a notebook it may be text
     if isinstance(file, str | Path):
         return InputFile(Path(file))
     raise CpunetError(
