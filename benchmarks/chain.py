@@ -1,11 +1,12 @@
 """Rates and memory of the chain of events: steps → pulses → raw traces → parameters.
 
-Run with ``python benchmarks/chain.py``; ``--events 2000,8000`` gives two sizes, of which the
+Run with ``python benchmarks/chain.py``; ``--events 4000,40000`` gives two sizes, of which the
 cost of an event and what is paid once are told apart, and scaled to a million.  Each step is a
 process of its own, as in the workflow, with one thread: its time is that of the processor,
 which others on the machine hardly change, its memory that process's maximum.  Steps are those
 of gammas in the crystal, as the built-in Monte Carlo makes them, in the layout of remage.
 The run is a readout chain that was not trained: neither rate nor memory depend on its numbers.
+Pulses are drifted for each hit (exact, a tenth of the events) and interpolated in a library.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ ROOT = Path(__file__).resolve().parents[1]
 POOL = 500  # different events; the file repeats them
 DSP = ROOT / "workflow" / "scripts" / "dsp.py"
 CONFIG = ROOT / "workflow" / "config" / "dsp.yaml"
+COMMAND = (sys.executable, "-c", "from cpunet.cli.main import main; main()")
 MILLION = 1_000_000
+TENTH = 10  # of the events are drifted one by one
 
 
 class Cost(NamedTuple):
@@ -85,27 +88,41 @@ def measured(*words: object) -> Cost:
     return Cost(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
 
 
+def simulated(folder: Path, steps: Path, mode: str) -> Cost:
+    """Steps to pulses, drifted one by one or interpolated in a library."""
+    words = ["--detector", "icpc", "--hits", steps, "--hits-detector", "V01", mode]
+    return measured(*COMMAND, "simulate", *words, "--out", folder / "pulses.lh5", "--force")
+
+
 def chain(folder: Path, steps: Path) -> dict[str, Cost]:
     """Each step of the chain on one file."""
-    command = [sys.executable, "-c", "from cpunet.cli.main import main; main()"]
     pulses, raw, dsp = (folder / f"{name}.lh5" for name in ("pulses", "raw", "dsp"))
-    simulate = ["simulate", "--detector", "icpc", "--hits", steps, "--hits-detector", "V01"]
     translate = ["translate", folder / "run", pulses, "--output", "adc"]
     translate += ["--adc-per-kev", 10, "--baseline", 10000, "--out-table", "V01/raw"]
     parameters = [DSP, raw, dsp, "--config", CONFIG, "--table", "V01/raw"]
     return {
-        "pulses": measured(*command, *simulate, "--out", pulses, "--force"),
-        "raw traces": measured(*command, *translate, "--out", raw, "--force"),
+        "pulses, library": simulated(folder, steps, "--library"),
+        "raw traces": measured(*COMMAND, *translate, "--out", raw, "--force"),
         "parameters": measured(
             sys.executable, *parameters, "--run", folder / "run", "--tau-us", 400
         ),
     }
 
 
+def told(step: str, few: int, many: int, first: Cost, last: Cost) -> str:
+    """A row of the table: what an event costs, and what is paid once."""
+    each = (last.seconds - first.seconds) / (many - few)
+    once = first.seconds - few * each
+    rate = f"{1 / each:.0f}" if each > 0 else "–"
+    hours = (once + MILLION * max(each, 0.0)) / 3600
+    sizes = f"{few}: {first.megabytes:.0f}, {many}: {last.megabytes:.0f}"
+    return f"| {step} | {rate} | {once:.1f} | {sizes} | {hours:.2f} |"
+
+
 def main() -> None:
     """Measure two sizes, and print the table of the documentation."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--events", default="2000,8000")
+    parser.add_argument("--events", default="4000,40000")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     few, many = (int(n) for n in given.events.split(","))
@@ -115,21 +132,18 @@ def main() -> None:
         pool, steps = some_hits(given.seed), folder / "stp.lh5"
         write_steps(steps, pool, 200)
         chain(folder, steps)  # compiles
-        costs = []
+        simulated(folder, steps, "--exact")
+        exact, costs = [], []
         for n in (few, many):
+            write_steps(steps, pool, n // TENTH)
+            exact.append(simulated(folder, steps, "--exact"))
             n_steps = write_steps(steps, pool, n)
             costs.append(chain(folder, steps))
             print(f"{n} events, {n_steps} steps: {costs[-1]}", flush=True)
-    print(f"| step | events/s | once (s) | memory at {few} | at {many} (MB) | 1M events (h) |")
-    for step in costs[0]:
-        first, last = costs[0][step], costs[1][step]
-        each = (last.seconds - first.seconds) / (many - few)
-        once = first.seconds - few * each
-        hours = (once + MILLION * each) / 3600
-        print(
-            f"| {step} | {1 / each:.0f} | {once:.1f} | {first.megabytes:.0f} | "
-            f"{last.megabytes:.0f} | {hours:.2f} |"
-        )
+        print("| step | events/s | once (s) | memory (MB) at events | 1M events (h) |")
+        print(told("pulses, exact", few // TENTH, many // TENTH, *exact))
+        for step in costs[0]:
+            print(told(step, few, many, costs[0][step], costs[1][step]))
 
 
 if __name__ == "__main__":

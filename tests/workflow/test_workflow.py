@@ -344,6 +344,15 @@ def test_a_calibration_takes_one_file(place):
     assert "detectors.V01.simulate.hits: 2 files, and calibrate takes one" in line
 
 
+def test_a_chain_of_dspeed_that_is_not_there(place):
+    with_steps(place)
+    config = whole_chain()
+    config["events"]["dsp"] = "none.yaml"
+    place.configure(config)
+    (line,) = defects(place)
+    assert "events.dsp: no file none.yaml; give a chain of dspeed, or leave it out" in line
+
+
 def defects(place: Place) -> list[str]:
     done = place.run("--dry-run")
     assert done.returncode == 1

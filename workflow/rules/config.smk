@@ -131,6 +131,11 @@ if "calibrate" in config:
             )
 EVENTS = {}
 if "events" in config:
+    if "dsp" in config["events"] and not Path(config["events"]["dsp"]).is_file():
+        raise WorkflowError(
+            f"configuration, events.dsp: no file {config['events']['dsp']}; give a chain of "
+            "dspeed, or leave it out"
+        )
     EVENTS = {
         name: by_stem(found(config["events"]["hits"], "events.hits", detector=name), "events.hits")
         for name in DETECTORS

@@ -4,8 +4,6 @@ OF_EVENTS = f"{RESULTS}/{{detector}}" + ("/{period}" if CALIBRATED else "")
 PARAMETERS = [
     f"{RESULTS}/{d}/{p}/events/dsp/{name}.lh5" for d, p in PAIRS for name in EVENTS.get(d, {})
 ]
-DSP = config.get("events", {}).get("dsp", str(Path(workflow.basedir) / "config" / "dsp.yaml"))
-DSP_SCRIPT = shlex.quote(str(Path(workflow.basedir) / "scripts" / "dsp.py"))
 
 
 def event_seed(wildcards):
