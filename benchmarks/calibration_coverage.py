@@ -21,10 +21,10 @@ from cpunet.analysis.style import styled
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import Search
-from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.noise import measured_noise
-from cpunet.jobs.stored_simulation import StoredSimulation
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.noise import measured_noise
+from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry import Detector

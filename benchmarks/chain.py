@@ -24,7 +24,7 @@ import numpy as np
 from lgdo import Array, Table, VectorOfVectors
 from streaming import write_fast_run
 
-from cpunet.jobs.hit_sources import GammaSource, energy_windows
+from cpunet.jobs.simulation.hit_sources import GammaSource, energy_windows
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits

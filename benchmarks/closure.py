@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.evaluation import evaluate
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.evaluation import evaluate
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9

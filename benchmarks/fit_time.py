@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.noise import measured_noise
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.noise import measured_noise
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe

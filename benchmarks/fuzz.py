@@ -607,8 +607,8 @@ def main() -> None:
     given = parser.parse_args()
     import torch
 
-    import cpunet.jobs.translate
-    import cpunet.jobs.validate  # noqa: F401
+    import cpunet.jobs.translation.translate
+    import cpunet.jobs.validation.validate  # noqa: F401
 
     torch.set_num_threads(1)
     os.environ["CPUNET_CACHE"] = str(given.base / "cache")

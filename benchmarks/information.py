@@ -17,9 +17,9 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.noise import measured_noise
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.noise import measured_noise
 from cpunet.networks.response import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude

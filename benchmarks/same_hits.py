@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
-from cpunet.jobs.hit_sources import GammaSource, Window
+from cpunet.jobs.simulation.hit_sources import GammaSource, Window
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry_readers import read_detector

@@ -22,9 +22,9 @@ from torch import nn
 
 from cpunet.cli.messages import monitor
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.translate import translate_file
-from cpunet.jobs.translate_options import Adc
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_options import Adc
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter

@@ -16,10 +16,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cpunet.jobs.evaluation import evaluate
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.evaluation import evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses

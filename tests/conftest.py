@@ -125,7 +125,7 @@ def held() -> ModuleType:
 
 def work_here(patch: pytest.MonkeyPatch) -> None:
     from cpunet.errors import CpunetError
-    from cpunet.jobs.workers import Link, Outcome
+    from cpunet.jobs.studies.workers import Link, Outcome
 
     def work_off(begin: Any, items: Any, **_options: Any) -> Iterator[Outcome]:
         work = begin(Link(SimpleNamespace(send=lambda _message: None)))  # type: ignore[arg-type]
@@ -136,8 +136,8 @@ def work_here(patch: pytest.MonkeyPatch) -> None:
                 outcome = Outcome(item, failure=str(error))
             yield outcome
 
-    patch.setattr("cpunet.jobs.ensemble.work_off", work_off)
-    patch.setattr("cpunet.jobs.tune.work_off", work_off)
+    patch.setattr("cpunet.jobs.studies.ensemble.work_off", work_off)
+    patch.setattr("cpunet.jobs.studies.tune.work_off", work_off)
 
 
 @pytest.fixture
@@ -155,7 +155,7 @@ def pool_of_none() -> Callable[[pytest.MonkeyPatch], None]:
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
-    patch.setattr("cpunet.jobs.validate._drawn", lambda _drawing, _advance: Figure())
+    patch.setattr("cpunet.jobs.validation.validate._drawn", lambda _drawing, _advance: Figure())
     patch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
 
 
@@ -187,7 +187,7 @@ def unprobed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 def few_sums() -> Iterator[None]:
     """Scores compare the translations of a few sums: two hundred take seconds each time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.jobs.evaluation.PAIRS", 20)
+        patch.setattr("cpunet.jobs.validation.evaluation.PAIRS", 20)
         yield
 
 

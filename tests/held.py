@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.cli.main import main
-from cpunet.jobs.held_out import HeldOut
+from cpunet.jobs.studies.held_out import HeldOut
 from cpunet.training.unfinished import UnfinishedRun
 
 AFTER = 2  # iterations
@@ -29,7 +29,7 @@ SETTINGS = ["training.checkpoint_interval=1", "training.log_interval=1"]
 # what takes long to import, and a training or a test needs
 PRELOADED = [
     "cpunet.cli.main",
-    "cpunet.jobs.train",
+    "cpunet.jobs.training.train",
     "cpunet.pulses.reading.hdf5",
     "pytest",
     "torch._dynamo",

@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 import warnings
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import typer
@@ -16,24 +19,26 @@ import yaml
 
 import cpunet
 from cpunet.cli.main import app
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.training.train import train_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
-from cpunet.recipes import load_recipe
+from cpunet.recipes import load_recipe, recipe_names
 from cpunet.translation.translator import RejectionWarning
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Seconds of simulation or training each: their imports are tried only.
 TOO_LONG = {"simulation.md", "explorer.md", "python.md"}
+MADE_BY_THE_SITE = ("reference/", "../reference/")
 KEV = 2614.511
 
 
 def blocks(*languages: str) -> list:
     return [
-        pytest.param(page, code, id=f"{page.name}-{i}")
+        pytest.param(page, code, id=f"{page.relative_to(ROOT)}-{i}")
         for page in PAGES
         for i, (language, code) in enumerate(BLOCK.findall(page.read_text()))
         if language in languages
@@ -48,13 +53,18 @@ def commands(code: str) -> list[list[str]]:
 
 
 def require_parsed(words: list[str]) -> None:
-    """Have the command line's own parser read the words; nothing is run."""
+    """Have the command line's own parser read the words; nothing is run.
+
+    What is set of a recipe must be one of its settings.
+    """
     command, name = typer.main.get_command(app), "cpunet"
     while words and words[0] in getattr(command, "commands", {}):
         name, *words = words
         command = command.commands[name]
     assert not hasattr(command, "commands"), f"no command {words[:1]}"
-    command.make_context(name, list(words))
+    given = command.make_context(name, list(words)).params
+    if given.get("recipe") in recipe_names():
+        load_recipe(given["recipe"], given.get("set_values") or ())
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("", "sh", "console"))
@@ -67,14 +77,78 @@ def test_the_commands(page, code):
                 assert (ROOT / word).exists(), f"{page.name}: {word}"
 
 
+def test_the_commands_within_sentences():
+    """What stands in a sentence may lack arguments, but its command and options are there."""
+    for page in PAGES:
+        for inline in re.findall(r"(?<!`)`cpunet ([^`]+)`(?!`)", page.read_text()):
+            command, words = typer.main.get_command(app), inline.split()
+            while words and words[0] in getattr(command, "commands", {}):
+                command = command.commands[words.pop(0)]
+            known = {name for option in command.params for name in option.opts}
+            known |= {name for option in command.params for name in option.secondary_opts}
+            options = {word.strip("[]").partition("=")[0] for word in words if word[:2] == "--"}
+            assert options <= known | {"--help"}, f"{page.name}: cpunet {inline}"
+            first = words[0] if words else ""
+            if hasattr(command, "commands"):
+                assert not first.isalpha() or first.isupper(), f"{page.name}: cpunet {inline}"
+
+
 def test_a_wrong_option_would_be_found():
     with pytest.raises(Exception, match="No such option"):
         require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
 
 
+def test_a_wrong_setting_would_be_found():
+    with pytest.raises(CpunetError, match="the recipe has no"):
+        require_parsed(
+            ["train", "--sim", "a", "--data", "b", "--out", "c", "--set", "training.nonsense=1"]
+        )
+
+
+@pytest.mark.parametrize(("page", "code"), blocks("yaml"))
+def test_the_yaml(page, code):
+    content = yaml.safe_load(code)
+    if "periods" in content:
+        schema = yaml.safe_load((ROOT / "workflow" / "config" / "schema.yaml").read_text())
+        jsonschema.validate(content, schema)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_links(page):
+    """Files that a page links to or shows are there, and so are the headings."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        name, _, heading = target.partition("#")
+        if "://" in target or name.startswith(MADE_BY_THE_SITE):
+            continue
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
+            assert heading in map(slugify, titles), f"{page.name}: {target}"
+
+
+def test_the_files_to_copy_are_there():
+    for path in re.findall(
+        r"`((?:src|tests|docs)/[\w./-]+)`", (ROOT / "CONTRIBUTING.md").read_text()
+    ):
+        assert (ROOT / path).exists(), path
+    for path in re.findall(r"`((?:\w+/)+\w+\.py)`", (ROOT / "CONTRIBUTING.md").read_text()):
+        assert (ROOT / path).exists() or (ROOT / "src" / "cpunet" / path).exists(), path
+
+
+def slugify(title: str) -> str:
+    """The anchor of a heading."""
+    words = re.sub(r"[^\w\s-]", "", title.lower()).strip()
+    return re.sub(r"[-\s]+", "-", words)
+
+
 def edges(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
     width = rng.uniform(1.0, 6.0, (n, 1))
     return 1 / (1 + np.exp(-(np.arange(length) - 550 - rng.uniform(0, 1, (n, 1))) / width))
+
+
+SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
+"""A fit that ends at once, whatever it has found."""
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +166,7 @@ def home(tmp_path_factory) -> Path:
     write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
     fine = Pulses.of(edges(4, 3000, rng), dt_ns=1, energy_kev=np.full(4, KEV))
     write_pulses(folder / "fine.lh5", fine)
-    short = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
-    recipe = load_recipe("fast", [f"training.{value}" for value in (*short, "noise_sets=1")])
+    recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")
     train_run(*sides, folder / "run", recipe, device="cpu")
     for seed in ("seed_000", "seed_001"):
@@ -115,6 +188,36 @@ def test_the_python(page, code, home, monkeypatch):
         lost = np.isnan(names["measured_like"]).any(axis=1)
         assert lost[7]  # and the one of 1 keV, if its noise is too high
         assert set(np.flatnonzero(lost)) <= {3, 7}
+
+
+@pytest.mark.slow
+def test_the_first_tutorial_from_end_to_end(tmp_path):
+    """Every command of it in turn, with fewer events and a fit that ends at once."""
+    page = ROOT / "docs" / "tutorials" / "first-ren.md"
+    lines = [
+        words
+        for language, code in BLOCK.findall(page.read_text())
+        if language == ""
+        for words in commands(code)
+        if words[0] == "cpunet"
+    ]
+    assert lines[0][1] == "stand"
+    for words in lines:
+        if "--events" in words:
+            words[words.index("--events") + 1] = "FEP=500,SEP=120,DEP=120"
+        if words[1] == "train":
+            words += [w for value in SHORT for w in ("--set", f"training.{value}")]
+            words += ["--set", "scores.bootstraps=10"]
+        code = "from cpunet.cli.main import main; main()"
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words[1:]],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, (words, done.stderr)
+    for made in ("check.png", "run/run.json", "translated.lh5", "report/report.html"):
+        assert (tmp_path / made).exists()
 
 
 def test_the_readmes_files_are_told_of(home):

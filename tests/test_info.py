@@ -13,7 +13,7 @@ import pytest
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.info import describe
+from cpunet.jobs.inspection.info import describe
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe

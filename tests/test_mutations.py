@@ -26,9 +26,9 @@ from torch import nn
 
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.compare import read_metrics
-from cpunet.jobs.import_published import import_pulses
-from cpunet.jobs.simulation_settings import load_settings
+from cpunet.jobs.simulation.simulation_settings import load_settings
+from cpunet.jobs.training.import_published import import_pulses
+from cpunet.jobs.validation.compare import read_metrics
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -37,7 +37,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import load_network, read_info, read_losses
 
 pytestmark = pytest.mark.probed
-FEW, MANY = 10, 2500
+FEW, MANY = 4, 2500
 
 
 def load_mutations() -> ModuleType:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation_settings import load_settings, split_overrides
+from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.shifted import Shift

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from cpunet.calls.runs import Run, train
     from cpunet.calls.translations import Translation, translate
     from cpunet.errors import CpunetError
-    from cpunet.jobs.hit_sources import HitFile
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.translation.translator import IREN, REN
@@ -52,8 +52,8 @@ _HOMES = {
     "calls.runs": ("Run", "train"),
     "calls.translations": ("Translation", "translate"),
     "errors": ("CpunetError",),
-    "jobs.hit_sources": ("HitFile",),
-    "jobs.inputs": ("InputFile",),
+    "jobs.simulation.hit_sources": ("HitFile",),
+    "jobs.common.inputs": ("InputFile",),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
     "translation.translator": ("IREN", "REN"),

@@ -32,6 +32,10 @@
 
   seen.labels = names.map((name) => [...svg(name).querySelectorAll("text.name")].map((t) => t.textContent));
   const raw = "#D55E00";
+  const beside = () => [...host("scatter").querySelectorAll("button[data-method]")].map((b) => b.dataset.method);
+  seen.beside = [beside()];
+  choose("scatter", 1, "raw");
+  seen.beside.push(beside());
   seen.rawBefore = names.map((name) => strokes(name, raw));
   host("slices").querySelector("button[data-method=raw]").click();
   seen.rawAfter = names.map((name) => strokes(name, raw));
@@ -45,7 +49,7 @@
     const before = ticks(name);
     drag(name, 0.4, 0.6, 0.3, 0.5);
     const zoomed = ticks(name);
-    const toggle = host(name).querySelector("button[data-method=truth]");
+    const toggle = host(name).querySelector(`button[data-method=${name === "scatter" ? "raw" : "truth"}]`);
     toggle.click();
     toggle.click();
     const kept = ticks(name);
@@ -62,11 +66,13 @@
 
   seen.below = cell("distributions", "data/below");
   seen.none = { data: null };
+  seen.idle = getComputedStyle(host("distributions").querySelector("th.live")).visibility;
   choose("distributions", 1, "drift_time");
   seen.chosen = svg("distributions").querySelector("text.name:last-child").textContent;
   seen.none = cell("distributions", "data/none");
   point("distributions", "pointermove", 0.5);
   seen.hover = host("distributions").querySelector(".readout").textContent;
+  seen.live = getComputedStyle(host("distributions").querySelector("th.live")).visibility;
   seen.bin = cell("distributions", "data/at");
 
   // the cursor's first step is from the middle; the next ones are whole samples

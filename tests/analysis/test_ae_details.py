@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from cpunet.analysis.a_over_e import sideband_survival
 from cpunet.analysis.ae_details import ae_against_drift_time, two_dimensional
-from cpunet.analysis.ae_figures import ae_figure, two_dimensional_figure
+from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.analysis.range_survival import peak_survival, survival_by_range
 from cpunet.errors import CpunetError
 
@@ -228,3 +228,17 @@ def render(figure) -> None:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=40)
     assert stream.tell() > 1000
+
+
+def test_curves_of_survival_are_the_analytic_ones():
+    """Of uniform amplitudes a cut that leaves a part p of one leaves 2 p - 1 of the other."""
+    single, other = np.linspace(1, 3, 2001), np.linspace(0, 2, 2001)
+    unknown = np.append(other, np.nan)
+    drawn = roc_figure(
+        {"SEP": {"data": unknown, "ren": other}, "DEP": dict.fromkeys(("data", "ren"), single)}
+    )
+    (axes,) = drawn.axes
+    assert [line.get_label() for line in axes.lines] == ["Data", "REN translation"]
+    for line in axes.lines:
+        accepted, left = line.get_data()
+        assert left == pytest.approx(np.clip(2 * accepted - 100, 0, 100) / 2, abs=0.2)

@@ -114,6 +114,14 @@ def test_axes_have_units(seen):
     assert seen["chosen"] == "Drift time, 1 % to maximum [ns]"
 
 
+def test_single_pulses_of_one_method_are_beside_the_data(seen):
+    assert seen["beside"] == [["data", "ren"], ["data", "raw"]]
+
+
+def test_columns_of_the_cursor_are_seen_with_a_cursor_only(seen):
+    assert (seen["idle"], seen["live"]) == ("hidden", "visible")
+
+
 def test_a_method_is_switched_off_in_all_charts_at_once(seen):
     assert all(seen["rawBefore"])
     assert seen["rawAfter"] == [0, 0, 0, 0]

@@ -130,8 +130,39 @@ def test_page_shows_scores_counts_and_provenance(report):
 def test_names_of_methods_are_aligned_as_words(report):
     html = (report / "report.html").read_text()
     left = re.findall(r'<t[hd][^>]*style="text-align: left">([^<]*)</t[hd]>', html)
-    filled, empty = ["Method", "Simulation", "REN translation", "Ceiling"], ["Method"]
-    assert left == [*filled, *empty]
+    assert left == ["Method", "Simulation", "REN translation", "Ceiling"]
+
+
+def test_scores_are_panels_of_dots_beside_their_ceilings(report):
+    html = (report / "report.html").read_text()
+    panels = re.search(r'<div class="panels">(.*?)</div>', html, re.DOTALL)
+    assert panels is not None
+    assert "SEP, IoU of the drift time [%]; grey: the ceiling" in panels[1]
+    assert panels[1].count("<circle") == 2
+    assert panels[1].count('fill="#ddd"') == 2
+    # tables are there for those who ask
+    assert "<details><summary>Scores as a table</summary>" in html
+
+
+def test_a_page_begins_with_what_was_compared_and_a_picture(tmp_path):
+    compared = {"simulation": "my <sim>.lh5", "fit": "chi-square is 1.1 per moment"}
+    names = ("spectrum", "FEP mean pulse", "SEP mean pulse", "SEP noise", "A over E survival")
+    found = metrics() | {"compared": compared, "training": {"peak": "FEP"}}
+    write_report(tmp_path, found, {name: figure() for name in names}, [])
+    html = (tmp_path / "report.html").read_text()
+    places = [
+        html.index(text)
+        for text in (
+            "my &lt;sim&gt;.lh5",
+            'alt="SEP mean pulse"',
+            'id="scores"',
+            'alt="A over E survival"',
+            'alt="SEP noise"',
+            'alt="FEP mean pulse"',
+        )
+    ]
+    assert places == sorted(places)
+    assert all(html.count(f'alt="{name}"') == 1 for name in names)
 
 
 def test_a_report_of_nothing_can_be_written(tmp_path):

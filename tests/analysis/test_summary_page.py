@@ -18,7 +18,7 @@ from cpunet.analysis.side_by_side import Cell
 from cpunet.analysis.summary_page import Entry, summary_page
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.summary_page import detector_and_period, summarise_reports
+from cpunet.jobs.validation.summary_page import detector_and_period, summarise_reports
 
 
 def metrics(*ious: float, auc: float = 0.51) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import _relaxed
-from cpunet.jobs.calibration_inputs import Freedom, known_depletion
+from cpunet.jobs.calibration.calibration_inputs import Freedom, known_depletion
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import solve

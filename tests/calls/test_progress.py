@@ -18,7 +18,7 @@ from cpunet.calls.progress import (
     notebook_display,
     shown,
 )
-from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.common.monitor import Monitor
 
 
 class Shown:

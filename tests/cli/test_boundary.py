@@ -48,7 +48,7 @@ def test_every_ending_is_one_line(command, monkeypatch, ending):
     def fail(*_words: object, **_options: object) -> None:
         raise error
 
-    monkeypatch.setattr("cpunet.jobs.info.describe", fail)
+    monkeypatch.setattr("cpunet.jobs.inspection.info.describe", fail)
     outcome = command("info", "x.lh5")
     assert (outcome.code, outcome.out) == (status, "")
     (line,) = outcome.err.splitlines()
@@ -63,7 +63,7 @@ def test_debug_shows_where_wherever_it_stands(command, monkeypatch):
     def fail(*_words: object, **_options: object) -> None:
         raise KeyError("translated")
 
-    monkeypatch.setattr("cpunet.jobs.info.describe", fail)
+    monkeypatch.setattr("cpunet.jobs.inspection.info.describe", fail)
     for words in (("--debug", "info", "x"), ("info", "x", "--debug")):
         outcome = command(*words)
         assert outcome.code == 70
@@ -90,7 +90,7 @@ def test_damaged_compiled_code_is_named(command, monkeypatch, tmp_path):
     def fail(*_words: object, **_options: object) -> None:
         files._load_index()
 
-    monkeypatch.setattr("cpunet.jobs.info.describe", fail)
+    monkeypatch.setattr("cpunet.jobs.inspection.info.describe", fail)
     with pytest.raises((pickle.UnpicklingError, ValueError)):
         fail()
     outcome = command("info", "x")

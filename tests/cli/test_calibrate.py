@@ -31,8 +31,8 @@ def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
     """A small stand; made by the package's own job, in this process."""
     from cpunet.electronics.chain import Electronics
     from cpunet.electronics.presets import read_electronics
-    from cpunet.jobs.hit_sources import energy_windows
-    from cpunet.jobs.stand import make_stand
+    from cpunet.jobs.simulation.hit_sources import energy_windows
+    from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe
     from cpunet.simulation.shifted import Shift
 
@@ -50,9 +50,9 @@ def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
 
 
 def calibrate(stand: Path, run: Path, *overrides: str) -> Path:
-    from cpunet.jobs.calibrate import Calibration
-    from cpunet.jobs.calibration_inputs import Freedom, Start
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.calibration.calibrate import Calibration
+    from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
+    from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes import load_recipe
 
     Calibration(

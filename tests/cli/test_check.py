@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.validate import validate_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.validation.validate import validate_run
 
 N = 240
 FEP = 2614.511
@@ -205,7 +205,7 @@ def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch
         seen.extend([sim, data])
         raise SeenError
 
-    monkeypatch.setattr("cpunet.jobs.validate.evaluate", evaluated)
+    monkeypatch.setattr("cpunet.jobs.validation.validate.evaluate", evaluated)
     sim = InputFile(stand.sim)
     other = Path(shutil.copy(stand.data, tmp_path / "other.lh5"))
     for data, expected in (

@@ -15,8 +15,8 @@ import yaml
 from matplotlib.figure import Figure
 
 from cpunet.cli.main import main
-from cpunet.jobs import validate
-from cpunet.jobs.figures import drawings
+from cpunet.jobs.validation import validate
+from cpunet.jobs.validation.figures import drawings
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 
@@ -332,7 +332,7 @@ def unscorable(monkeypatch):
     def evaluate(*_args, **_options):
         raise AssertionError("scored")
 
-    return lambda: monkeypatch.setattr("cpunet.jobs.figure_files.evaluate", evaluate)
+    return lambda: monkeypatch.setattr("cpunet.jobs.validation.figure_files.evaluate", evaluate)
 
 
 def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):

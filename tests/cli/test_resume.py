@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.training.train import train_run
 from cpunet.recipes import load_recipe
 from cpunet.training.checkpoints import CHECKPOINT
 from cpunet.training.run_folder import LOSSES
@@ -153,7 +153,7 @@ def test_too_little_memory(command, words, tmp_path, monkeypatch, error, line):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr("cpunet.jobs.train.train", fail)
+    monkeypatch.setattr("cpunet.jobs.training.train.train", fail)
     outcome = command(*words)
     assert outcome.code == 2
     assert outcome.err.splitlines()[-1] == line

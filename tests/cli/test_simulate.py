@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from cpunet.jobs.simulate import LIBRARY_FROM_HITS
+from cpunet.jobs.simulation.simulate import LIBRARY_FROM_HITS
 from cpunet.pulses.reading import open_pulses
 
 PPC = ["--detector", "ppc", "--set", "grid_mm=0.5"]

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.truth import load_truth
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.truth import load_truth
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
+from cpunet.training.response_starts import GOOD_FIT
 
 EVENTS = "FEP=40,DEP=20"
 
@@ -62,6 +63,23 @@ def test_rates_are_options_and_are_told(command, tmp_path: Path):
     with np.load(tmp_path / "stand" / "data_labels.npz") as known:
         assert (known["remains_kev"] == 0).all()
         assert 0.3 < (known["flag"] & 2 > 0).mean() < 0.9
+
+
+@pytest.mark.slow
+def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
+    """With 2,000 pulses a fit with fixed fast decays is poor, and a ringing imitates one."""
+    stand, run = tmp_path / "stand", tmp_path / "run"
+    words = ("stand", "--preset", "ornl", "--rate-khz", 0, "--events", "FEP=2000", "--seed", 3)
+    assert command(*words, "--out", stand).code == 0
+    words = ("train", "--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--out", run)
+    assert command(*words).code == 0
+    fit = json.loads((run / "run.json").read_text())["fit"]
+    found = fit["parameters"]
+    assert "ringing_mhz" not in found
+    assert found["pole_1_ns"] == pytest.approx(55, rel=0.1)
+    assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
+    assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
+    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
 
 
 def test_it_is_replaced_with_force_only(command, made: Path):

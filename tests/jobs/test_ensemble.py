@@ -15,9 +15,9 @@ from torch import nn
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.seed_scores import failed_seeds, seed_table
 from cpunet.errors import CpunetError
-from cpunet.jobs.ensemble import train_ensemble
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.studies.ensemble import train_ensemble
+from cpunet.jobs.training.train import train_run
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses
@@ -104,10 +104,9 @@ def weights(run: Path) -> bytes:
 
 
 def test_a_seed_is_what_a_single_training_gives(files, made, tmp_path):
-    for seed in (0, 1):
-        train_run(*files, tmp_path / str(seed), RECIPE, seed=seed, device="cpu")
-        assert weights(made.folder / f"seed_00{seed}") == weights(tmp_path / str(seed))
-    assert weights(tmp_path / "0") != weights(tmp_path / "1")
+    train_run(*files, tmp_path / "1", RECIPE, seed=1, device="cpu")
+    assert weights(made.folder / "seed_001") == weights(tmp_path / "1")
+    assert weights(made.folder / "seed_000") != weights(tmp_path / "1")
 
 
 def test_the_ensemble_tells_of_its_seeds(made):

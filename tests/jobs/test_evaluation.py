@@ -11,14 +11,14 @@ import pytest
 from cpunet.analysis.drift_slices import slice_edges
 from cpunet.analysis.paired import paired_scores
 from cpunet.errors import CpunetError
-from cpunet.jobs.energy_ranges import validation_selection
-from cpunet.jobs.evaluation import Evaluation, evaluate
-from cpunet.jobs.figure_store import read_drawings, write_drawings
-from cpunet.jobs.figures import drawings, figure_names
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.train import train_run
-from cpunet.jobs.validate import validate_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.energy_ranges import validation_selection
+from cpunet.jobs.validation.evaluation import Evaluation, evaluate
+from cpunet.jobs.validation.figure_store import read_drawings, write_drawings
+from cpunet.jobs.validation.figures import drawings, figure_names
+from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.writing import write_pulses
@@ -164,7 +164,9 @@ def test_a_damaged_store_is_one_line(tmp_path, content) -> None:
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("cpunet.jobs.validate.drawings", lambda found: {})  # drawn above
+    monkeypatch.setattr(
+        "cpunet.jobs.validation.validate.drawings", lambda found: {}
+    )  # drawn above
     metrics = validate_run(
         run, files["sim"], files["no DEP"], tmp_path / "report", rivals=False, device="cpu"
     )

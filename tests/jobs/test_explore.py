@@ -22,10 +22,10 @@ from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.explore import explore_runs
-from cpunet.jobs.inputs import InputFile, load_measured
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.places import IN_CONTACT, NOT_COLLECTED
+from cpunet.jobs.common.inputs import InputFile, load_measured
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.explore import explore_runs
+from cpunet.jobs.inspection.places import IN_CONTACT, NOT_COLLECTED
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
@@ -332,7 +332,7 @@ def test_an_existing_page_is_kept_and_a_failure_leaves_nothing(runs, tmp_path, m
         raise CpunetError("stopped")
 
     with monkeypatch.context() as patch:
-        patch.setattr("cpunet.jobs.explore.explorer_page", fails)
+        patch.setattr("cpunet.jobs.inspection.explore.explorer_page", fails)
         with pytest.raises(CpunetError, match="stopped"):
             explore_runs(runs[:1], DETECTOR, out, points=20, force=True)
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]

@@ -10,8 +10,8 @@ import pytest
 from safetensors.torch import load_file
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.training.train import train_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe

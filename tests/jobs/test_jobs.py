@@ -13,19 +13,19 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs import translate as translate_job
-from cpunet.jobs.devices import resolve_device
-from cpunet.jobs.inputs import (
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.inputs import (
     InputFile,
     InputSet,
     load_measured,
     load_simulated,
     require_same_sampling,
 )
-from cpunet.jobs.monitor import Advance, Monitor
-from cpunet.jobs.train import train_run
-from cpunet.jobs.translate import translate_file
-from cpunet.jobs.truth import load_truth
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.common.truth import load_truth
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.translation import translate as translate_job
+from cpunet.jobs.translation.translate import translate_file
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses

@@ -15,7 +15,7 @@ glibc = pytest.mark.skipif(
 # apart from the heap, and how many stay on top of it.
 SCRIPT = """
 import ctypes
-from cpunet.jobs.memory import give_back_large_arrays, keep_freed_memory
+from cpunet.jobs.common.memory import give_back_large_arrays, keep_freed_memory
 {jobs}
 library = ctypes.CDLL(None)
 names = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.noise import measured_noise, noise_of_traces
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.noise import measured_noise, noise_of_traces
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.pulses.writing import write_pulses

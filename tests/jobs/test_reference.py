@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.train import train_run
-from cpunet.jobs.validate import validate_run
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.validate import validate_run
 from cpunet.recipes import load_recipe
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.jobs.response_errors import propagated
+from cpunet.jobs.inspection.response_errors import propagated
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes import load_recipe
 

@@ -14,11 +14,17 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.hit_sources import GammaSource, HitFile, OpenHits, Window, energy_windows
-from cpunet.jobs.inputs import InputFile, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.simulate import Resolution, simulate_file
-from cpunet.jobs.simulation_settings import load_settings
+from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.simulation.hit_sources import (
+    GammaSource,
+    HitFile,
+    OpenHits,
+    Window,
+    energy_windows,
+)
+from cpunet.jobs.simulation.simulate import Resolution, simulate_file
+from cpunet.jobs.simulation.simulation_settings import load_settings
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
@@ -85,15 +91,15 @@ def test_events_do_not_depend_on_threads_but_on_the_seed(ppc, monkeypatch):
     def numbers(source: GammaSource) -> list[float]:
         return np.concatenate([b.edep_kev for b in source.open(ppc).blocks]).tolist()
 
-    monkeypatch.setattr("cpunet.jobs.hit_sources._ROUND_EVENTS", 10)
+    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._ROUND_EVENTS", 10)
     many = numbers(gammas())
-    monkeypatch.setattr("cpunet.jobs.hit_sources._MOST_WORKERS", 1)
+    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._MOST_WORKERS", 1)
     assert numbers(gammas()) == many
     assert numbers(gammas(seed=5)) != many
 
 
 def test_rounds_add_up_and_number_events_anew(ppc, monkeypatch):
-    monkeypatch.setattr("cpunet.jobs.hit_sources._ROUND_EVENTS", 10)
+    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._ROUND_EVENTS", 10)
     hits = Hits.concatenate(list(gammas().open(ppc).blocks))
     energy = np.round(hits.energy_kev - 0.011, 1)
     assert [int((energy == e).sum()) for e in (2614.5, 2103.5, 1592.5)] == [30, 3, 3]

@@ -14,10 +14,10 @@ import pytest
 
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs import stand_plan
-from cpunet.jobs.hit_sources import Window
-from cpunet.jobs.stand import make_stand
-from cpunet.jobs.stored_simulation import StoredSimulation
+from cpunet.jobs.simulation import stand_plan
+from cpunet.jobs.simulation.hit_sources import Window
+from cpunet.jobs.simulation.stand import make_stand
+from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry_readers import read_detector
@@ -61,7 +61,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return build_library(maps, settings.model_copy(update={"library_halvings": 3}))
 
     monkeypatch.setattr(stand_plan, "build_library", build)
-    monkeypatch.setattr("cpunet.jobs.stand._LIBRARY_FROM_EVENTS", sum(EVENTS))
+    monkeypatch.setattr("cpunet.jobs.simulation.stand._LIBRARY_FROM_EVENTS", sum(EVENTS))
     return built
 
 
@@ -116,7 +116,7 @@ def test_pulses_of_a_library_are_those_drifted_one_by_one(
     by_library = made(tmp_path / "library", kind=kind)
     assert libraries == temperatures
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.jobs.stand._LIBRARY_FROM_EVENTS", sum(EVENTS) + 1)
+        patch.setattr("cpunet.jobs.simulation.stand._LIBRARY_FROM_EVENTS", sum(EVENTS) + 1)
         drifted = made(tmp_path / "drifted", kind=kind)
     assert len(libraries) == len(temperatures)
     values = "waveform/values"

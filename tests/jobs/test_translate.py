@@ -24,15 +24,15 @@ from torch import nn
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.errors import CpunetError
-from cpunet.jobs import translate as translate_job
-from cpunet.jobs.file_workers import in_processes
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.output_lock import only_writer
-from cpunet.jobs.translate import translate_file
-from cpunet.jobs.translate_files import expanded, translate_files
-from cpunet.jobs.translate_options import Adc, TranslateOptions
-from cpunet.jobs.translation_blocks import noise_seed, regrouped
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.output_lock import only_writer
+from cpunet.jobs.translation import translate as translate_job
+from cpunet.jobs.translation.file_workers import in_processes
+from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_files import expanded, translate_files
+from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.jobs.translation.translation_blocks import noise_seed, regrouped
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.truth import Responses
+from cpunet.jobs.common.truth import Responses
 
 
 def prepared(index, n_read):

@@ -16,11 +16,11 @@ import torch
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.held_out import HeldOut
-from cpunet.jobs.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.tune import tune_recipe
-from cpunet.jobs.tuning_study import _is_gone, this_worker
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.studies.held_out import HeldOut
+from cpunet.jobs.studies.tune import tune_recipe
+from cpunet.jobs.studies.tuning_study import _is_gone, this_worker
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses

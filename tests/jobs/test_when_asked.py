@@ -2,7 +2,7 @@
 
 import pytest
 
-from cpunet.jobs.when_asked import WhenAsked
+from cpunet.jobs.validation.when_asked import WhenAsked
 
 
 def test_values_are_made_anew_when_asked_for():

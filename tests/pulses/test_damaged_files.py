@@ -175,7 +175,7 @@ def test_every_flipped_bit_of_encoded_waveforms_is_met_or_harmless(tmp_path):
         with h5py.File(path) as file:
             codes = file[CODES][()]
         rng = np.random.default_rng(4)
-        for at in rng.integers(0, len(codes), 40):
+        for at in rng.integers(0, len(codes), 15):
             flipped = codes.copy()
             flipped[at] ^= np.uint8(1 << rng.integers(8))
             with h5py.File(path, "r+") as file:

@@ -57,15 +57,20 @@ PHYSICS = [
 ]
 
 
+@pytest.mark.parametrize(
+    "physics",
+    [[{}, {**PHYSICS[1], **PHYSICS[4]}], pytest.param(PHYSICS, marks=pytest.mark.slow)],
+    ids=["two", "all"],
+)
 def test_it_is_a_new_simulation_from_one_solution(
-    hits: Hits, monkeypatch: pytest.MonkeyPatch
+    hits: Hits, monkeypatch: pytest.MonkeyPatch, physics: list[dict[str, float]]
 ) -> None:
     solved: list[Detector] = []
     solve = again.solve
     monkeypatch.setattr(again, "solve", lambda d: solved.append(d) or solve(d))
     same = SameHits(hits)
     first = same.simulate(DETECTOR, SETTINGS)
-    for values in PHYSICS:
+    for values in physics:
         detector, settings = changed(**values)
         new = simulate_events(compute_fields(detector), hits, settings)
         old = same.simulate(detector, settings)

@@ -11,7 +11,7 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.jobs import hit_sources
-from cpunet.jobs.hit_sources import HitFile, Window
+from cpunet.jobs.simulation.hit_sources import HitFile, Window
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import hit_parts, read_hits
 from cpunet.simulation.hit_readers.remage import parts_of

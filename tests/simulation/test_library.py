@@ -30,10 +30,13 @@ def library(planar: Maps) -> Library:
     return build_library(planar, FINE)
 
 
-def random_events(size: tuple[float, float], n_hits: int, seed: int = 0) -> Hits:
-    """Events of three hits within a radius and a height."""
+def random_events(
+    size: tuple[float, float], n_hits: int, seed: int = 0, above: float = 0.0
+) -> Hits:
+    """Events of three hits within a radius and a height, above a plane."""
     rng = np.random.default_rng(seed)
     place = rng.uniform([-size[0], -size[0], 0], [size[0], *size], (n_hits, 3))
+    place[:, 2] += above
     return Hits.of(place, rng.uniform(50, 1000, n_hits), np.arange(0, n_hits + 1, 3))
 
 
@@ -61,8 +64,15 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
     assert seen[-1] == (2, 2)
 
 
-def test_library_agrees_with_the_exact_drift(reference_maps: Maps) -> None:
-    hits = random_events((40, 96), 1800)
+@pytest.mark.parametrize(
+    ("size", "above", "n_hits"),
+    [((10, 20), 60, 360), pytest.param((40, 96), 0, 1800, marks=pytest.mark.slow)],
+    ids=["of a part", "of the crystal"],
+)
+def test_library_agrees_with_the_exact_drift(
+    reference_maps: Maps, size: tuple[float, float], above: float, n_hits: int
+) -> None:
+    hits = random_events(size, n_hits, above=above)
     exact = simulate_events(reference_maps, hits, SETTINGS)
     quick = simulate_events(reference_maps, hits, SETTINGS, mode="library")
     np.testing.assert_array_equal(exact.lost_kev, quick.lost_kev)

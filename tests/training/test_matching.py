@@ -262,16 +262,20 @@ def test_a_ringing_is_found_where_there_is_one() -> None:
 
 
 def test_a_fast_decay_gets_a_time_of_its_own() -> None:
-    """That of the paper's stand: fixed times of 4 and 16 us do not follow 2.9."""
+    """That of the paper's stand: fixed times of 4 and 16 us do not follow 2.9.
+
+    A ringing would imitate it, if the fit from the fixed ones were left with that.
+    """
     decays = [{"fraction": 0.95, "tau_us": 54.6}, {"fraction": 0.05, "tau_us": 2.9}]
     fast = measured_with(CHAIN.model_validate(CHAIN.model_dump() | {"decays": decays}))
     fixed = "generator.fast_decays_us=[4, 16]"
-    response, fit = fast.fit(0, fixed, "training.ringing_mhz=[]", "training.start_factors=[1]")
+    response, fit = fast.fit(0, fixed, "training.start_factors=[1]")
     assert response.config.free_decays
     numbers = response.describe()
+    assert "ringing_mhz" not in numbers
     assert numbers["fast_decay_1_us"] == pytest.approx(2.9, rel=0.3)
     assert numbers["fast_decay_1_share"] == pytest.approx(0.05, rel=0.3)
-    assert fit.chi_square < 1.6 * fit.moments
+    assert fit.chi_square < GOOD_FIT * fit.moments
 
 
 def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:

@@ -13,7 +13,7 @@ from cpunet.analysis.comparisons import compare
 from cpunet.analysis.report import write_report
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.export import export_run
+from cpunet.jobs.translation.export import export_run
 from cpunet.networks.hybrid import EdgeResidual
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator

@@ -13,8 +13,8 @@ from lgdo import Array, Scalar, Struct
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.pulse_shape_library import write_library
-from cpunet.jobs.translate_library import translate_library
+from cpunet.jobs.simulation.pulse_shape_library import write_library
+from cpunet.jobs.translation.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.import_published import import_pulses, import_weights
+from cpunet.jobs.training.import_published import import_pulses, import_weights
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.restricted_unpickler import ForbiddenError, TruncatedError, load
 from cpunet.translation.translator import IREN, REN

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -16,6 +17,10 @@ AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
 COLUMNS = 3  # panels beside each other
+ROC_POINTS = 201  # of a curve
+ROC_RANGE = (50, 100)  # percent of the DEP, which useful cuts leave
+
+Values = npt.NDArray[np.float64]
 
 
 @styled
@@ -59,6 +64,52 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
         alignment="left",
     )
     return figure
+
+
+@styled
+def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figure:
+    """What cuts on a low A/E leave of other peaks, against what they leave of the DEP.
+
+    Parameters
+    ----------
+    ae
+        A/E of single pulses by peak and method, the measured ones under ``"data"``; not
+        finite values are left out.
+    dep
+        The peak of single-site events.
+    """
+    others = [peak for peak in ae if peak != dep]
+    methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
+    palette = colours(methods)
+    figure = Figure(figsize=(3.4 * max(len(others), 1) + 0.6, 3.8))
+    panels = figure.subplots(1, max(len(others), 1), sharey=True, squeeze=False)[0]
+    accepted = np.linspace(0.0, 1.0, ROC_POINTS)
+    for axes, peak in zip(panels, others, strict=False):
+        for method in sorted(methods, key=lambda name: name == "ren"):
+            single, other = (_finite(ae[name][method]) for name in (dep, peak))
+            if not (single.size and other.size):
+                continue
+            cuts = np.quantile(single, 1 - accepted)
+            left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
+            is_data = method == "data"
+            look = {"color": "0.65" if is_data else palette[method]}
+            axes.plot(
+                100 * accepted,
+                100 * left,
+                linewidth=4.0 if is_data else 1.4,
+                label=label(method),
+                **look,
+            )
+        axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
+    # cuts that leave few multi-site events are the useful ones
+    panels[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
+    panels[0].yaxis.set_major_formatter("{x:g}")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+def _finite(values: Values) -> Values:
+    return values[np.isfinite(values)]
 
 
 @styled

@@ -224,8 +224,9 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     time_ns = (np.arange(len(data.mean)) - data.before) * dt_ns
     figure = Figure(figsize=(5.6, 4.8))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    for method, mean in means.items():
-        text = f"{label(method)}, n = {sets[method].n}"
+    # the translation last, so that nothing hides it
+    for method in sorted(means, key=lambda name: name == "ren"):
+        mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
         # a broad grey line, so that a method which agrees does not hide the data
         look = (
             {"color": "0.65", "linewidth": 4.0}
@@ -233,14 +234,18 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
             else {"color": palette[method]}
         )
         above.plot(time_ns, mean, label=text, **look)
+        if method == "raw":
+            # its height alone would be most of its difference
+            mean, look["linestyle"] = mean * data.mean[-1] / mean[-1], "dashed"
+            above.plot(time_ns, mean, label="the same, at the data's height", **look)
         if method != "data":
-            below.plot(time_ns, 100 * (mean - means["data"]), color=palette[method])
+            below.plot(time_ns, 100 * (mean - means["data"]), **look)
     below.axhline(0, color="black", linewidth=0.8)
     above.set(title=f"{peak}, mean pulse aligned at half maximum", ylabel="Pulse height")
     above.legend(loc="lower right")
     below.set(
         xlabel="Time from half maximum [ns]",
-        ylabel="Method − data\n[% of full charge]",
+        ylabel="Method − data\n[% of full charge,\nlinear within ± 1]",
         xlim=(time_ns[0], time_ns[-1]),
     )
     # so that small differences show beside those of an untranslated simulation

@@ -25,6 +25,8 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.nested_tables import nested_html
 from cpunet.analysis.report_tables import (
+    compared_html,
+    folded,
     gap,
     pairs_table,
     peak_html,
@@ -45,6 +47,7 @@ REPORT = FolderKind(
 DPI = 150
 COMPRESSION = 1  # of PNG, 0 … 9: a tenth larger than with the usual 6, in half of the time
 WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
+FIRST = 2  # figures of mean pulses that a page begins with
 MANY = 4  # figures, from which on they are folded away
 
 SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
@@ -65,13 +68,14 @@ VIEWS = {
         "correlated.",
     ),
     "pulses": (
-        "Single pulses",
+        "Single pulses by every method",
         "The same simulated event by every method, without noise, aligned at half maximum.",
     ),
     "scatter": (
         "Current amplitude and drift time",
-        "One point a pulse; of larger sets a part, drawn at random. The drift time ends at the "
-        "maximum, which on a flat top is that of the noise.",
+        "One point a pulse, data in grey and one method beside them; of larger sets a part, "
+        "drawn at random. The drift time ends at the maximum, which on a flat top is that of "
+        "the noise.",
     ),
 }
 # parts of the metrics that are shown as they are
@@ -104,6 +108,7 @@ def write_report(
         ``verdicts``: ``summary``, a list of sentences, and ``table``, by peak, method and
         quantity its ``sigma`` and ``words``; ``ae_survival``; ``ae_details``,
         ``drift_slices``, ``linearity``, ``noise``: any nesting, shown as tables;
+        ``compared``: names and values of what was compared;
         ``training``: how the network was trained; ``rejections``: counts by reason,
         possibly nested.  Numbers that are not finite are written as ``null``.
     figures
@@ -118,15 +123,18 @@ def write_report(
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
     (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-    drawn = []
+    drawn = {}
     for name, figure in figures.items():
         png = _png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
-        drawn.append(_figure_html(name, figure, png))
+        drawn[name] = _figure_html(name, figure, png)
+    first, of_noise, of_ae, others = _shared_out(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
     html = Template(_asset("page.html")).substitute(
         css=_asset("page.css"),
+        compared=compared_html(metrics.get("compared", {})),
+        first=_gallery(first),
         notes="\n".join(f"<p>{escape(note)}</p>" for note in notes),
         verdicts=verdicts_html(metrics.get("verdicts")),
         scores="\n".join(
@@ -134,10 +142,13 @@ def write_report(
             for name, scores in metrics.get("peaks", {}).items()
         )
         or gap("no peak was scored"),
-        views=_views_html(views),
+        shapes=_views_html(views, ("distributions", "slices")),
+        pulses=_views_html(views, ("pulses", "scatter")),
         survival=survival_html(metrics.get("ae_survival", {})),
+        ae=_gallery(of_ae),
+        noise=_gallery(of_noise),
         details=_details_html(metrics),
-        figures=_gallery(drawn),
+        figures=_gallery(others) or gap("no figures were drawn"),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=_script(views),
@@ -149,12 +160,32 @@ def _asset(name: str) -> str:
     return files("cpunet.analysis").joinpath("page", name).read_text("utf-8")
 
 
-def _views_html(views: Mapping[str, Any]) -> str:
+def _shared_out(
+    drawn: Mapping[str, str], trained_on: str | None
+) -> tuple[list[str], list[str], list[str], list[str]]:
+    """Figures that come first, those of noise and of A/E cuts, and all others.
+
+    Mean pulses come first, of peaks that took no part in the training if there are any.
+    """
+    held_out = [name for name in drawn if not name.startswith(f"{trained_on} ")]
+    chosen = {
+        end: [name for name in held_out if name.endswith(end)][:FIRST]
+        or [name for name in drawn if name.endswith(end)][:FIRST]
+        for end in (" mean pulse", " noise", "A over E survival")
+    }
+    used = {name for names in chosen.values() for name in names}
+    others = [html for name, html in drawn.items() if name not in used]
+    first, noise, cuts = ([drawn[name] for name in names] for names in chosen.values())
+    return first, noise, cuts, others
+
+
+def _views_html(views: Mapping[str, Any], names: Sequence[str]) -> str:
     """Where the script draws, or why it does not."""
     if not any(views.get(name) for name in VIEWS):
         return gap("this report was written without the data of the interactive views")
     parts = ["<noscript><p>The views need JavaScript; the figures do not.</p></noscript>"]
-    for name, (title, about) in VIEWS.items():
+    for name in names:
+        title, about = VIEWS[name]
         parts.append(f"<h3>{title}</h3>")
         if views.get(name):
             parts.append(f'<p class="about">{about}</p>\n<div id="view-{name}"></div>')
@@ -180,7 +211,7 @@ def _script(views: Mapping[str, Any]) -> str:
 def _details_html(metrics: Mapping[str, Any]) -> str:
     """Return the parts of the metrics that are shown as they are, where there are any."""
     return "\n".join(
-        f"<details><summary>{title}</summary>\n{nested_html(metrics[name])}</details>"
+        folded(title, nested_html(metrics[name]))
         for name, title in DETAILS.items()
         if metrics.get(name)
     )
@@ -188,12 +219,11 @@ def _details_html(metrics: Mapping[str, Any]) -> str:
 
 def _gallery(drawn: Sequence[str]) -> str:
     if not drawn:
-        return gap("no figures were drawn")
+        return ""
     gallery = '<div class="figures">\n' + "\n".join(drawn) + "\n</div>"
     if len(drawn) <= MANY:
         return gallery
-    title = f"{len(drawn)} figures, also as PNG beside this page"
-    return f"<details><summary>{title}</summary>\n{gallery}\n</details>"
+    return folded(f"{len(drawn)} figures, also as PNG beside this page", gallery)
 
 
 def _figure_html(name: str, figure: Figure, png: bytes) -> str:

@@ -7,6 +7,7 @@ from html import escape
 from typing import Any
 
 from cpunet.analysis.nested_tables import NO_VALUE, html_table, number, with_std, words_of
+from cpunet.analysis.score_panels import score_panels
 from cpunet.analysis.style import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
@@ -15,6 +16,17 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 def gap(reason: str) -> str:
     """Return a sentence that says why something is not there."""
     return f'<p class="gap">None recorded: {escape(reason)}.</p>'
+
+
+def folded(title: str, html: str) -> str:
+    """Return what is there for those who ask for it, and on paper."""
+    return f"<details><summary>{title}</summary>\n{html}\n</details>"
+
+
+def compared_html(compared: Mapping[str, Any]) -> str:
+    """Return what was compared: files, dates, versions, the quality of the fit."""
+    rows = [[name.replace("_", " "), str(number(value))] for name, value in compared.items()]
+    return html_table(["Compared", ""], rows, words={0, 1}) if rows else ""
 
 
 def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
@@ -38,7 +50,7 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
     if rows:
         head = ["Peak", "Method", "Quantity", "σ", "In words"]
         table = html_table(head, rows, words={0, 1, 2, 4})
-        parts.append(f"<details><summary>Each verdict</summary>\n{table}\n</details>")
+        parts.append(folded("Each verdict", table))
     return "\n".join(parts)
 
 
@@ -58,18 +70,16 @@ def peak_html(
         f"{number(scores.get('n_data'))} measured pulses</h3>",
         f"<p>Not scored: {escape(scores['missing'])}.</p>"
         if "missing" in scores
-        else _parameter_table(chief, _noisy, verdicts),
+        else score_panels(peak, scores),
     ]
+    if chief:
+        parts.append(folded("Scores as a table", _parameter_table(chief, _noisy, verdicts)))
     if others:
-        parts.append(
-            f"<details><summary>Further parameters: {len(others)}</summary>\n"
-            f"{_parameter_table(others, _noisy, verdicts)}\n</details>"
-        )
+        title = f"Further parameters: {len(others)}"
+        parts.append(folded(title, _parameter_table(others, _noisy, verdicts)))
     if any(not _noisy(m) for found in chief.values() for m in found["wasserstein"]):
-        parts.append(
-            "<details><summary>The same without noise</summary>\n"
-            f"{_parameter_table(chief, lambda m: not _noisy(m))}\n</details>"
-        )
+        without = _parameter_table(chief, lambda m: not _noisy(m))
+        parts.append(folded("Scores without noise", without))
     if scores.get("not_prepared"):
         counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
         parts.append(
@@ -77,7 +87,8 @@ def peak_html(
             f"they are translated: {escape('; '.join(counts))}.</p>"
         )
     if scores.get("two_sample"):
-        parts.append(_two_sample_table(scores["two_sample"]))
+        title = "The classifier as a table"
+        parts.append(folded(title, _two_sample_table(scores["two_sample"])))
     if scores.get("paired"):
         parts.append(_paired_table(scores["paired"]))
     return "\n".join(parts)
@@ -149,7 +160,7 @@ def _parameter_table(
             for kind in ("wasserstein", "ks")
         )
         rows.append([title, "Ceiling", ceiling, moved, apart, ""])
-    head = ["Parameter", "Method", "IoU [%]", "W₁", "KS", "Overlap"]
+    head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS", "Overlap"]
     if not verdicts:
         head, rows = head[:-1], [row[:-1] for row in rows]
     return html_table(head, rows, words={0, 1, 5})

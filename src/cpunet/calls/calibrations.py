@@ -20,11 +20,11 @@ from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
 from cpunet.errors import CpunetError
-from cpunet.jobs.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
-from cpunet.jobs.calibration_inputs import Freedom, Start
-from cpunet.jobs.hit_sources import HitFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.simulation_settings import load_settings
+from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
+from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.jobs.simulation.simulation_settings import load_settings
 from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.common.inputs import InputFile
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 

@@ -21,7 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.jobs.common.monitor import Advance, Monitor
 
 LOGGER = logging.getLogger("cpunet")
 WARNING = "warning: "  # beginning of a note that is one

@@ -20,12 +20,12 @@ from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
-from cpunet.jobs.figure_store import STORE, read_drawings
-from cpunet.jobs.figures import Drawing
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.scoring import ByMethod
-from cpunet.jobs.validate import validated
-from cpunet.jobs.when_asked import WhenAsked
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.figure_store import STORE, read_drawings
+from cpunet.jobs.validation.figures import Drawing
+from cpunet.jobs.validation.scoring import ByMethod
+from cpunet.jobs.validation.validate import validated
+from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MOST_BYTES, plain_json
 

@@ -18,9 +18,9 @@ from cpunet.calls import html
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.response import describe_responses, learned_chain
-from cpunet.jobs.train import train_run
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.response import describe_responses, learned_chain
+from cpunet.jobs.training.train import train_run
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, read_losses, read_recipe
 from cpunet.translation.backends import ResponseBackend

@@ -21,10 +21,10 @@ from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.translate import FileTranslation
-from cpunet.jobs.translate_options import Adc, TranslateOptions
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.translation.translate import FileTranslation
+from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses

@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
-    from cpunet.jobs.calibration_inputs import Start
+    from cpunet.jobs.calibration.calibration_inputs import Start
 
 PHYSICS, HITS = "What is free", "Simulation"
 
@@ -149,9 +149,9 @@ def calibrate(
 
     Example: cpunet calibrate --sim sim.lh5 --data raw.lh5 --plan
     """
-    from cpunet.jobs.calibrate import Calibration
-    from cpunet.jobs.calibration_inputs import Freedom
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.calibration.calibrate import Calibration
+    from cpunet.jobs.calibration.calibration_inputs import Freedom
+    from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes import load_recipe
 
     if out_folder is None and not plan:
@@ -197,10 +197,10 @@ def _start(
     cluster_mm: float,
     insist: bool,
 ) -> Start:
-    from cpunet.jobs.calibration_inputs import Start
-    from cpunet.jobs.hit_sources import HitFile
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.simulation_settings import load_settings, split_overrides
+    from cpunet.jobs.calibration.calibration_inputs import Start
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.simulation.hit_sources import HitFile
+    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.hit_readers import Transform
 

@@ -44,8 +44,8 @@ def check(
 
     Example: cpunet check --sim sim.lh5 --data raw.lh5 --out check.png
     """
-    from cpunet.jobs.check import Level, check, draw
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.training.check import Level, check, draw
     from cpunet.recipes import load_recipe
 
     if out_file is not None:

@@ -35,7 +35,7 @@ def compare(
 
     Example: cpunet compare report1 report2 --out compare.html
     """
-    from cpunet.jobs.compare import compare_reports
+    from cpunet.jobs.validation.compare import compare_reports
 
     compared = compare_reports(reports, method=method, out=out_file, force=force)
     table = comparison_table(compared)

@@ -65,8 +65,8 @@ def ensemble(
 
     Example: cpunet ensemble --sim sim.lh5 --data raw.lh5 --seeds 20 --out ens
     """
-    from cpunet.jobs.ensemble import FIGURE, train_ensemble
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.studies.ensemble import FIGURE, train_ensemble
     from cpunet.recipes import load_recipe
 
     refuse_inputs(out_folder, recipe)

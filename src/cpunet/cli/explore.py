@@ -56,9 +56,9 @@ def explore(
 
     Example: cpunet explore run --detector icpc --data raw.lh5 --out explorer.html
     """
-    from cpunet.jobs.explore import explore_runs
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.inspection.explore import explore_runs
+    from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
     refuse_inputs(out_file, detector, settings_file)

@@ -40,7 +40,7 @@ def export(
 
     Example: cpunet export run --format onnx --out ren.onnx
     """
-    from cpunet.jobs.export import export_run
+    from cpunet.jobs.translation.export import export_run
 
     done = export_run(
         run,

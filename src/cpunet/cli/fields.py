@@ -39,7 +39,7 @@ def fields(
 
     Example: cpunet fields icpc --out icpc.png
     """
-    from cpunet.jobs.fields import describe_fields
+    from cpunet.jobs.simulation.fields import describe_fields
     from cpunet.simulation.geometry_readers import read_detector
 
     if out_file is not None:

@@ -56,8 +56,8 @@ def figure(
 
     Example: cpunet figure run "single pulse" --sim sim.lh5 --data raw.lh5 --out figures
     """
-    from cpunet.jobs.figure_files import draw_figures
-    from cpunet.jobs.inputs import InputFile
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.validation.figure_files import draw_figures
 
     files = draw_figures(
         folder,

@@ -47,7 +47,7 @@ def weights(
 
     Example: cpunet import weights --ren fep_REN.pt --iren fep_IREN.pt --out run
     """
-    from cpunet.jobs.import_published import import_weights
+    from cpunet.jobs.training.import_published import import_weights
 
     info = import_weights(
         out_folder,
@@ -76,7 +76,7 @@ def pulses(
 
     Example: cpunet import pulses fep_data.pickle --out pulses.lh5
     """
-    from cpunet.jobs.import_published import import_pulses
+    from cpunet.jobs.training.import_published import import_pulses
 
     told = import_pulses(
         source, out_file, dt_ns=dt, table=table, units=units, force=force, monitor=monitor()

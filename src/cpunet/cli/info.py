@@ -47,7 +47,7 @@ def info(
 
     Example: cpunet info raw.lh5 --without-remains flat.lh5
     """
-    from cpunet.jobs.info import describe
+    from cpunet.jobs.inspection.info import describe
     from cpunet.recipes import load_recipe
     from cpunet.training.run_schema import problem
 

@@ -72,8 +72,8 @@ def make(
 
     Example: cpunet library make --detector icpc --out psl.lh5
     """
-    from cpunet.jobs.pulse_shape_library import DT_NS, LENGTH_NS, write_library
-    from cpunet.jobs.simulation_settings import load_settings
+    from cpunet.jobs.simulation.pulse_shape_library import DT_NS, LENGTH_NS, write_library
+    from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
     refuse_inputs(out_file, detector, settings)
@@ -111,7 +111,7 @@ def translate(
 
     Example: cpunet library translate run psl.lh5 --out psl_ren.lh5
     """
-    from cpunet.jobs.translate_library import translate_library
+    from cpunet.jobs.translation.translate_library import translate_library
 
     told = translate_library(
         run,

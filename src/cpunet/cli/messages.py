@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cpunet.cli.streams import Notes, OutputError, Results
-from cpunet.jobs.monitor import Advance, Monitor
+from cpunet.jobs.common.monitor import Advance, Monitor
 
 out = Results()
 err = Notes(stderr=True)
@@ -89,6 +89,9 @@ def monitor() -> Monitor:
 class BarMonitor(Monitor):
     """A bar per stage with count, rate, and elapsed and remaining time."""
 
+    def __init__(self) -> None:
+        self._show: Callable[[str], None] = lambda _text: None
+
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
         """Show a bar while the stage lasts."""
@@ -97,20 +100,29 @@ class BarMonitor(Monitor):
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
+            TextColumn("{task.fields[state]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
         with Progress(*columns, console=err) as progress:
-            task = progress.add_task(_plain(title), total=total, rate="")
+            task = progress.add_task(_plain(title), total=total, rate="", state="")
+            self._show = lambda text: progress.update(task, state=_plain(text))
             start, done = time.monotonic(), 0
 
             def advance(steps: int) -> None:
                 nonlocal done
                 done += steps
                 rate = f"{done / (time.monotonic() - start):.3g}/s"
-                progress.update(task, advance=steps, rate=rate)
+                most = None if total is None else max(done, total)
+                progress.update(task, advance=steps, rate=rate, total=most)
 
             yield advance
+            if total is not None:
+                progress.update(task, completed=max(done, total))
+
+    def state(self, text: str) -> None:
+        """Show a text beside the bar."""
+        self._show(text)
 
     def note(self, message: str) -> None:
         """Print a line."""
@@ -119,6 +131,9 @@ class BarMonitor(Monitor):
 
 class LogMonitor(Monitor):
     """A line at the end of each stage, and every `LOG_EVERY_S` seconds in a long one."""
+
+    def __init__(self) -> None:
+        self._state = ""
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
@@ -134,10 +149,16 @@ class LogMonitor(Monitor):
                 last = now
                 rate = done / (now - start)
                 left = f", {(total - done) / rate:.0f} s left" if total and done else ""
-                _print(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}")
+                state = f", {self._state}" if self._state else ""
+                _print(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}{state}")
 
+        self._state = ""
         yield advance
         _print(f"{title}: done in {time.monotonic() - start:.1f} s")
+
+    def state(self, text: str) -> None:
+        """Keep a text for the next line."""
+        self._state = text
 
     def note(self, message: str) -> None:
         """Print a line."""

@@ -14,8 +14,8 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
-    from cpunet.jobs.hit_sources import HitSource
-    from cpunet.jobs.simulation_summary import Summary
+    from cpunet.jobs.simulation.hit_sources import HitSource
+    from cpunet.jobs.simulation.simulation_summary import Summary
 
 HITS, GAMMAS = "Hits from a file", "Hits from the built-in gamma Monte Carlo"
 PULSES, OUTPUT = "Pulses", "Output"
@@ -220,9 +220,9 @@ def simulate(
 
     Example: cpunet simulate --detector V01.yaml --hits stp.lh5 --flip-z --out sim.lh5
     """
-    from cpunet.jobs.hit_sources import GammaSource, HitFile, energy_windows
-    from cpunet.jobs.simulate import simulate_file
-    from cpunet.jobs.simulation_settings import load_settings, split_overrides
+    from cpunet.jobs.simulation.hit_sources import GammaSource, HitFile, energy_windows
+    from cpunet.jobs.simulation.simulate import simulate_file
+    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.hit_readers import Transform

@@ -16,7 +16,7 @@ from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
     from cpunet.electronics.chain import Hum
-    from cpunet.jobs.stand import StandSummary
+    from cpunet.jobs.simulation.stand import StandSummary
 
 
 class Kind(StrEnum):
@@ -105,9 +105,9 @@ def stand(
     Example: cpunet stand --preset ornl --kind shifted --shift bias_V=20 --out stand2
     """
     from cpunet.electronics.presets import read_electronics
-    from cpunet.jobs.hit_sources import energy_windows
-    from cpunet.jobs.simulation_settings import load_settings, split_overrides
-    from cpunet.jobs.stand import make_stand
+    from cpunet.jobs.simulation.hit_sources import energy_windows
+    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
+    from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.shifted import Shift

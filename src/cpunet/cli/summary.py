@@ -32,7 +32,7 @@ def summary(
 
     Example: cpunet summary results/*/*/report --out results/index.html
     """
-    from cpunet.jobs.summary_page import summarise_reports
+    from cpunet.jobs.validation.summary_page import summarise_reports
 
     entries = summarise_reports(reports, out_file, missing_ok=missing_ok, force=force)
     missing = [entry.name for entry in entries if entry.metrics is None]

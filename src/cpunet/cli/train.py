@@ -14,7 +14,7 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import fail, monitor, tell
 from cpunet.errors import CpunetError
-from cpunet.jobs.monitor import Monitor
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:  # torch takes seconds to import
@@ -78,8 +78,8 @@ def train(
     """
     import torch
 
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.train import train_run
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.training.train import train_run
     from cpunet.recipes import load_recipe
     from cpunet.training.loop import StoppedError
     from cpunet.training.team import ToldElsewhereError, launch

@@ -14,7 +14,7 @@ from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
-    from cpunet.jobs.translate_options import Adc
+    from cpunet.jobs.translation.translate_options import Adc
 
 FILES, ADC = "Many files", "Raw traces in ADC counts (--output adc)"
 
@@ -143,10 +143,10 @@ def translate(
 
     Example: cpunet translate run sim_*.lh5 --out translated/ --jobs 4 --resume
     """
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.translate import translate_file
-    from cpunet.jobs.translate_files import expanded, translate_files
-    from cpunet.jobs.translate_options import TranslateOptions
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.translation.translate import translate_file
+    from cpunet.jobs.translation.translate_files import expanded, translate_files
+    from cpunet.jobs.translation.translate_options import TranslateOptions
 
     adc = _adc(output, adc_per_kev, baseline, length, n_pre)
     files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
@@ -194,7 +194,7 @@ def _adc(
     length: int | None,
     n_pre: int | None,
 ) -> Adc | None:
-    from cpunet.jobs.translate_options import Adc
+    from cpunet.jobs.translation.translate_options import Adc
 
     adc = Adc(adc_per_kev, baseline, length, n_pre)
     if output == Output.ADC:

@@ -49,8 +49,8 @@ def tune(
 
     Example: cpunet tune --sim sim.lh5 --data raw.lh5 --recipe fast --trials 30 --out tuned
     """
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.tune import BEST, tune_recipe
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.studies.tune import BEST, tune_recipe
     from cpunet.recipes import load_recipe
 
     refuse_inputs(out_folder, recipe)

@@ -36,8 +36,8 @@ def validate(
 
     Example: cpunet validate run --sim sim.lh5 --data raw.lh5 --out report
     """
-    from cpunet.jobs.inputs import InputFile
-    from cpunet.jobs.validate import validate_run
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.validation.validate import validate_run
 
     metrics = validate_run(
         run,

@@ -11,8 +11,8 @@ from cpunet.yaml_files import shown
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from cpunet.jobs.hit_sources import Window
-    from cpunet.jobs.simulate import Resolution
+    from cpunet.jobs.simulation.hit_sources import Window
+    from cpunet.jobs.simulation.simulate import Resolution
     from cpunet.recipes.schema import PeakConfig
 
 
@@ -39,7 +39,7 @@ def parse_events(
     CpunetError
         If a number or a line cannot be understood, or the lines are named twice.
     """
-    from cpunet.jobs.hit_sources import energy_windows
+    from cpunet.jobs.simulation.hit_sources import energy_windows
 
     if "=" not in events:
         windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
@@ -85,7 +85,7 @@ def parse_resolution(text: str | None) -> Resolution | None:
     CpunetError
         If there are not two numbers from 0 up.
     """
-    from cpunet.jobs.simulate import Resolution
+    from cpunet.jobs.simulation.simulate import Resolution
 
     if text is None:
         return None

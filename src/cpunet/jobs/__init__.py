@@ -1,1 +1,1 @@
-"""One function per command: files in, files out."""
+"""One function per command: files in, files out; by what is done with them."""

@@ -7,14 +7,14 @@ from typing import Any
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
-from cpunet.jobs.hit_sources import energy_windows
-from cpunet.jobs.inputs import InputFile
-from cpunet.jobs.monitor import Monitor
-from cpunet.jobs.stand import write_stand
-from cpunet.jobs.stand_plan import Kind, StandPlan
-from cpunet.jobs.train import train_run
-from cpunet.jobs.validate import validate_run
+from cpunet.jobs.simulation.hit_sources import energy_windows
+from cpunet.jobs.simulation.stand import write_stand
+from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
@@ -43,7 +43,7 @@ def demonstrate(
     Parameters
     ----------
     electronics, detector, kind
-        Of the stand, as for `cpunet.jobs.stand.make_stand`.
+        Of the stand, as for `cpunet.jobs.simulation.stand.make_stand`.
     recipe
         Of the training.
     events
@@ -54,7 +54,7 @@ def demonstrate(
     force
         Make all parts anew.
     seed, device, monitor
-        As for `cpunet.jobs.train.train_run`.
+        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------

@@ -9,8 +9,8 @@ from typing import Any
 
 from cpunet.analysis.report import METRICS, REPORT
 from cpunet.errors import CpunetError
-from cpunet.jobs.stand import MARKER, STAND
-from cpunet.jobs.stand_plan import StandPlan
+from cpunet.jobs.simulation.stand import MARKER, STAND
+from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.outputs import Note, made_here, remove_own, require_replaceable, told_kept
 from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import read_text

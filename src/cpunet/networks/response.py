@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import scipy.fft
 import torch
 from torch import Tensor, nn
 
@@ -195,12 +196,4 @@ def padded_length(length: int) -> int:
 
 def fast_length(least: int) -> int:
     """The least even number of `least` or more whose prime factors are 2, 3 and 5."""
-    length = least + least % 2
-    while True:
-        rest = length
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return length
-        length += 2
+    return 2 * int(scipy.fft.next_fast_len((least + 1) // 2, real=True))

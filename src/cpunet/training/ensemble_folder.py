@@ -10,18 +10,18 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.file_locks import locked
 from cpunet.files import written_aside
 from cpunet.outputs import (
     MARKER,
@@ -163,19 +163,10 @@ def read_json(path: Path) -> dict[str, Any] | None:
     return content
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    with (folder / _LOCK).open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise CpunetError(
-                f"{folder}: another process is working there; wait for it, or choose "
-                "another --out"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
-        yield
+def _locked(folder: Path) -> AbstractContextManager[None]:
+    """Keep other processes out."""
+    busy = f"{folder}: another process is working there; wait for it, or choose another --out"
+    return locked(folder / _LOCK, busy)
 
 
 def _plain(value: Any) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
 
 from cpunet.electronics.drawn_remains import KnownDecay
 from cpunet.networks.response import ElectronicsResponse
@@ -25,8 +26,8 @@ HOPELESS_FIT = 20.0
 # A ringing must lower chi-square to this part of it, or there is none; derivatives far from
 # where it would be promise less.
 RINGS, PROMISES = 0.7, 0.9
-# Where a fast decay of free time starts, in us, and its share.
-FAST_DECAY_US, FAST_SHARE = 3.0, 0.02
+# Where a fast decay of free time may start, in us, and its share.
+FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 LEAST_SHARE, MOST_SHARE = 0.005, 0.2
 # An overshoot of more than this is much like a fast decay, and would be a valley beside it.
 SLOWEST_NS = 800.0
@@ -100,15 +101,13 @@ def free_decay_if_better(
         return problem, found
     slow = tuple(tau for tau in config.slow_ns if tau <= SLOWEST_NS)
     free = config.model_copy(
-        update={"free_decays": True, "fast_decays_us": (FAST_DECAY_US,), "slow_ns": slow}
+        update={"free_decays": True, "fast_decays_us": FAST_DECAYS_US[:1], "slow_ns": slow}
     )
-    dt_ns = float(problem.response.dt_ns)
-    response = start_response(free, dt_ns, 1.0, problem.slope, decay)
-    if decay is not None:
-        # with the tails right, so is about the bandwidth that the fit without it has found
-        response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
-    response.decay_weights.data.fill_(_fast_share(problem, decay))
-    again = problem.of(response)
+    starts = [
+        _free_decay_start(problem, free, us, share, decay)
+        for us, share in _decays(problem, decay)
+    ]
+    again = min(starts, key=_cost)
     fitted = levenberg_marquardt(again, training.steps, listener)
     steps = found.steps + fitted.steps
     if fitted.cost < RINGS * found.cost:
@@ -116,19 +115,55 @@ def free_decay_if_better(
     return problem, found._replace(steps=steps)
 
 
-def _fast_share(problem: ResponseProblem, decay: KnownDecay | None) -> float:
-    """Of a fast decay beside a known one, by how much steeper the tails are; never 0.
+def _free_decay_start(
+    problem: ResponseProblem,
+    config: ResponseConfig,
+    fast_us: float,
+    share: float,
+    decay: KnownDecay | None,
+) -> ResponseProblem:
+    """The comparison for a fast decay and a main one that give the data's tails together.
 
-    Of a share of 0 no time is told, and from tails of another slope fits get lost.
+    With the tails right, so is about the bandwidth that the fit without it has found.
     """
+    dt_ns, slope = float(problem.response.dt_ns), problem.slope
     if decay is None:
-        return FAST_SHARE
+        slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
+    response = start_response(config, dt_ns, 1.0, slope, decay)
+    response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
+    response.log_fast_decays_us.data.fill_(math.log(fast_us))
+    response.decay_weights.data.fill_(share)
+    return problem.of(response)
+
+
+def _decays(
+    problem: ResponseProblem, decay: KnownDecay | None
+) -> Iterator[tuple[float, float]]:
+    """Times and shares of a fast decay that a fit may start from; no share is 0.
+
+    Of a share of 0 no time is told, and from tails of another slope fits get lost.  Beside a
+    known decay the share follows from how much steeper the tails are.
+    """
+    for us in FAST_DECAYS_US:
+        if decay is None:
+            yield from ((us, share) for share in SHARES)
+        else:
+            steeper = -problem.slope / (1e-3 * float(problem.response.dt_ns)) - 1 / decay.us
+            share = steeper / _fast_slope(problem, us)
+            yield us, min(max(share, LEAST_SHARE), MOST_SHARE)
+
+
+def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
+    """By how much a fast decay makes the tails steeper, for a share of 1; per us."""
     preparation = problem.bands[0].moments.preparation
-    us = float(problem.response.dt_ns) * 1e-3
+    us = 1e-3 * float(problem.response.dt_ns)
     middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
-    steeper = -problem.slope / us - 1 / decay.us
-    share = steeper * FAST_DECAY_US * math.exp(middle_us / FAST_DECAY_US)
-    return min(max(share, LEAST_SHARE), MOST_SHARE)
+    return math.exp(-middle_us / fast_us) / fast_us
+
+
+def _cost(problem: ResponseProblem) -> float:
+    residuals = problem.residuals(problem.parameters.vector())
+    return float(residuals @ residuals)
 
 
 def ringing_if_better(

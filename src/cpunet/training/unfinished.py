@@ -12,17 +12,17 @@ The folder is visible, so that nobody wonders where a day of GPU time went.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
+from cpunet.file_locks import locked
 from cpunet.files import folder_written_aside
 from cpunet.outputs import (
     FolderKind,
@@ -129,20 +129,10 @@ def _put_in_place(folder: Path, out: Path, *, force: bool, note: Callable[[str],
         raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; the system takes the lock back however this one ends."""
-    with (folder / MARKER).open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise CpunetError(
-                f"{folder}: another process is training there; wait for it, or choose "
-                "another --out"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
-        yield
+def _locked(folder: Path) -> AbstractContextManager[None]:
+    """Keep other processes out."""
+    busy = f"{folder}: another process is training there; wait for it, or choose another --out"
+    return locked(folder / MARKER, busy)
 
 
 class UnfinishedRun:

@@ -49,7 +49,8 @@ function row(packed, index) {
 }
 
 // columns that follow the cursor have nothing to say on paper
-const live = (column) => (["at", "off"].includes(column) ? " class=\"live\"" : "");
+const LIVE = ["at", "off"];
+const live = (column) => (LIVE.includes(column) ? " class=\"live\"" : "");
 
 // A table of methods; its first column switches them on and off, others are set by name.
 class Legend {
@@ -81,6 +82,9 @@ class Legend {
   set(name, column, text) {
     const cell = this.cells.get(`${name}/${column}`);
     if (cell) cell.textContent = text;
+    // without a cursor they say nothing
+    const live = [...this.host.querySelectorAll("td.live")];
+    if (LIVE.includes(column)) this.host.querySelector("table").classList.toggle("idle", live.every((td) => !td.textContent));
   }
 }
 

@@ -9,6 +9,9 @@ function edgeOf(xs, ys) {
   return [begin - room, end + room];
 }
 
+// the translation is drawn last, so that nothing hides it
+const onTop = (names) => [...names].sort((a, b) => (a === "ren") - (b === "ren"));
+
 function times(data, samples) {
   return Array.from({ length: samples }, (_, i) => (i - data.before) * data.dt_ns);
 }
@@ -58,7 +61,7 @@ function mountSuperpulses(host, data) {
       lower.push(band(xs, sigma.data.map((e) => -100 * e), sigma.data.map((e) => 100 * e), { colour: "#000", opacity: 0.2 }));
     }
     view.legend.build(names, columns);
-    for (const name of names) {
+    for (const name of onTop(names)) {
       view.legend.set(name, "n", String(found.methods[name].n[k]));
       if (!base || name === "data") { if (!base && isShown(name)) upper.push(line(xs, means[name], methodOf(name))); continue; }
       const { colour, dashed } = methodOf(name), fit = scale.checked || name !== "raw";
@@ -147,7 +150,7 @@ function mountPulses(host, data) {
     view.legend.build(names, [["at", "Height"], ["off", reference ? `Less ${what}` : "–"], ["rms", "RMS of that"]]);
     const wide = names.includes("nearest") && isShown("nearest");
     if (wide) upper.push(line(xs, pulses.nearest, { colour: "#000", width: 5, opacity: 0.28 }));
-    for (const name of names) {
+    for (const name of onTop(names)) {
       const { colour, dashed } = methodOf(name), fit = scale.checked || name !== "raw";
       const residual = reference ? pulses[name].map((y, i) => 100 * (y - pulses[reference][i])) : [];
       const known = residual.filter(Number.isFinite);

@@ -9,6 +9,7 @@ function mountScatter(host, data) {
     onCursor: () => {},
   });
   const peak = view.select("Peak", peakChoices(data.peaks), update);
+  const beside = view.select("Beside the data", [], update);
   view.button("Data's range", () => view.plot.zoomTo(null), "Show where the data lie");
   view.button("All", () => {
     const all = (axis) => ends(Object.keys(clouds).filter(isShown).flatMap((name) => clouds[name][axis]));
@@ -30,7 +31,11 @@ function mountScatter(host, data) {
   function update() {
     const found = data.peaks[peak.value];
     if (view.missing(found.missing)) return;
-    const names = inOrder(Object.keys(found.methods));
+    const all = inOrder(Object.keys(found.methods)), others = all.filter((name) => name !== "data");
+    const first = beside.options.length === 0;
+    fill(beside, others.map((name) => [name, methodOf(name).label]));
+    if (first && others.includes("ren")) beside.value = "ren";
+    const names = all.filter((name) => name === "data" || name === beside.value);
     view.legend.build(names, columns);
     clouds = {};
     for (const name of names) {
@@ -47,7 +52,9 @@ function mountScatter(host, data) {
       panels: [{
         label: withUnit(data.axes[1]),
         home: found.home[1],
-        series: names.filter(isShown).map((name) => dots(clouds[name].x, clouds[name].y, { colour: methodOf(name).colour, opacity: 0.45, width: 3.2 })),
+        series: names.filter(isShown).map((name) => dots(clouds[name].x, clouds[name].y, name === "data"
+          ? { colour: "#888", opacity: 0.45, width: 4.2 }
+          : { colour: methodOf(name).colour, opacity: 0.6, width: 2.6 })),
       }],
     });
   }

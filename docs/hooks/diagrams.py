@@ -1,0 +1,171 @@
+"""Draw the diagrams of the concept pages; run by hand, it writes their SVG files."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+PICTURES = Path(__file__).parents[1] / "pictures"
+INK, LINE, SIM, DATA, LEARNED = "#222", "#777", "#dbe7f6", "#fde6cf", "#dff0df"
+FONT = "font-family='system-ui, sans-serif'"
+
+
+class Drawing:
+    """Boxes, arrows and curves on a white ground; lengths are pixels from the upper left."""
+
+    def __init__(self, width: int, height: int, title: str) -> None:
+        self.size = width, height
+        self.parts = [f"<title>{escape(title)}</title>"]
+        self.parts.append(f"<rect width='{width}' height='{height}' fill='#fff'/>")
+
+    def text(
+        self, x: float, y: float, words: str, size: int = 13, anchor: str = "middle"
+    ) -> None:
+        style = f"{FONT} font-size='{size}' fill='{INK}' text-anchor='{anchor}'"
+        self.parts.append(f"<text x='{x:g}' y='{y:g}' {style}>{escape(words)}</text>")
+
+    def box(self, x: float, y: float, w: float, h: float, fill: str, *lines: str) -> None:
+        self.parts.append(
+            f"<rect x='{x:g}' y='{y:g}' width='{w:g}' height='{h:g}' rx='6' fill='{fill}' "
+            f"stroke='{LINE}'/>"
+        )
+        first = y + h / 2 - 8.5 * (len(lines) - 1) + 4.5
+        for i, line in enumerate(lines):
+            self.text(x + w / 2, first + 17 * i, line, 13 if i == 0 else 11)
+
+    def arrow(self, *points: tuple[float, float], dashed: bool = False) -> None:
+        path = " ".join(f"{x:g},{y:g}" for x, y in points)
+        dash = " stroke-dasharray='5 4'" if dashed else ""
+        self.parts.append(
+            f"<polyline points='{path}' fill='none' stroke='{LINE}' stroke-width='1.5'"
+            f"{dash} marker-end='url(#head)'/>"
+        )
+
+    def curve(self, x: float, y: float, w: float, h: float, values: np.ndarray) -> None:
+        """Values from 0 (bottom) to 1 (a little below the top) over the whole width."""
+        xs = x + w * np.linspace(0, 1, len(values))
+        ys = y + h * (0.92 - 0.8 * values)
+        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(xs, ys, strict=True))
+        self.parts.append(f"<rect x='{x}' y='{y}' width='{w}' height='{h}' fill='#fafafa'/>")
+        self.parts.append(
+            f"<polyline points='{path}' fill='none' stroke='#3949ab' stroke-width='1.6'/>"
+        )
+
+    def write(self, name: str) -> None:
+        width, height = self.size
+        head = (
+            "<defs><marker id='head' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' "
+            "markerHeight='7' orient='auto'>"
+            f"<path d='M0 0L8 4L0 8z' fill='{LINE}'/></marker></defs>"
+        )
+        svg = f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}'>\n"
+        (PICTURES / name).write_text(svg + "\n".join([head, *self.parts]) + "\n</svg>\n")
+
+
+def data_flow() -> None:
+    d = Drawing(860, 330, "From hits and traces to a translated simulation and a report")
+    d.box(10, 20, 130, 54, SIM, "hits", "Geant4, remage, own")
+    d.box(170, 20, 150, 54, SIM, "simulated pulses", "charge, noise-free")
+    d.box(10, 246, 310, 54, DATA, "measured traces", "ADC counts: LH5, FlashCam, HDF5, NumPy")
+    d.arrow((140, 47), (170, 47))
+    d.text(155, 92, "simulate", 11)
+    d.box(350, 20, 130, 54, SIM, "windows", "800 samples")
+    d.box(350, 246, 130, 54, DATA, "windows", "800 samples")
+    d.arrow((320, 47), (350, 47))
+    d.arrow((320, 273), (350, 273))
+    d.text(335, 92, "prepare", 11)
+    d.text(335, 235, "prepare", 11)
+    d.box(520, 128, 130, 64, LEARNED, "run", "REN, IREN,", "noise, recipe")
+    d.arrow((415, 74), (415, 150), (520, 150))
+    d.arrow((415, 246), (415, 170), (520, 170))
+    d.text(465, 143, "train", 11)
+    d.box(700, 20, 150, 54, SIM, "translated pulses", "like data, with noise")
+    d.arrow((480, 47), (700, 47))
+    d.arrow((585, 128), (585, 52), dashed=True)
+    d.text(545, 40, "translate", 11)
+    d.box(700, 246, 150, 54, "#eee", "report", "scores beside ceilings")
+    d.arrow((775, 74), (775, 246))
+    d.arrow((480, 273), (700, 273))
+    d.text(588, 265, "validate", 11)
+    d.text(
+        430, 322, "blue: simulated · orange: measured · green: learned from both, unpaired", 11
+    )
+    d.write("data-flow.svg")
+
+
+def chain() -> None:
+    """The stages of a readout, with the pulse after each: computed, not sketched."""
+    dt_ns, n = 4.0, 1100
+    t = np.arange(n) * dt_ns
+    charge = np.interp(t, [600, 1300, 1520], [0.0, 0.35, 1.0])
+
+    def after(values: np.ndarray, impulse: np.ndarray) -> np.ndarray:
+        return np.convolve(values, impulse)[:n]
+
+    def pole(tau_ns: float) -> np.ndarray:
+        return np.exp(-t / tau_ns) / np.exp(-t / tau_ns).sum()
+
+    smooth = after(after(charge, pole(60)), pole(40))
+    slow = 0.93 * smooth + 0.07 * after(smooth, pole(400))
+    decayed = after(np.diff(slow, prepend=0), np.exp(-t / 12_000))
+    noise = after(np.random.default_rng(1).normal(0, 0.06, n), pole(30))
+    d = Drawing(860, 210, "A readout chain: charge, bandwidth, slow part, decay, noise")
+    stages = [
+        ("charge", "of the simulation", charge),
+        ("bandwidth", "two poles", smooth),
+        ("slow part", "five fixed times", slow),
+        ("decay", "of the preamplifier", decayed),
+        ("noise", "of real baselines", decayed + noise),
+    ]
+    for i, (name, what, values) in enumerate(stages):
+        x = 10 + 172 * i
+        d.curve(x, 50, 148, 110, values[::3])
+        d.text(x + 74, 24, name)
+        d.text(x + 74, 41, what, 11)
+        if i:
+            d.arrow((x - 22, 105), (x - 3, 105))
+    d.text(430, 185, "4.4 µs; slow part, decay and noise drawn larger than they are", 11)
+    d.text(
+        430,
+        203,
+        "recipe fast fits bandwidth, slow part and decay; the noise is that of the data",
+        11,
+    )
+    d.write("chain.svg")
+
+
+def networks() -> None:
+    d = Drawing(
+        860, 400, "The CycleGAN: two generators, two discriminators, three kinds of loss"
+    )
+    d.box(20, 60, 150, 50, SIM, "simulated window")
+    d.box(20, 250, 150, 50, DATA, "measured window")
+    d.box(240, 60, 150, 50, LEARNED, "REN", "Positional U-Net")
+    d.box(240, 250, 150, 50, LEARNED, "IREN", "Positional U-Net")
+    d.box(460, 60, 150, 50, DATA, "like data")
+    d.box(460, 250, 150, 50, SIM, "like simulation")
+    d.box(690, 60, 150, 50, "#eee", "discriminator", "GRU with attention")
+    d.box(690, 250, 150, 50, "#eee", "discriminator", "GRU with attention")
+    for y in (85, 275):
+        d.arrow((170, y), (240, y))
+        d.arrow((390, y), (460, y))
+        d.arrow((610, y), (690, y))
+    d.text(650, 50, "adversarial loss", 11)
+    d.text(650, 324, "adversarial loss", 11)
+    d.arrow((535, 110), (535, 165), (345, 165), (345, 250), dashed=True)
+    d.arrow((535, 250), (535, 195), (285, 195), (285, 110), dashed=True)
+    d.text(640, 172, "cycle loss: there and back", 11)
+    d.text(640, 188, "must give the pulse again", 11)
+    d.arrow((95, 250), (95, 180), (255, 180), (255, 110), dashed=True)
+    d.text(110, 150, "identity loss: REN leaves", 11)
+    d.text(110, 166, "measured pulses alone", 11)
+    d.text(430, 360, "The two sides are drawn independently; no pulse has a partner.", 12)
+    d.text(430, 380, "The likewise identity loss of IREN is not drawn.", 11)
+    d.write("networks.svg")
+
+
+if __name__ == "__main__":
+    for draw in (data_flow, chain, networks):
+        draw()

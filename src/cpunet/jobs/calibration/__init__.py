@@ -1,0 +1,1 @@
+"""Detector and electronics found together: a run, and the detector that goes with it."""

@@ -1,0 +1,313 @@
+"""A simulation and a measurement in; calibrated physics and a run of that detector out."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import cpunet
+from cpunet.analysis.calibration_figures import directions_figure
+from cpunet.analysis.calibration_page import calibration_page
+from cpunet.calibration.identifiability import Information
+from cpunet.calibration.nearby import Simulator
+from cpunet.calibration.nuisances import Physics
+from cpunet.calibration.result import described, hopeless
+from cpunet.calibration.search import Calibrated, Search
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.jobs.calibration.calibration_inputs import (
+    DEPLETION,
+    Freedom,
+    Sides,
+    Start,
+    known_depletion,
+    read_sides,
+)
+from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.memory import keep_freed_memory
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.noise import measured_noise
+from cpunet.jobs.common.remains import drawn_like, measured_remains
+from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.jobs.simulation.simulate import simulate_file
+from cpunet.jobs.training.train import TrainingJob
+from cpunet.outputs import FolderKind
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.run_folder import RUN, write_run
+from cpunet.training.team import Team
+
+QUIET = Monitor()
+CALIBRATION, PAGE, SIM = "calibration.json", "calibration.html", "sim.lh5"
+DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
+PLAN = FolderKind(
+    name="plan",
+    command="cpunet calibrate --plan",
+    known_by="plan.json",
+    own=r"plan\.json|plan\.png",
+)
+# Pulses of each side for which a plan tells the errors.
+PLANNED = (1000, 4000, 40_000)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration to be made or planned.
+
+    Parameters
+    ----------
+    start
+        What is simulated.
+    data
+        Measured pulses.
+    recipe
+        With a response to be matched.
+    freedom
+        Which physics are free.
+    peak
+        Energies to calibrate on.
+    events
+        Simulated events, at most, that are drifted again and again.
+    seed
+        Of everything random.
+
+    Raises
+    ------
+    CpunetError
+        If the recipe has no readout chain.
+    """
+
+    start: Start
+    data: InputFile
+    recipe: Recipe
+    freedom: Freedom = field(default_factory=Freedom)
+    peak: str = "FEP"
+    events: int = 3000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.recipe.training, MatchingConfig):
+            raise CpunetError(
+                f"recipe {self.recipe.name}: a network, which has no readout chain to "
+                "calibrate with a detector; give fast or best"
+            )
+
+    @property
+    def files(self) -> tuple[Path | str | None, ...]:
+        """What is read."""
+        return (*self.start.files, *self.data.files)
+
+    def run(
+        self, out: Path, *, force: bool = False, monitor: Monitor = QUIET
+    ) -> dict[str, Any]:
+        """Calibrate detector and readout together, and write a run folder of the result.
+
+        The folder is a run as `cpunet.jobs.training.train.train_run` makes one, and holds
+        ``detector.yaml`` and ``settings.yaml`` (calibrated), ``sim.lh5`` (all events simulated
+        again with them), ``calibration.json`` (see `cpunet.calibration.result.described`) and
+        ``calibration.html``.
+
+        Parameters
+        ----------
+        out
+            The folder; it appears when all is done.
+        force, monitor
+            As for `cpunet.jobs.training.train.train_run`.
+
+        Returns
+        -------
+        dict
+            The content of ``calibration.json``.
+
+        Raises
+        ------
+        CpunetError
+            If the inputs cannot be used, the detector cannot be simulated with any physics
+            that the data ask for, or the data are plainly of another detector.
+        """
+        keep_freed_memory()
+        clock, started = time.perf_counter(), datetime.now(UTC)
+        with folder_written_aside(
+            out, RUN, *self.files, force=force, note=monitor.note
+        ) as folder:
+            sides = self._sides(folder, monitor)
+            with monitor.stage("Calibrating") as advance:
+                calibrated = self._search(sides, monitor, lambda: advance(1)).run()
+            self._require_hope(calibrated, sides)
+            content = self._content(calibrated, sides)
+            for note in content["notes"]:
+                monitor.note(note)
+            _simulate_calibrated(calibrated, sides, folder, self.seed, monitor)
+            again = load_simulated(
+                InputFile(folder / SIM), self.recipe, sides.selection, monitor
+            )
+            job = TrainingJob(
+                self.recipe, self.peak, self.seed, "cpu", Team(), None, again, sides.data,
+                self.data, folder, monitor,
+            )  # fmt: skip
+            model, info, recipe = job.match(False, calibrated.response)
+            info["sim"]["file"] = str(out / SIM)
+            info["started"] = started.isoformat(timespec="seconds")
+            info["seconds"] = content["seconds"] = round(time.perf_counter() - clock, 1)
+            content["fit"] = {k: info["fit"][k] for k in ("chi_square", "moments", "verdict")}
+            (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
+            (folder / PAGE).write_text(calibration_page(content), encoding="utf-8")
+            write_run(folder, model, recipe, info | {"calibration": CALIBRATION})
+        return content
+
+    def plan(
+        self, out: Path | None = None, *, force: bool = False, monitor: Monitor = QUIET
+    ) -> dict[str, Any]:
+        """Tell what the pulses know of the physics, before any fit of it.
+
+        Parameters
+        ----------
+        out
+            Folder for ``plan.json`` and ``plan.png``; None for none.
+        force, monitor
+            As for `run`.
+
+        Returns
+        -------
+        dict
+            ``errors``: of each parameter, by number of pulses, alone and with all free;
+            ``directions``, by number of pulses.
+        """
+        if out is None:
+            with tempfile.TemporaryDirectory() as aside:
+                return self._planned(Path(aside), monitor)
+        with folder_written_aside(
+            out, PLAN, *self.files, force=force, note=monitor.note
+        ) as folder:
+            content = self._planned(folder, monitor)
+            (folder / "plan.json").write_text(json.dumps(content, indent=1) + "\n")
+            figure = directions_figure(content["directions"][str(PLANNED[1])])
+            figure.savefig(folder / "plan.png", dpi=110)
+        return content
+
+    def _planned(self, folder: Path, monitor: Monitor) -> dict[str, Any]:
+        sides = self._sides(folder, monitor)
+        with monitor.stage("Planning") as advance:
+            search = self._search(sides, monitor, lambda: advance(1))
+            information = search.plan()
+        sides.forget()
+        directions = {
+            str(n): [
+                {"components": d.components, "error": d.error, "words": d.words}
+                for d in information.for_pulses(n / 2).directions()
+            ]
+            for n in PLANNED
+        }
+        return {
+            "cpunet": cpunet.__version__,
+            "detector": sides.physics.detector.name,
+            "pulses": list(PLANNED),
+            "errors": _errors_by_pulses(information, search.simulator.physics),
+            "directions": directions,
+        }
+
+    def _sides(self, folder: Path, monitor: Monitor) -> Sides:
+        inputs = self.start, self.data, self.recipe, self.peak, self.events, self.seed
+        return read_sides(*inputs, folder, monitor)
+
+    def _search(self, sides: Sides, monitor: Monitor, simulated: Callable[[], None]) -> Search:
+        """The search, ready to begin."""
+        measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
+        preparation = self.recipe.preparation
+        remains, _ = measured_remains(self.data, preparation)
+        drawn = None
+        if remains is not None and remains.law is not None:
+            drawn = drawn_like(remains, self.data, sides.data, preparation)
+        noise, note = measured_noise(self.data, measured, preparation, remains)
+        if note is not None:
+            monitor.note(f"warning: {note}")
+        physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors
+        hits = sides.stored.hits[sides.sim.prepared.index]
+        rng = np.random.default_rng(self.seed)
+        free = self.freedom.free
+        return Search(
+            simulator=Simulator(hits, physics, simulated),
+            sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
+            energy_kev=pulses.energy_kev,
+            recipe=self.recipe,
+            given={k: v for k, v in given.items() if k != DEPLETION},
+            known=known_depletion(physics, given.get(DEPLETION)),
+            free=None if free is None else list(range(len(free))),
+            note=monitor.note,
+        )
+
+    def _require_hope(self, calibrated: Calibrated, sides: Sides) -> None:
+        if hopeless(calibrated):
+            per = calibrated.chi_square / calibrated.problem.moments
+            raise CpunetError(
+                f"{self.data.path}: no physics near those of {sides.physics.detector.name} "
+                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
+                "of another detector, or of other energies (--detector, --peak)?"
+            )
+
+    def _content(self, calibrated: Calibrated, sides: Sides) -> dict[str, Any]:
+        compared = calibrated.problem.bands
+        return {
+            "cpunet": cpunet.__version__,
+            "detector": sides.physics.detector.name,
+            "data": str(self.data.path),
+            "peak": self.peak,
+            "seed": self.seed,
+            "events": {
+                "sim": sum(len(band.sim) for band in compared),
+                "data": sum(len(band.moments.data) for band in compared),
+            },
+            **described(calibrated),
+        }
+
+
+def _simulate_calibrated(
+    calibrated: Calibrated, sides: Sides, folder: Path, seed: int, monitor: Monitor
+) -> None:
+    """Write the physics found, and all events simulated with them."""
+    parameters = calibrated.problem.parameters
+    detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
+    _write_physics(folder, detector, settings)
+    simulate_file(
+        detector,
+        HitFile(sides.sim_path, placed=True),
+        folder / SIM,
+        settings,
+        cluster_mm=0.0,
+        seed=seed,
+        monitor=monitor,
+    )
+    sides.forget()
+
+
+def _write_physics(folder: Path, detector: Detector, settings: SimulationSettings) -> None:
+    for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
+        text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def _errors_by_pulses(information: Information, physics: Physics) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    of_pulses = {n: information.for_pulses(n / 2) for n in PLANNED}
+    for i, nuisance in enumerate(information.nuisances):
+        nominal = physics.nominal(nuisance)
+        slope = nuisance.slope(nominal, nominal)
+        found[nuisance.name] = {
+            "simulated": nominal,
+            "prior": float(slope * information.widths[i]),
+            "alone": {str(n): float(slope * f.errors([i])[0]) for n, f in of_pulses.items()},
+            "all_free": {str(n): float(slope * f.errors()[i]) for n, f in of_pulses.items()},
+        }
+    return found

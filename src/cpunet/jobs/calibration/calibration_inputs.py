@@ -1,0 +1,265 @@
+"""What a calibration starts from: a simulation with its hits, a measurement, and priors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import (
+    InputFile,
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_both_sides,
+    require_same_sampling,
+)
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.jobs.simulation.simulate import simulate_file
+from cpunet.jobs.simulation.stored_simulation import StoredSimulation
+from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.recipes.schema import Recipe
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.superposition import solve
+
+DEPLETION = "depletion_voltage"
+_PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
+# Of the tilt (1e10/cm4), for the derivative of the depletion voltage.
+_TILT = 0.01
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """Which physics are free, and what is known of them.
+
+    Parameters
+    ----------
+    free
+        Parameters; None for those that the data tell.
+    fixed
+        Names of parameters that stay as simulated.
+    priors
+        Value and error by name, also of ``"depletion_voltage"``.
+    """
+
+    free: tuple[Nuisance, ...] | None = None
+    fixed: frozenset[str] = frozenset()
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, free: str, fixed: str, given: Sequence[str]) -> Freedom:
+        """From what the command line gives.
+
+        Raises
+        ------
+        CpunetError
+            If a parameter is not known, or a prior is no ``NAME=VALUE±ERROR``.
+
+        Examples
+        --------
+        >>> Freedom.of("auto", "tilt", ["temperature=90±0.5"]).priors
+        {'temperature_K': (90.0, 0.5)}
+        """
+        chosen = None if free.strip() == "auto" else _parameters(free)
+        stay = frozenset(nuisance.name for nuisance in _parameters(fixed))
+        if chosen is not None:
+            chosen = tuple(n for n in chosen if n.name not in stay)
+            if not chosen:
+                raise CpunetError(f"--free {free}: all of it is fixed; leave something free")
+        return cls(chosen, stay, dict(_prior(text) for text in given))
+
+    @property
+    def looked_at(self) -> tuple[Nuisance, ...]:
+        """Parameters that may become free."""
+        if self.free is not None:
+            return self.free
+        # another lithium layer takes solutions of the fields: only if it is asked for
+        return tuple(
+            n for n in NUISANCES if n.name not in self.fixed and n.name != "li_thickness_mm"
+        )
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a calibration starts from: a simulation with its hits, or hits to simulate.
+
+    Parameters
+    ----------
+    sim
+        Output of ``cpunet simulate`` or ``cpunet stand``; None with `hits`.
+    hits
+        Of the events to be simulated; None with `sim`.
+    detector, settings
+        To simulate them with; with `sim`, None for those that it was made with.
+    cluster_mm
+        Of `hits`, those nearer than this to each other are merged.
+    """
+
+    sim: InputFile | None = None
+    hits: HitFile | None = None
+    detector: Detector | None = None
+    settings: SimulationSettings | None = None
+    cluster_mm: float = 0.05
+
+    def __post_init__(self) -> None:
+        if (self.sim is None) == (self.hits is None):
+            raise CpunetError("give either --sim FILE, with its hits, or --hits FILE")
+        if self.hits is not None and self.detector is None:
+            raise CpunetError("--hits: give the --detector that they lie in")
+
+    @property
+    def files(self) -> tuple[Path | str | None, ...]:
+        """What is read."""
+        return (*(self.sim.files if self.sim else ()), self.hits.path if self.hits else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Both sides, read and prepared, and the physics of the simulated one.
+
+    Parameters
+    ----------
+    sim, data
+        Prepared pulses.
+    sim_path
+        File of the simulated ones, with their hits.
+    physics
+        As they are to be simulated at first; nothing is free yet.
+    stored
+        Hits, one event per pulse of the file.
+    selection
+        Energies.
+    temporary
+        File that was only simulated to start from, or None.
+    """
+
+    sim: InputSet
+    data: InputSet
+    sim_path: Path
+    physics: Physics
+    stored: StoredSimulation
+    selection: EnergySelection
+    temporary: Path | None
+
+    def forget(self) -> None:
+        """Remove what was only simulated to start from."""
+        if self.temporary is not None:
+            self.temporary.unlink()
+
+
+def read_sides(
+    start: Start,
+    data_file: InputFile,
+    recipe: Recipe,
+    peak: str,
+    events: int,
+    seed: int,
+    folder: Path,
+    monitor: Monitor,
+) -> Sides:
+    """Read and prepare both sides; simulate hits first, if that is what is given.
+
+    Parameters
+    ----------
+    start, data_file, recipe, peak, events, seed
+        See `cpunet.jobs.calibration.calibrate.Calibration`.
+    folder
+        For pulses that are only simulated to start from.
+    monitor
+        Told of the progress.
+
+    Raises
+    ------
+    CpunetError
+        If an input cannot be used.
+    """
+    selection = parse_selection(peak, recipe.peaks)
+    data = load_measured(data_file, recipe, selection, monitor)
+    sim, temporary = start.sim, None
+    if sim is None:
+        temporary = folder / "as_simulated.lh5"
+        sim = InputFile(_simulated(start, temporary, data.dt_ns, monitor))
+    stored = StoredSimulation.read(sim.path)
+    simulated = load_simulated(sim, recipe, selection, monitor)
+    require_same_sampling(simulated, data)
+    for note in require_both_sides(simulated, data, selection):
+        monitor.note(note)
+    # in an order of which any beginning is a fair part
+    rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
+    some = replace(simulated, prepared=simulated.prepared[rows])
+    settings = start.settings or stored.settings
+    if not np.isclose(settings.dt_ns, simulated.dt_ns):
+        raise CpunetError(
+            f"--settings: dt_ns = {settings.dt_ns:g}, but the pulses of {sim.path} have "
+            f"{simulated.dt_ns:g}; give that"
+        )
+    physics = Physics(start.detector or stored.detector, settings, ())
+    return Sides(some, data, sim.path, physics, stored, selection, temporary)
+
+
+def _simulated(start: Start, path: Path, dt_ns: float, monitor: Monitor) -> Path:
+    """Pulses of hits with the physics given."""
+    assert start.hits is not None
+    assert start.detector is not None
+    settings = start.settings or SimulationSettings(dt_ns=dt_ns)
+    simulate_file(
+        start.detector, start.hits, path, settings, cluster_mm=start.cluster_mm, monitor=monitor
+    )
+    return path
+
+
+def known_depletion(
+    physics: Physics, measured: tuple[float, float] | None
+) -> Callable[[Values], Values]:
+    """Deviation of the depletion voltage from what it was measured to be, if it was.
+
+    Parameters
+    ----------
+    physics
+        Whose coordinates are given.
+    measured
+        In V, and its error; None gives no deviation.
+    """
+    if measured is None:
+        return lambda _: np.empty(0)
+    wanted, error = measured
+    superposition, detector = solve(physics.detector), physics.detector
+    scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
+    at_first = superposition.depletion_V(scale, tilt)
+    with_tilt = (superposition.depletion_V(scale, tilt + _TILT) - at_first) / _TILT
+
+    def known(coordinates: Values) -> Values:
+        values = physics.values(coordinates)
+        more = values.get("impurity_tilt_1e10_per_cm4", tilt) - tilt
+        voltage = values.get("impurity_factor", 1.0) * at_first + with_tilt * more
+        return np.array([(voltage - wanted) / error])
+
+    return known
+
+
+def _parameters(text: str) -> tuple[Nuisance, ...]:
+    names = [part for part in text.split(",") if part.strip()]
+    return tuple(dict.fromkeys(named(name) for name in names))
+
+
+def _prior(text: str) -> tuple[str, tuple[float, float]]:
+    found = _PRIOR.fullmatch(text)
+    try:
+        if found is None:
+            raise ValueError
+        value, error = float(found[2]), float(found[3])
+        if not (error > 0 and np.isfinite([value, error]).all()):
+            raise ValueError
+    except ValueError:
+        raise CpunetError(
+            f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
+        ) from None
+    name = found[1] if found else ""
+    return (name if name == DEPLETION else named(name).name), (value, error)

@@ -1,0 +1,262 @@
+"""Files named on a command line become prepared sets."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
+from cpunet.pulses.peaks import EnergySelection, label_peaks
+from cpunet.pulses.preparation import Kind, Prepared
+from cpunet.pulses.reading.energies import amplitude
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.sets import load_prepared
+from cpunet.pulses.side import require_side
+from cpunet.pulses.spectrum import suggested_calibration
+from cpunet.recipes.schema import Recipe
+
+_READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
+Energies = npt.NDArray[np.float64]
+
+MOST_KEV, LEAST_KEV = 20_000.0, 20.0  # most energies of gammas lie between
+LOW_KEV = 300.0  # below, noise hides shapes
+LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`.
+
+    With `insist` it is what it is given as, simulated or measured, whatever it looks like.
+    """
+
+    path: Path
+    table: str | None = None
+    energy: str | None = None
+    kev_per_adc: float | None = None
+    dt_ns: float | None = None
+    insist: bool = False
+
+    @property
+    def files(self) -> tuple[Path | str | None, ...]:
+        """What is read, for `cpunet.outputs.refuse_inputs`."""
+        return self.path, self.energy
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What was said of how to read it."""
+        given = {name: getattr(self, name) for name in _READ_AS}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def as_before(self, run_info: Mapping[str, Any], side: str) -> InputFile:
+        """The same file, read as a run read it if nothing else is said.
+
+        Parameters
+        ----------
+        run_info
+            The content of ``run.json``.
+        side
+            ``"sim"`` or ``"data"``.
+        """
+        told = run_info.get(side)
+        if self.options or not isinstance(told, dict):
+            return self
+        before, read_as = told.get("file"), told.get("read_as")
+        same = isinstance(before, str) and Path(before).resolve() == self.path.resolve()
+        if not same or not isinstance(read_as, dict):
+            return self
+        return replace(self, **{name: read_as[name] for name in _READ_AS if name in read_as})
+
+    def open(self) -> PulseSource:
+        """Open the file."""
+        return open_pulses(
+            self.path,
+            table=self.table,
+            energy=self.energy,
+            kev_per_adc=self.kev_per_adc,
+            dt_ns=self.dt_ns,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class InputSet:
+    """What was made of a file: prepared pulses, and the cuts if it was measured.
+
+    ``energies_kev`` holds the known energies of all its pulses, selected or not; ``read_as``
+    how the file was read, see `InputFile.options`.
+    """
+
+    prepared: Prepared
+    dt_ns: float
+    path: Path
+    energies_kev: Energies
+    cuts: CutWindows | None = None
+    read_as: dict[str, Any] = field(default_factory=dict)
+
+    def provenance(self) -> dict[str, Any]:
+        """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
+        waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
+        return {
+            "file": str(self.path),
+            "read_as": self.read_as,
+            "dt_ns": self.dt_ns,
+            "read": self.prepared.n_read,
+            "used": len(self.prepared),
+            "rejections": self.prepared.rejections,
+            "cuts": None if self.cuts is None else self.cuts.model_dump(mode="json"),
+            "sha256": hashlib.sha256(waveforms.data).hexdigest(),
+        }
+
+
+def load_simulated(
+    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+) -> InputSet:
+    """Read and prepare the selected simulated pulses of a file."""
+    return _load(file, recipe, selection, monitor, measured=False)
+
+
+def load_measured(
+    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+) -> InputSet:
+    """Read, prepare and cut the selected measured pulses of a file."""
+    return _load(file, recipe, selection, monitor, measured=True)
+
+
+def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
+    """Look for energies that one of the sides does not have.
+
+    Returns
+    -------
+    list of str
+        What is to be told of the selection: lines that it takes away from the test.
+
+    Raises
+    ------
+    CpunetError
+        If a line or range that was chosen has pulses of one side only.
+    """
+    for part in selection.parts:
+        counts = [
+            int(part.select(side.prepared.pulses.energy_kev).sum()) for side in (sim, data)
+        ]
+        if max(counts) == 0:
+            raise CpunetError(
+                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be "
+                "used; leave it out of --peak"
+            )
+        if min(counts) == 0:
+            missing, there = (sim, data) if counts[0] == 0 else (data, sim)
+            raise CpunetError(
+                f"{missing.path}: no pulse of {part.name} can be used, {there.path.name} has "
+                f"{max(counts)}; leave it out of --peak, or give a file that has them"
+            )
+    lines = selection.lines_in_ranges
+    if not lines:
+        return []
+    are = "is" if len(lines) == 1 else "are"
+    return [
+        f"warning: {', '.join(lines)} {are} in the range trained on, and no test of it any more"
+    ]
+
+
+def require_same_sampling(sim: InputSet, data: InputSet) -> None:
+    """Raise a `CpunetError` if the two sides differ in their sampling period."""
+    if not np.isclose(sim.dt_ns, data.dt_ns):
+        raise CpunetError(
+            f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
+            f"{data.dt_ns:g} ns; resample one of them"
+        )
+
+
+def _load(
+    file: InputFile,
+    recipe: Recipe,
+    selection: EnergySelection,
+    monitor: Monitor,
+    *,
+    measured: bool,
+) -> InputSet:
+    source = file.open()
+    side: Kind = "measured" if measured else "simulated"
+    require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
+    seen: list[Energies] = []
+
+    def select(energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        seen.append(np.array(energy_kev, float))
+        return selection.select(energy_kev)
+
+    with monitor.stage(f"Preparing {file.path.name}", source.n_pulses) as advance:
+        try:
+            prepared = load_prepared(
+                source,
+                recipe.preparation,
+                side,
+                select=select,
+                peaks=lambda energies: label_peaks(energies, recipe.peaks),
+                progress=advance,
+            )
+        except CpunetError as error:
+            hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
+            raise CpunetError(f"{error}{hint}") from error
+    cuts = None
+    if measured:
+        cuts = fit_cuts(prepared, recipe.cuts)
+        prepared = apply_cuts(prepared, cuts)
+        if not len(prepared):
+            raise CpunetError(
+                f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
+            )
+    if not measured and _decays(prepared, recipe):
+        monitor.note(
+            f"warning: {file.path.name}: these pulses decay; "
+            "are they simulated ones, without electronics?"
+        )
+    rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+    monitor.note(
+        f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
+        + (f" (left out: {rejected})" if rejected else "")
+    )
+    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options)
+
+
+def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:
+    """What energies there are, if none is selected: to choose others, or to calibrate them."""
+    energies = np.concatenate(seen) if seen else np.empty(0)
+    if not len(energies) or selection.select(energies).any():
+        return ""
+    low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
+    there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
+    if high > MOST_KEV:
+        return f"{there}: if these are ADC counts, give --kev-per-adc"
+    if high < LEAST_KEV:
+        return f"{there}: if these are MeV, give --kev-per-adc 1000"
+    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
+    n = int((energies >= from_kev).sum())
+    if not n:
+        return there
+    return f"{there}; --peak {from_kev:.0f}- takes {n} pulses"
+
+
+def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
+    """The calibration that lines in the amplitudes ask for, if no energy is known."""
+    if any(map(len, seen)):
+        return ""
+    found = suggested_calibration(
+        np.concatenate([amplitude(block.waveforms) for block in source.blocks()])
+    )
+    return "" if found is None else f"; their amplitudes look like {found}"
+
+
+def _decays(prepared: Prepared, recipe: Recipe) -> bool:
+    """Tell whether simulated pulses end below their maximum, as measured ones do."""
+    end = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
+    return bool(np.median(end) < LEAST_SIMULATED_END)

@@ -1,0 +1,84 @@
+"""Remains of earlier pulses in the measured file of a training or a validation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from cpunet.electronics.drawn_remains import DrawnRemains, passing
+from cpunet.electronics.remains import Remains
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.networks.response import ROOM_BEFORE
+from cpunet.pulses.container import Pulses
+from cpunet.recipes.schema import PreparationConfig
+
+BLOCK = 4096  # traces read at a time
+MOST_BLOCKS = 16  # that are searched for traces that have passed the cuts
+
+
+def measured_remains(
+    data_file: InputFile, config: PreparationConfig
+) -> tuple[Remains | None, str | None]:
+    """Measure the remains under the traces of a file.
+
+    Returns
+    -------
+    tuple
+        The remains, or None and why they cannot be told.
+    """
+    try:
+        return Remains.of_traces(data_file.open().blocks(BLOCK), config), None
+    except CpunetError as error:
+        return None, str(error)
+
+
+def drawn_like(
+    remains: Remains, data_file: InputFile, data: InputSet, config: PreparationConfig
+) -> DrawnRemains:
+    """Remains to be drawn like those of the data behind their quality cuts.
+
+    Parameters
+    ----------
+    remains
+        Of the file.
+    data_file, data
+        The file, and what has passed the cuts.
+    config
+        The preparation.
+    """
+    windows = data.prepared.pulses.waveforms
+    begins = float(np.median(data.prepared.align_sample)) - config.samples_before - ROOM_BEFORE
+    passed = None
+    if data.cuts is not None and remains.law is not None:
+        passed = passing(remains, _rows(data_file, data), config, data.cuts)
+    return DrawnRemains(
+        law=remains.fit.law,
+        height=float(np.median(windows.max(axis=1))),
+        lead_us=begins * data.dt_ns * 1e-3,
+        dt_ns=data.dt_ns,
+        passed=passed,
+        decay_error_us=remains.decay_error_us,
+    )
+
+
+def _rows(data_file: InputFile, data: InputSet) -> Iterator[Pulses]:
+    """Raw traces of the pulses in use, block by block."""
+    first = 0
+    for number, block in enumerate(data_file.open().blocks(BLOCK)):
+        index = data.prepared.index
+        yield block[index[(index >= first) & (index < first + len(block))] - first]
+        first += len(block)
+        if number + 1 >= MOST_BLOCKS:
+            return
+
+
+def told_of(
+    remains: Remains | None, drawn: DrawnRemains | None, reason: str | None
+) -> dict[str, Any]:
+    """What ``run.json`` says of them; `drawn` may be drawn from even if none are sure."""
+    if remains is None or drawn is None:
+        return {"missing": reason}
+    return remains.describe() | {"drawn": drawn.describe()}

@@ -1,0 +1,122 @@
+"""The known answer of a test stand, made comparable with translated pulses."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from cpunet import npz_files
+from cpunet.electronics.finishing import BLOCK, finish
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputSet
+from cpunet.pulses.container import FloatArray
+from cpunet.recipes.schema import PreparationConfig
+
+_NAME = "response"
+_MOST_SAMPLES = 1 << 20
+
+
+def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
+    """Read the noise-free response of each simulated pulse, prepared like data.
+
+    Parameters
+    ----------
+    path, sim
+        As for `Responses`.
+    config
+        The preparation of the run.
+
+    Returns
+    -------
+    array
+        Shape (pulses in use, window); NaN where a response cannot be prepared.
+
+    Raises
+    ------
+    CpunetError
+        If the file is not readable or belongs to other pulses.
+    """
+    blocks = Responses(path, sim).blocks()
+    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns) for block in blocks])
+
+
+class Responses:
+    """The noise-free traces of the simulated pulses in use, read block by block.
+
+    Parameters
+    ----------
+    path
+        ``.npz`` with ``response``, shape (pulses of the simulation file, samples).
+    sim
+        The simulated pulses in use.
+
+    Raises
+    ------
+    CpunetError
+        If the file is not readable or belongs to other pulses.
+    """
+
+    def __init__(self, path: Path, sim: InputSet) -> None:
+        self.path = path
+        self._index = sim.prepared.index
+        with self._readable():
+            if path.is_file() and not zipfile.is_zipfile(path):
+                raise ValueError("no archive of arrays")
+            headers = npz_files.headers(path)
+        if _NAME not in headers:
+            names = ", ".join(headers) or "none"
+            raise CpunetError(f"{path}: has no array '{_NAME}' (found {names})")
+        shape, dtype = headers[_NAME].shape, headers[_NAME].dtype
+        if len(shape) != 2 or shape[0] != sim.prepared.n_read:
+            raise CpunetError(
+                f"{path}: response has shape {shape}, but {sim.path} holds "
+                f"{sim.prepared.n_read} pulses; give the truth of that file"
+            )
+        if dtype.kind not in "iuf" or not 2 <= shape[1] <= _MOST_SAMPLES:
+            raise CpunetError(
+                f"{path}: response is of {dtype}, {shape[1]} samples each; give traces"
+            )
+        if headers[_NAME].by_columns:
+            raise CpunetError(
+                f"{path}: response is stored column by column; "
+                "save numpy.ascontiguousarray(response)"
+            )
+        self._shape, self._dtype = shape, dtype
+
+    def blocks(self, size: int = BLOCK) -> Iterator[FloatArray]:
+        """Float32 traces of `size` pulses in use at a time, in their order.
+
+        Raises
+        ------
+        CpunetError
+            If the file is damaged.
+        """
+        n, samples = self._shape
+        waiting = np.empty((0, samples), np.float32)
+        with self._readable(), npz_files.member(self.path, _NAME) as stream:
+            npz_files.read_header(stream)
+            for first in range(0, n, size):
+                rows = min(size, n - first)
+                raw = stream.read(rows * samples * self._dtype.itemsize)
+                traces = np.frombuffer(raw, self._dtype).reshape(rows, samples)
+                begin, end = np.searchsorted(self._index, [first, first + rows])
+                chosen = traces[self._index[begin:end] - first].astype(np.float32)
+                waiting = np.concatenate([waiting, chosen])
+                if len(waiting) >= size:
+                    yield waiting[:size]
+                    waiting = waiting[size:]
+        if len(waiting):
+            yield waiting
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        try:
+            yield
+        except npz_files.DAMAGED as error:
+            raise CpunetError(
+                f"{self.path}: cannot be read as .npz ({npz_files.said(error)})"
+            ) from error

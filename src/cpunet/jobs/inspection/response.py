@@ -1,0 +1,425 @@
+"""What the training of a readout chain has learned, in terms of physics, and how true it is."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+import cpunet
+from cpunet.analysis.response_figure import (
+    Chain,
+    Numbers,
+    align_ns,
+    chain_numbers,
+    noise_numbers,
+    response_figure,
+)
+from cpunet.electronics.chain import Electronics
+from cpunet.electronics.exponentials import Exponentials, moved_apart
+from cpunet.electronics.noise import noise_power
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.response_errors import propagated
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.outputs import FolderKind, refuse_existing
+from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import PreparationConfig
+from cpunet.regular_files import read_text
+from cpunet.training.run_folder import load_network, read_info, read_recipe
+from cpunet.yaml_files import MOST_BYTES, plain_json
+
+QUIET = Monitor()
+MARKER = "response.json"
+RESPONSE = FolderKind(
+    name="response",
+    command="cpunet response",
+    known_by=MARKER,
+    own=r"response\.json|response\.png",
+)
+
+_DPI = 150
+_LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
+_FOREVER_US = 1e9  # instead of a decay
+_LONG_DRIFT_NS = 1000.0  # by which a charge may come earlier than all at once
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """A run: its chain, its parameters with their errors, and where it comes from."""
+
+    path: Path
+    info: Mapping[str, Any]
+    fit: Mapping[str, Any]
+    preparation: PreparationConfig
+    chain: Chain
+    parameters: Numbers
+    errors: Numbers
+
+    @property
+    def dt_ns(self) -> float:
+        return float(self.info["dt_ns"])
+
+
+def describe_responses(
+    runs: Sequence[Path],
+    *,
+    truth: Electronics | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Say in terms of physics which readout chains trainings have learned.
+
+    Parameters
+    ----------
+    runs
+        Folders of trainings of a response, all of the same sampling and preparation.
+    truth
+        The chain of the data, if it is known (`stand_electronics`).
+    out
+        Folder to make, with ``response.json`` and ``response.png``; None for none.
+    force
+        Replace an existing folder.
+    monitor
+        Told of what is kept of it.
+
+    Returns
+    -------
+    dict
+        The content of ``response.json``.  ``runs``: for each its ``values`` by name, the unit
+        at the end (shares of the full charge have none), and ``errors`` of those that are
+        parameters of the fit, and of the noise; all ``parameters`` and their
+        ``parameter_errors``.  ``mean`` and ``spread`` (standard deviation) of several runs.
+        ``truth``: the same ``values`` of the true chain, ``difference`` from it of the run or
+        the mean of the runs, and ``sigma``: that in units of the error or the spread,
+        whichever is larger.  What has no error has no sigma: runs share their data, so that
+        their spread alone says how well they agree, not how far they may be off.
+
+    Raises
+    ------
+    CpunetError
+        If a run holds no response, or runs or truth do not fit each other.
+    """
+    if out is not None:
+        refuse_existing(out, *runs, force=force)
+    learned = [_read_run(Path(run)) for run in runs]
+    if not learned:
+        raise CpunetError("no run was given; give the folder of one")
+    first = learned[0]
+    _require_alike(learned, truth)
+    told: dict[str, Any] = {
+        "cpunet": cpunet.__version__,
+        "dt_ns": first.dt_ns,
+        "runs": [_told(run) for run in learned],
+    }
+    true_chain = None if truth is None else true_chain_of(truth)
+    told |= _summary(told["runs"])
+    if truth is not None and true_chain is not None:
+        values = _true_parameters(truth) | chain_numbers(
+            true_chain, first.preparation, first.dt_ns
+        )
+        told["truth"] = {"name": truth.name} | _compared(told, values)
+    if out is not None:
+        window = first.preparation.samples_after * first.dt_ns
+        figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
+        with folder_written_aside(
+            out, RESPONSE, *runs, force=force, note=monitor.note
+        ) as folder:
+            text = json.dumps(told, indent=1, ensure_ascii=False)
+            (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+            figure.savefig(folder / "response.png", dpi=_DPI)
+    return told
+
+
+def stand_electronics(stand: Path) -> Electronics:
+    """The true electronics of a test stand, from its ``stand.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the folder is no stand.
+    """
+    path = Path(stand) / "stand.json"
+    try:
+        text = read_text(path, MOST_BYTES)
+        return Electronics.model_validate(plain_json(text)["electronics"])
+    except OSError as error:
+        raise CpunetError(
+            f"{stand}: no test stand (stand.json cannot be read); make one with `cpunet stand`"
+        ) from error
+    except (ValueError, KeyError, TypeError, ValidationError) as error:
+        raise CpunetError(f"{path}: holds no electronics; make the stand again") from error
+
+
+def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
+    """The closed form of a learned response: a sum of exponentials, as a true chain is."""
+    poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
+    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    fast = dict(
+        zip(response.fast_times_us.tolist(), response.decay_weights.tolist(), strict=True)
+    )
+    taus = moved_apart([*poles, *slow, 1e3 * main, *(1e3 * tau for tau in fast)])
+    n, n_slow = len(poles), len(slow)
+    undecayed = Exponentials.of_real(
+        1 - sum(slow.values()),
+        taus[n : n + n_slow],
+        [weight / tau for weight, tau in zip(slow.values(), taus[n:], strict=False)],
+    )
+    for tau in taus[:n]:
+        undecayed = undecayed * Exponentials.low_pass(tau)
+    if len(response.ringing):
+        undecayed = undecayed * _ringing(response)
+    shares = [1 - sum(fast.values()), *fast.values()]
+    whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
+    return Chain(name, whole, undecayed)
+
+
+def true_chain_of(electronics: Electronics) -> Chain:
+    """A true chain in the same terms; its non-linearity is left out."""
+    endless = electronics.model_dump() | {"decays": [{"fraction": 1, "tau_us": _FOREVER_US}]}
+    frequency = density = None
+    spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
+    if spectrum is not None:
+        samples = 2 * (NOISE_BINS - 1)
+        power = noise_power(spectrum, dt_ns, samples)
+        frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
+        density = electronics.noise.rms_kev**2 * power / frequency[1]
+    return Chain(
+        f"true response ({electronics.name})",
+        electronics.transfer,
+        # made anew, since a copy would keep the transfer function that was cached
+        Electronics.model_validate(endless).transfer,
+        frequency,
+        density,
+    )
+
+
+def _read_run(path: Path) -> _Learned:
+    info, recipe = read_info(path), read_recipe(path)
+    if not isinstance(recipe.generator, ResponseConfig):
+        raise CpunetError(
+            f"{path}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
+            "response in closed form; give a run of the recipe fast, or score this one with "
+            "`cpunet validate`"
+        )
+    network = ResponseGenerator(recipe.generator, float(info["dt_ns"]))
+    load_network(path, "ren", network)
+    try:
+        learned = _described(path, info, recipe.preparation, network)
+    except (ArithmeticError, ValueError, LookupError, RuntimeError) as error:
+        raise CpunetError(
+            f"{path}: its weights make no response of electronics ({error}); train again"
+        ) from error
+    wrong = [name for name, value in learned.parameters.items() if not math.isfinite(value)]
+    if wrong:
+        raise CpunetError(f"{path}: {wrong[0]} of its response is no number; train again")
+    return learned
+
+
+def _described(
+    path: Path,
+    info: Mapping[str, Any],
+    preparation: PreparationConfig,
+    network: ResponseGenerator,
+) -> _Learned:
+    response = network.response
+    chain = learned_chain(response, path.name)
+    if int(network.n_baselines):
+        chain = _with_noise(chain, network, preparation)
+    parameters = response.describe() | _ringing_numbers(response)
+    fit = info.get("fit")
+    fit = fit if isinstance(fit, Mapping) else {}
+    errors = _errors_by_name(response, fit.get("errors") or {})
+    dt_ns = float(info["dt_ns"])
+    errors |= propagated(
+        response,
+        fit.get("covariance") or [],
+        lambda moved: _shape_numbers(moved, preparation, dt_ns),
+    )
+    return _Learned(path, info, fit, preparation, chain, parameters, errors)
+
+
+def _shape_numbers(
+    response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
+) -> Numbers:
+    """Numbers of a response that are no parameters of it."""
+    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
+    return _slow(slow) | numbers
+
+
+def _with_noise(
+    chain: Chain, network: ResponseGenerator, preparation: PreparationConfig
+) -> Chain:
+    """Add the noise, from the units of prepared pulses to keV."""
+    noise = network.noise
+    # a full charge has this height where its tail has the level of prepared pulses
+    tail = preparation.samples_after - 0.5 * preparation.tail_samples
+    tail_ns = align_ns(chain, preparation) + tail * noise.dt_ns
+    height = preparation.tail_level / float(chain.whole.step(tail_ns))
+    dt_us = 1e-3 * noise.dt_ns
+    return Chain(
+        chain.name,
+        chain.whole,
+        chain.undecayed,
+        np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float),
+        # both signs of a frequency
+        2 * dt_us * noise.density / height**2,
+    )
+
+
+def _ringing(response: ElectronicsResponse) -> Exponentials:
+    """Step response ``1 + exp(-t/damping) (a sin + b cos)``."""
+    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+    sine, cosine = response.ringing.tolist()
+    pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
+    residue = 0.5 * complex(cosine, -sine) * pole
+    poles = np.array([pole, pole.conjugate()])
+    return Exponentials(1 + cosine, poles, np.array([residue, residue.conjugate()]))
+
+
+def _ringing_numbers(response: ElectronicsResponse) -> Numbers:
+    if not len(response.ringing):
+        return {}
+    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+    return {
+        "ringing": response.ringing.norm().item(),
+        "ringing_mhz": frequency_mhz,
+        "ringing_damping_ns": damping_ns,
+    }
+
+
+def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
+    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
+    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
+    order = poles.argsort(descending=True).tolist()
+    sources = {
+        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
+        for i, k in enumerate(order)
+    }
+    sources["decay_us"] = ("log_decay_us.1", decay)
+    for i, (name, value) in enumerate(list(_ringing_numbers(response).items())[1:]):
+        sources[name] = (f"log_ringing.{i + 1}", value)
+    for i, tau in enumerate(response.slow_ns.tolist()):
+        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
+    free = response.config.free_decays
+    for i, tau in enumerate(response.fast_times_us.tolist()):
+        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
+        sources[name] = (f"decay_weights.{i + 1}", 1.0)
+        if free:
+            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
+    return {
+        name: scale * float(errors[source])
+        for name, (source, scale) in sources.items()
+        if source in errors
+    }
+
+
+def _slow(shares: Mapping[float, float]) -> Numbers:
+    """Total share of what arrives late, and its mean time, of shares by time in ns."""
+    total = sum(shares.values())
+    numbers = {"slow_share": total}
+    if abs(total) >= _LEAST_SLOW:
+        numbers["slow_time_ns"] = sum(tau * w for tau, w in shares.items()) / total
+    return numbers
+
+
+def _told(run: _Learned) -> dict[str, Any]:
+    slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
+    values = {n: v for n, v in run.parameters.items() if n not in slow}
+    values |= _slow({float(n.split("_")[1]): w for n, w in slow.items()})
+    values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
+    if run.fit.get("moments"):
+        values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+    return {
+        "path": str(run.path),
+        "recipe": run.info["recipe"],
+        "peak": run.info["peak"],
+        "seed": run.info["seed"],
+        "values": values,
+        "errors": {n: e for n, e in run.errors.items() if n in values} | _noise_error(run),
+        "parameters": run.parameters,
+        "parameter_errors": run.errors,
+    }
+
+
+def _noise_error(run: _Learned) -> Numbers:
+    """Error of the noise in keV: of the baselines, and of the height of a full charge."""
+    measured, chain = run.fit.get("noise") or {}, run.chain
+    error, rms = measured.get("rms_error"), measured.get("rms")
+    if not error or not rms or chain.noise_kev2_per_mhz is None:
+        return {}
+    end_ns = align_ns(chain, run.preparation) + run.preparation.samples_after * run.dt_ns
+    sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
+    kev = noise_numbers(chain)["noise_rms_kev"]
+    return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
+
+
+def _true_parameters(electronics: Electronics) -> Numbers:
+    poles = sorted(electronics.bandwidth_poles_ns, reverse=True)
+    numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
+    # an overshoot is a slow part that takes away
+    parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
+    numbers |= _slow({part.tau_ns: sign * part.fraction for part, sign in parts if part})
+    if ring := electronics.ringing:
+        numbers["ringing"] = ring.fraction
+        numbers["ringing_mhz"] = ring.frequency_MHz
+        numbers["ringing_damping_ns"] = ring.damping_ns
+    *fast, main = sorted(electronics.decays, key=lambda part: part.tau_us)
+    numbers["decay_us"] = main.tau_us
+    return numbers | {f"decay_{part.tau_us:g}_us": part.fraction for part in fast}
+
+
+def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
+    """Mean and spread of several runs."""
+    if len(runs) < 2:
+        return {}
+    names = [name for name in runs[0]["values"] if all(name in r["values"] for r in runs)]
+    columns = {name: [run["values"][name] for run in runs] for name in names}
+    return {
+        "mean": {name: float(np.mean(column)) for name, column in columns.items()},
+        "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
+    }
+
+
+def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
+    """Truth, and how far the run or the mean of the runs is from it."""
+    runs = told["runs"]
+    found: Numbers = told.get("mean", runs[0]["values"])
+    spread: Numbers = told.get("spread", {})
+    difference = {n: found[n] - true for n, true in values.items() if n in found}
+    sigma = {}
+    for name, apart in difference.items():
+        errors = [run["errors"][name] for run in runs if name in run["errors"]]
+        if len(errors) == len(runs) and any(errors):
+            sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
+    return {"values": values, "difference": difference, "sigma": sigma}
+
+
+def _require_alike(runs: Sequence[_Learned], truth: Electronics | None) -> None:
+    first = runs[0]
+    for run in runs[1:]:
+        if not np.isclose(run.dt_ns, first.dt_ns):
+            raise CpunetError(
+                f"{run.path}: trained on pulses sampled every {run.dt_ns:g} ns, {first.path} "
+                f"every {first.dt_ns:g} ns; describe them one by one"
+            )
+        if run.preparation != first.preparation:
+            raise CpunetError(
+                f"{run.path}: trained with another preparation than {first.path}; describe "
+                "them one by one"
+            )
+    if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
+        raise CpunetError(
+            f"{first.path}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
+            f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
+        )

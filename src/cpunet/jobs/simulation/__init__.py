@@ -1,0 +1,1 @@
+"""From hits to ideal pulses: simulations, fields, virtual test stands and libraries."""

@@ -1,0 +1,170 @@
+"""A detector in, a library of pulse shapes out, as production simulations read it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.signals import Signals, hit_signals
+
+QUIET = Monitor()
+# As SolidStateDetectors.jl's libraries are sampled: reboost's surface model wants 1 ns.
+DT_NS, LENGTH_NS = 1.0, 5000.0
+ANGLES_DEG = (0, 45)  # <100> and <110>: what reboost interpolates between
+
+
+def write_library(
+    detector: Detector,
+    out: Path,
+    *,
+    settings: SimulationSettings | None = None,
+    grid_mm: float = 1.0,
+    angles_deg: tuple[int, ...] = ANGLES_DEG,
+    energy_kev: float = 1000.0,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Simulate the charge pulse of every place of a grid and write them as a library.
+
+    The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
+    under the detector's name: r and z in mm from the centre of the point contact, times in
+    ns from when the charge is set free, pulses of unit charge as float32 arrays of shape
+    (r, z, samples).  What the format calls drift times are the collection times of all
+    charge, `Signals.collection_time_ns`.  Places that give no signal, and those whose charge
+    is not collected within the record, are NaN.
+
+    Parameters
+    ----------
+    detector
+        Geometry, impurities and bias.
+    out
+        LH5 file to write.
+    settings
+        Of the simulation; by default with 5000 samples of 1 ns.
+    grid_mm
+        Spacing in r and z.
+    angles_deg
+        Azimuths from <100>.
+    energy_kev
+        Of each hit; it matters with self-repulsion only.
+    force
+        Replace an existing file.
+    monitor
+        Told of the progress.
+
+    Returns
+    -------
+    dict
+        ``templates`` (places times angles), ``written``, ``outside`` (no signal there) and
+        ``late`` (not collected within the record).
+
+    Raises
+    ------
+    CpunetError
+        If the detector is not depleted, the grid is empty, or the file cannot be written.
+    """
+    refuse_existing(out, force=force)
+    if not (math.isfinite(grid_mm) and grid_mm > 0):
+        raise CpunetError(f"the grid is {grid_mm} mm wide; expected more than 0")
+    wrong = [angle for angle in angles_deg if not 0 <= angle < 360]
+    if wrong or not angles_deg or len(set(angles_deg)) < len(angles_deg):
+        raise CpunetError(f"angles {angles_deg}: give different ones from 0 to 359 degrees")
+    settings = settings or SimulationSettings(dt_ns=DT_NS, length_ns=LENGTH_NS)
+    with monitor.stage(f"Fields of {detector.name or 'the detector'}"):
+        fields = compute_fields(detector)
+    r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
+    counts = {"templates": 0, "written": 0, "outside": 0, "late": 0}
+    total = len(angles_deg) * len(r_mm) * len(z_mm)
+    with (
+        written_aside(out) as aside,
+        FileInTheMaking(aside, out) as made,
+        monitor.stage("Templates", total) as advance,
+    ):
+        library = made.h5.create_group(detector.name or "detector")
+        _describe(library, r_mm, z_mm, settings)
+        for angle in angles_deg:
+            _fill(library, angle, fields, settings, energy_kev, counts, advance)
+        library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
+    return counts
+
+
+def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:
+    """Multiples of the grid's spacing within the axis."""
+    return np.asarray(np.arange(int(axis_mm[-1] / grid_mm + 1e-6) + 1) * grid_mm)
+
+
+def _describe(
+    library: h5py.Group, r_mm: FloatArray, z_mm: FloatArray, settings: SimulationSettings
+) -> None:
+    for name, values, units, datatype in (
+        ("r", r_mm, "mm", "array<1>{real}"),
+        ("z", z_mm, "mm", "array<1>{real}"),
+        ("dt", settings.dt_ns, "ns", "real"),
+        ("t0", 0.0, "ns", "real"),
+    ):
+        library[name] = values
+        library[name].attrs.update({"datatype": datatype, "units": units})
+
+
+def _fill(
+    library: h5py.Group,
+    angle_deg: int,
+    fields: FieldMaps,
+    settings: SimulationSettings,
+    energy_kev: float,
+    counts: dict[str, int],
+    advance: Advance,
+) -> None:
+    """Simulate the places of one azimuth, row by row of r."""
+    r_mm, z_mm = library["r"][()], library["z"][()]
+    shape = (len(r_mm), len(z_mm))
+    waveforms = _array(library, f"waveform_{angle_deg:03d}_deg", shape, settings.n_samples)
+    drift_times = _array(library, f"drift_time_{angle_deg:03d}_deg", shape)
+    waveforms.attrs["units"], drift_times.attrs["units"] = "", "ns"
+    phi = math.radians(angle_deg)
+    for i, r in enumerate(r_mm):
+        x, y = r * math.cos(phi), r * math.sin(phi)
+        signals = hit_signals(fields, x, y, z_mm, energy_kev, settings)
+        good = signals.valid & signals.collected
+        waveforms[i] = _kept(signals, good)
+        drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
+        counts["templates"] += len(z_mm)
+        counts["written"] += int(good.sum())
+        counts["outside"] += int((~signals.valid).sum())
+        counts["late"] += int((signals.valid & ~signals.collected).sum())
+        advance(len(z_mm))
+
+
+def _kept(signals: Signals, good: np.ndarray[Any, np.dtype[np.bool_]]) -> Any:
+    return np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
+
+
+def _array(
+    library: h5py.Group, name: str, shape: tuple[int, int], *samples: int
+) -> h5py.Dataset:
+    """An empty array of NaN with LH5's attributes, in chunks of whole templates."""
+    whole = (*shape, *samples)
+    made = library.create_dataset(
+        name,
+        whole,
+        np.float32 if samples else np.float64,
+        chunks=(1, *whole[1:]),
+        compression="gzip",
+        compression_opts=1,
+        shuffle=True,
+        fillvalue=np.nan,
+    )
+    made.attrs["datatype"] = f"array<{len(whole)}>{{real}}"
+    return made

@@ -1,0 +1,263 @@
+"""A detector and hits in, a file of pulses out: the simulated side of a training."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.simulation.hit_sources import HitFile, HitSource, Window
+from cpunet.jobs.simulation.simulation_summary import Clock, Summary
+from cpunet.outputs import refuse_inputs
+from cpunet.pulses.writing import PulseWriter
+from cpunet.simulation.clustering import cluster_hits, merge_hits
+from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.fields import FieldMaps, compute_fields, scaled_to_depletion
+from cpunet.simulation.gammas import with_resolution
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hit_readers.hit_table import hit_columns
+from cpunet.simulation.hits import FloatArray, Hits
+from cpunet.simulation.library import build_library
+from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.settings import SimulationSettings
+
+QUIET = Monitor()
+Mode = Literal["exact", "library", "auto"]
+ImpurityFrom = Literal["file", "depletion"]
+
+# Building the library takes as long as drifting so many hits. From there on it is faster,
+# but its pulses deviate by up to `library_tolerance`.
+LIBRARY_FROM_HITS = 200_000
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """FWHM of the reported energies: FWHM² = noise_kev2 + fano_kev E, in keV."""
+
+    noise_kev2: float
+    fano_kev: float
+
+    def smear(self, energy_kev: FloatArray, seed: int) -> FloatArray:
+        """Energies as they would be reported, see `with_resolution`."""
+        return with_resolution(
+            energy_kev, noise_kev2=self.noise_kev2, fano_kev=self.fano_kev, seed=seed
+        )
+
+
+def simulate_file(
+    detector: Detector,
+    source: HitSource,
+    out: Path,
+    settings: SimulationSettings,
+    *,
+    windows: tuple[Window, ...] = (),
+    impurity_from: ImpurityFrom = "file",
+    mode: Mode = "auto",
+    cluster_mm: float = 0.05,
+    resolution: Resolution | None = None,
+    seed: int = 0,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> Summary:
+    """Simulate the pulses of a detector and write them, with their hits, to an LH5 file.
+
+    The table ``geds/sim`` is what `cpunet.jobs.training.train.train_run` reads: ``waveform`` in
+    units of the collected charge, ``energy`` (keV) collected, ``event_number``; beside
+    them ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, with trapping
+    ``trapped_energy`` (keV, deposited elsewhere but not collected) and with a resolution
+    ``true_energy``.  Its attribute ``simulation`` tells in JSON how the file
+    was made.  ``geds/hits`` holds the hits of the pulses, in the crystal's frame.
+
+    Parameters
+    ----------
+    detector
+        Geometry, impurities, bias and temperature.
+    source
+        Of the hits.
+    out
+        LH5 file to write; it appears when all is done.
+    settings
+        Of the drift and the pulses.
+    windows
+        In which the summary counts pulses.
+    impurity_from
+        ``"depletion"`` scales the detector's impurities so that it depletes at its
+        ``measured_depletion_V``.
+    mode
+        ``"exact"`` drifts every hit, ``"library"`` interpolates between pre-computed
+        pulses; ``"auto"`` takes the library from `LIBRARY_FROM_HITS` hits on.
+    cluster_mm
+        Hits nearer than this to each other are merged; 0 merges none.
+    resolution
+        Of the energies written; the pulses stay as they are.
+    seed
+        Of the resolution (the Monte Carlo has its own).
+    force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Raises
+    ------
+    CpunetError
+        If the file exists, the detector is not depleted, the hits cannot be used, or none
+        gives a signal.
+    """
+    clock = Clock()
+    made_by = f"cpunet simulate {cpunet.__version__}"
+    refuse_inputs(out, source.path if isinstance(source, HitFile) else None)
+    writer = PulseWriter(out, attrs={"made_by": made_by}, force=force)
+    _check(cluster_mm, resolution)
+    opened = source.open(detector)
+    clock.lap("reading")
+    if opened.warning:
+        monitor.note(f"warning: {opened.warning}")
+    detector, fields = solved(detector, impurity_from, monitor)
+    clock.lap("fields")
+    summary = Summary()
+    blocks = _merged(opened.blocks, detector, cluster_mm, summary)
+    first = next(blocks)
+    clock.lap("first hits")
+    summary.mode = _resolved(mode, len(first.edep_kev) / len(first) * opened.n_events)
+    library = _library(fields, settings, monitor) if summary.mode == "library" else None
+    clock.lap("library")
+    with writer, monitor.stage(f"Simulating {detector.name}", opened.n_events) as advance:
+        for block in chain([first], blocks):
+            clock.lap("waiting for hits")
+            events = _simulate(fields, block, settings, library, advance)
+            clock.lap("pulses")
+            summary.add(detector, block, events, windows)
+            _append(writer, block, events, settings, resolution, seed)
+            clock.lap("writing")
+        if not writer.n_pulses:
+            raise CpunetError(
+                f"{out}: none of {summary.n_events} events gives a signal: their hits lie "
+                f"outside {detector.name} or in its contacts; check the hits' frame"
+            )
+        summary.seconds = clock.seconds
+        made = _made(detector, source, settings, cluster_mm, resolution, seed, summary)
+        made["impurity_from"] = impurity_from
+        made["depletion_V"] = fields.depletion_V
+        writer.annotate({"simulation": json.dumps(made)})
+    return summary
+
+
+def _check(cluster_mm: float, resolution: Resolution | None) -> None:
+    """Refuse, before any work is done, what would fail later."""
+    cluster_hits(Hits.of([], [], [0]), cluster_mm)
+    if resolution is not None:
+        resolution.smear(np.zeros(0), seed=0)
+
+
+def solved(
+    detector: Detector, impurity_from: ImpurityFrom, monitor: Monitor
+) -> tuple[Detector, FieldMaps]:
+    """The detector with the impurities wanted, and its fields."""
+    with monitor.stage(f"Fields of {detector.name}"):
+        if impurity_from == "depletion":
+            detector = scaled_to_depletion(detector)
+        fields = compute_fields(detector)
+    if impurity_from == "depletion":
+        monitor.note(
+            f"{detector.name}: impurities times {detector.impurity_scale:.4g}, so that it "
+            f"depletes at the measured {detector.measured_depletion_V:g} V"
+        )
+    return detector, fields
+
+
+def _resolved(mode: Mode, expected_hits: float) -> Literal["exact", "library"]:
+    if mode != "auto":
+        return mode
+    return "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
+
+
+def _library(fields: FieldMaps, settings: SimulationSettings, monitor: Monitor) -> Library:
+    with monitor.stage("Library of pulses") as advance:
+        return build_library(fields, settings, _steps_of(advance))
+
+
+def _merged(
+    blocks: Iterator[Hits], detector: Detector, distance_mm: float, summary: Summary
+) -> Iterator[Hits]:
+    for block in blocks:
+        summary.hits_before_merging += len(block.edep_kev)
+        yield merge_hits(block, detector, distance_mm)
+
+
+def _simulate(
+    fields: FieldMaps,
+    hits: Hits,
+    settings: SimulationSettings,
+    library: Library | None,
+    advance: Advance,
+) -> EventPulses:
+    mode: Literal["exact", "library"] = "exact" if library is None else "library"
+    return simulate_events(fields, hits, settings, mode, _steps_of(advance), library)
+
+
+def _steps_of(advance: Advance) -> Callable[[int, int], None]:
+    """From the number done so far, as the simulation tells it, to the steps a stage takes."""
+    before = 0
+
+    def progress(done: int, _total: int) -> None:
+        nonlocal before
+        advance(done - before)
+        before = done
+
+    return progress
+
+
+def _append(
+    writer: PulseWriter,
+    hits: Hits,
+    events: EventPulses,
+    settings: SimulationSettings,
+    resolution: Resolution | None,
+    seed: int,
+) -> None:
+    kept = events.collected_kev > 0
+    pulses = events.pulses()
+    columns: dict[str, tuple[Any, str]] = {
+        "lost_energy": (events.lost_kev[kept], "keV"),
+        "n_hits": (np.diff(hits.offsets)[kept], ""),
+    }
+    if any(settings.trapping_per_ns):
+        columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
+    if resolution is not None:
+        columns["true_energy"] = (pulses.energy_kev, "keV")
+        # each block draws anew, from where in the file it begins
+        block_seed = int(np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)[0])
+        pulses = replace(pulses, energy_kev=resolution.smear(pulses.energy_kev, block_seed))
+    writer.append(pulses, columns)
+    writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))
+
+
+def _made(
+    detector: Detector,
+    source: HitSource,
+    settings: SimulationSettings,
+    cluster_mm: float,
+    resolution: Resolution | None,
+    seed: int,
+    summary: Summary,
+) -> dict[str, Any]:
+    """How the file was made, to be kept in it."""
+    return {
+        "cpunet": cpunet.__version__,
+        "detector": detector.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json"),
+        "hits": source.provenance(),
+        "mode": summary.mode,
+        "cluster_mm": cluster_mm,
+        "resolution": None if resolution is None else vars(resolution),
+        "seed": seed,
+        "events": summary.n_events,
+        "events_without_signal": summary.without_signal,
+    }

@@ -1,0 +1,212 @@
+"""What a test stand is to be: two sides of independent events, and what each is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from cpunet.electronics.chain import Electronics
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.simulation.hit_sources import GammaSource, Window
+from cpunet.pulses.container import Pulses
+from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.events import simulate_events
+from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.library import build_library
+from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.shifted import Shift
+
+Kind = Literal["matched", "shifted"]
+Labels = npt.NDArray[np.int64]
+
+LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
+OTHER = 3
+# Period of the simulated pulses that pass the chain; at 4 ns they are those of the library.
+_FINE_NS = 4.0
+# As `cpunet simulate` merges hits.
+CLUSTER_MM = 0.05
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a stand: its detector, how it is simulated, its events."""
+
+    detector: Detector
+    settings: SimulationSettings
+    source: GammaSource
+
+    def library(self, monitor: Monitor) -> Library:
+        """Pre-computed pulses."""
+        with monitor.stage(f"Library of pulses of {self.detector.name}"):
+            return build_library(compute_fields(self.detector), self.settings)
+
+    def blocks(
+        self, title: str, library: Library | None, monitor: Monitor
+    ) -> Iterator[tuple[Pulses, Labels, Hits]]:
+        """Its pulses, finely sampled, their lines and their hits, block by block.
+
+        The energies are calibrated, as a measurement's are: where charge is trapped, a
+        factor brings the median of the first block's lines to what it was before.
+        """
+        with monitor.stage(f"Fields of {self.detector.name}"):
+            fields = compute_fields(self.detector)
+        mode: Literal["exact", "library"] = "exact" if library is None else "library"
+        opened = self.source.open(self.detector)
+        gain = 0.0
+        with monitor.stage(title, opened.n_events) as advance:
+            for hits in opened.blocks:
+                merged = merge_hits(hits, self.detector, CLUSTER_MM)
+                events = simulate_events(fields, merged, self.settings, mode, library=library)
+                kept = events.collected_kev > 0
+                pulses = events.pulses()
+                if len(pulses):
+                    untrapped = pulses.energy_kev + events.trapped_kev[kept]
+                    labels = labels_of(untrapped, self.source.windows)
+                    gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
+                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
+                    yield calibrated, labels, merged[kept]
+                advance(len(hits))
+
+
+@dataclass(frozen=True)
+class StandPlan:
+    """Everything that a stand follows from.
+
+    Parameters
+    ----------
+    electronics
+        The chain of the data, and of the truth.
+    kind, shift
+        ``"shifted"``, and by what the data's detector differs, or ``"matched"`` and None.
+    sim, data
+        The two sides.
+    seed
+        Of everything random.
+    readout_seed
+        Of the noise and what else the readout adds, drawn from `seed`.
+    """
+
+    electronics: Electronics
+    kind: Kind
+    shift: Shift | None
+    sim: Side
+    data: Side
+    seed: int
+    readout_seed: int
+
+    @classmethod
+    def of(
+        cls,
+        electronics: Electronics,
+        detector: Detector,
+        windows: tuple[Window, ...],
+        events: tuple[int, ...],
+        *,
+        kind: Kind = "matched",
+        shift: Shift | None = None,
+        settings: SimulationSettings | None = None,
+        height_mm: float = 20.0,
+        radius_mm: float = 5.0,
+        seed: int = 0,
+    ) -> Self:
+        """Plan a stand, see `cpunet.jobs.simulation.stand.make_stand`.
+
+        Raises
+        ------
+        CpunetError
+            If a window has no events, the chain's period is no multiple of the pulses', the
+            settings give a period, or there can be no detector shifted so.
+        """
+        for window, number in zip(windows, events, strict=True):
+            if number < 1:
+                raise CpunetError(f"--events {window.name}={number}: give at least 1 event")
+        settings = _finely_sampled(settings or SimulationSettings(), electronics)
+        if kind == "shifted":
+            shift = shift or Shift.default()
+        elif shift is not None:
+            raise CpunetError("--shift: a matched stand has none; give --kind shifted")
+        # seeds of the events of both sides and of the readout's blocks
+        sim_seed, data_seed, readout_seed = map(
+            int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+        )
+        sim_hits, data_hits = (
+            GammaSource(windows, events, height_mm, radius_mm, s) for s in (sim_seed, data_seed)
+        )
+        sim = Side(detector, settings, sim_hits)
+        data = Side(
+            detector if shift is None else shift.detector(detector),
+            settings if shift is None else shift.settings(settings),
+            data_hits,
+        )
+        return cls(electronics, kind, shift, sim, data, seed, readout_seed)
+
+    def provenance(self) -> dict[str, Any]:
+        """What ``stand.json`` tells of how the stand was made."""
+        sides = {
+            name: {
+                "detector": side.detector.model_dump(mode="json"),
+                "settings": side.settings.model_dump(mode="json"),
+                "hits": side.source.provenance(),
+            }
+            for name, side in (("sim", self.sim), ("data", self.data))
+        }
+        return {
+            "kind": self.kind,
+            "shift": None if self.shift is None else self.shift.model_dump(mode="json"),
+            "seed": self.seed,
+            "electronics": self.electronics.model_dump(mode="json"),
+            **sides,
+        }
+
+
+def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
+    """0 DEP, 1 SEP, 2 FEP, 3 other, by which window the collected energies (keV) are in."""
+    labels = np.full(len(energy_kev), OTHER)
+    for window in windows:
+        # deposits add up to a line only within rounding
+        inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
+        labels[inside] = LABELS.get(window.name, OTHER)
+    return labels
+
+
+def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
+    """The median of those in a line, or of all if none is."""
+    of_lines = labels != OTHER
+    return float(np.median(share[of_lines] if of_lines.any() else share))
+
+
+def _finely_sampled(
+    settings: SimulationSettings, electronics: Electronics
+) -> SimulationSettings:
+    fine = _fine_ns(electronics)
+    if "dt_ns" in settings.model_fields_set and settings.dt_ns != fine:
+        raise CpunetError(
+            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
+            "period; leave dt_ns out"
+        )
+    try:
+        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": fine})
+    except ValidationError as error:
+        raise CpunetError(
+            f"settings: step_ns = {settings.step_ns:g} does not divide the {fine:g} ns of a "
+            "stand's pulses; give one that does"
+        ) from error
+
+
+def _fine_ns(electronics: Electronics) -> float:
+    ratio = electronics.dt_ns / _FINE_NS
+    if abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
+            f"{_FINE_NS:g}, the pulses' period; choose another"
+        )
+    return _FINE_NS

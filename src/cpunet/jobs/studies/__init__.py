@@ -1,0 +1,1 @@
+"""Many runs: ensembles over seeds and searches over settings, in several processes."""

@@ -1,0 +1,302 @@
+"""One training per seed, several at once; a seed that fails does not stop the others."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cpunet.analysis.seed_scores import failed_seeds, seed_table
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.studies.fingerprints import fingerprints
+from cpunet.jobs.studies.workers import Link, Outcome, cores, default_jobs, work_off
+from cpunet.jobs.training.train import train_run
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
+from cpunet.training.checkpoints import require_same
+from cpunet.training.ensemble_folder import (
+    ENSEMBLE,
+    ENSEMBLE_KIND,
+    member_folder,
+    read_json,
+    require_usable,
+    working_folder,
+    write_json,
+)
+from cpunet.training.run_folder import INFO, read_info
+
+QUIET = Monitor()
+SEEDS = 20
+FIGURE, DPI = "seeds.png", 150
+METRICS = "metrics.json"
+TRAINED, FAILED = "trained", "failed"
+
+
+def train_ensemble(
+    sim: InputFile,
+    data: InputFile,
+    out: Path,
+    recipe: Recipe,
+    *,
+    seeds: int = SEEDS,
+    peak: str = "FEP",
+    jobs: int | None = None,
+    threads: int | None = None,
+    validate: bool = True,
+    truth: Path | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Train the seeds 0 … N - 1, each into a run folder of its own, and score them.
+
+    Parameters
+    ----------
+    sim, data, recipe, peak, device
+        As for `cpunet.jobs.training.train.train_run`.
+    out
+        Folder of the run folders; whatever stops the job, it can be gone on with.
+    seeds
+        How many.
+    jobs
+        Processes at a time; by default as many as cores, or one on a GPU.
+    threads
+        CPU threads of each; by default its share of the cores.
+    validate
+        Score each seed on all peaks, without rivals.
+    truth
+        As for `cpunet.jobs.validation.validate.validate_run`.
+    resume
+        Go on: finished seeds are kept, unfinished and failed ones are trained, and there may
+        be more of them; all else must be as it was.
+    force
+        Without `resume`, replace an existing ensemble.
+    monitor
+        Told of the progress.
+
+    Returns
+    -------
+    dict
+        The content of ``ensemble.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, the folder is in the way or was begun otherwise, or
+        every seed failed.
+    """
+    if seeds < 1:
+        raise CpunetError(f"--seeds {seeds}: give 1 or more")
+    device = resolve_device(device)
+    require_usable(
+        out, ENSEMBLE_KIND, *sim.files, *data.files, truth, resume=resume, force=force
+    )
+    begun_with = {"recipe": recipe.model_dump(mode="json"), "peak": peak}
+    begun_with |= fingerprints(sim, data, recipe, peak, monitor)
+    with working_folder(
+        out, ENSEMBLE_KIND, resume=resume, force=force, note=monitor.note
+    ) as folder:
+        ensemble = _Ensemble(folder, begun_with)
+        member = _Member(sim, data, folder, recipe, peak, validate, truth, device)
+        left = [seed for seed in range(seeds) if not member.is_done(seed)]
+        jobs = max(1, min(jobs or default_jobs(device), len(left)))
+        threads = threads or max(1, cores() // jobs)
+        _remove_leavings(folder)
+        outcomes = work_off(member, left, jobs=jobs, threads=threads, monitor=monitor)
+        title = f"Training {len(left)} seeds in {jobs} processes"
+        with _stage(monitor, title, len(left), recipe) as count, closing(outcomes):
+            for outcome in outcomes:
+                count(outcome)
+                if isinstance(outcome, Outcome):
+                    ensemble.add(outcome)
+                    if outcome.failure is not None:
+                        monitor.note(f"seed {outcome.item} failed: {outcome.failure}")
+        return ensemble.finish()
+
+
+class _Ensemble:
+    """``ensemble.json``: what is known of each seed."""
+
+    def __init__(self, folder: Path, begun_with: dict[str, Any]) -> None:
+        self.folder, self.path = folder, folder / ENSEMBLE
+        content = read_json(self.path) or {"begun_with": begun_with, "seeds": {}}
+        require_same(content["begun_with"], begun_with)
+        self.content = content
+        for seed, entry in [*content["seeds"].items()]:
+            if entry["state"] == FAILED:  # is tried again
+                del content["seeds"][seed]
+        self._write()
+
+    def add(self, outcome: Outcome) -> None:
+        """Record what became of a seed."""
+        entry = {"state": FAILED, "reason": outcome.failure}
+        if outcome.failure is None:
+            entry = {"state": TRAINED} | outcome.result
+        self.content["seeds"][str(outcome.item)] = entry
+        self._write()
+
+    def finish(self) -> dict[str, Any]:
+        """Take the scores together; return all."""
+        seeds: dict[str, Any] = self.content["seeds"]
+        seeds = dict(sorted(seeds.items(), key=lambda item: int(item[0])))
+        failed = {int(s): e["reason"] for s, e in seeds.items() if e["state"] == FAILED}
+        metrics = {}
+        for seed in (int(s) for s in seeds if int(s) not in failed):
+            read = read_json(member_folder(self.folder, seed) / METRICS)
+            if read is not None:
+                metrics[seed] = read
+        self.content |= {"seeds": seeds, "failures": failed, "table": []}
+        poor: dict[int, list[str]] = {}
+        if metrics:
+            self.content["table"] = seed_table(metrics)
+            poor = failed_seeds(metrics)
+            _draw(self.folder / FIGURE, [*metrics.values()])
+        self.content["poor"] = poor
+        self.content["failure_rate"] = len({*failed, *poor}) / len(seeds)
+        self._write()
+        if len(failed) == len(seeds):
+            raise CpunetError(
+                f"{self.folder}: all of {len(seeds)} seeds failed, the first: "
+                f"{next(iter(failed.values()))}"
+            )
+        return self.content
+
+    def _write(self) -> None:
+        write_json(self.path, self.content)
+
+
+@dataclass(frozen=True)
+class _Member:
+    """What each process does with a seed: train it, and score it."""
+
+    sim: InputFile
+    data: InputFile
+    folder: Path
+    recipe: Recipe
+    peak: str
+    validate: bool
+    truth: Path | None
+    device: str
+
+    def is_done(self, seed: int) -> bool:
+        """Whether nothing is left to do for a seed."""
+        run = member_folder(self.folder, seed)
+        return (run / INFO).is_file() and (not self.validate or (run / METRICS).is_file())
+
+    def __call__(self, link: Link) -> Callable[[int], dict[str, Any]]:
+        """Give what does a seed; returns its times and scores."""
+        return lambda seed: self._do(seed, link)
+
+    def _do(self, seed: int, link: Link) -> dict[str, Any]:
+        run = member_folder(self.folder, seed)
+        if not (run / INFO).is_file():
+            self._train(run, seed, link)
+        told = {"seconds": read_info(run)["seconds"]}
+        if self.validate and not (run / METRICS).is_file():
+            told |= self._score(run)
+        return told
+
+    def _train(self, run: Path, seed: int, link: Link) -> None:
+        begun = run.with_name(f"{run.name}.unfinished").exists()
+        with link.stoppable() as stop:
+            train_run(
+                self.sim,
+                self.data,
+                run,
+                self.recipe,
+                peak=self.peak,
+                seed=seed,
+                device=self.device,
+                resume=begun and isinstance(self.recipe.training, TrainingConfig),
+                stop=stop,
+                monitor=_Forwarding(link, seed),
+            )
+
+    def _score(self, run: Path) -> dict[str, Any]:
+        # seconds to import, for each process: only if needed
+        from cpunet.jobs.validation.evaluation import evaluate
+
+        clock = time.perf_counter()
+        metrics = evaluate(
+            run,
+            self.sim,
+            self.data,
+            truth=self.truth,
+            rivals=False,
+            seed=0,  # the same noise and bootstraps for all: they differ in the training alone
+            device=self.device,
+            monitor=QUIET,
+        ).metrics
+        write_json(run / METRICS, metrics)
+        scores = {
+            peak: {
+                name: found["iou"].get("ren") for name, found in of_peak["parameters"].items()
+            }
+            for peak, of_peak in metrics["peaks"].items()
+        }
+        return {"seconds_scoring": round(time.perf_counter() - clock, 1), "iou": scores}
+
+
+class _Forwarding(Monitor):
+    """Sends steps of a training and warnings to the parent."""
+
+    def __init__(self, link: Link, seed: int) -> None:
+        self._link, self._seed = link, seed
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        """Pass the iterations of a CycleGAN on."""
+        yield self._link.advance if title == "Training" else lambda _steps: None
+
+    def note(self, message: str) -> None:
+        """Pass warnings on; the rest is the same for all seeds."""
+        if message.startswith("warning"):
+            self._link.note(f"seed {self._seed}: {message}")
+
+
+@contextmanager
+def _stage(
+    monitor: Monitor, title: str, seeds: int, recipe: Recipe
+) -> Iterator[Callable[[Outcome | int], None]]:
+    """Count the iterations of a CycleGAN; a matching ends when it will, so count seeds.
+
+    A seed that ends with fewer iterations, or failed, is made up to all of its own.
+    """
+    training = recipe.training
+    each = training.iterations if isinstance(training, TrainingConfig) else 1
+    ended = counted = 0
+    with monitor.stage(title, seeds * each) as advance:
+
+        def count(outcome: Outcome | int) -> None:
+            nonlocal ended, counted
+            steps = outcome if isinstance(outcome, int) else 0
+            ended += not isinstance(outcome, int)
+            steps = max(steps, ended * each - counted)
+            counted += steps
+            if steps:
+                advance(steps)
+
+        yield count
+
+
+def _draw(path: Path, metrics: list[dict[str, Any]]) -> None:
+    from cpunet.analysis.seed_figure import seed_distributions, seed_figure
+
+    with written_aside(path) as aside:
+        figure = seed_figure(seed_distributions(metrics))
+        figure.savefig(aside, format="png", dpi=DPI)
+
+
+def _remove_leavings(folder: Path) -> None:
+    """Remove what processes that were killed have written aside."""
+    for path in folder.glob(".seed_*"):
+        shutil.rmtree(path, ignore_errors=True)

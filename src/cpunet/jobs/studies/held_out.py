@@ -1,0 +1,195 @@
+"""Pulses of the training's energies that a training does not see, and what they say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Self
+
+import numpy as np
+import torch
+from torch import nn
+
+from cpunet.analysis.distances import null_distances, wasserstein
+from cpunet.analysis.resampling import resampled_twice
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.matching import Sides, match
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import Values, pulse_parameters
+from cpunet.recipes.network_settings import PunetConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.loop import Keeping, State, train
+from cpunet.training.run_folder import write_run
+from cpunet.training.sampling import Deck
+from cpunet.training.statistics import refresh_batch_statistics
+from cpunet.translation.backends import NetworkBackend
+from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.output_form import drawn_kev
+from cpunet.translation.translator import REN
+
+SHARE = 0.3  # of the pulses of each side
+FEWEST = 20  # of each side, below which a distribution says nothing
+MOST_LOST = 0.01  # of the translations: pulses that cannot be prepared would flatter the rest
+REPORTS = 8  # of a CycleGAN on its way
+
+Report = Callable[[int, float], None]  # iterations done, score
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Prepared pulses of both sides, to fit and held out.
+
+    Parameters
+    ----------
+    fit
+        To train on.
+    sim, data
+        Held out.
+    values, nulls
+        Of the held-out data: parameters, and the distance of each to itself.
+    """
+
+    fit: Sides
+    sim: Pulses
+    data: Pulses
+    values: dict[str, Values]
+    nulls: dict[str, float]
+    seed: int
+
+    @classmethod
+    def of(
+        cls, sim: InputSet, data: InputSet, data_file: InputFile, recipe: Recipe, seed: int
+    ) -> Self:
+        """Part both sides at random.
+
+        Raises
+        ------
+        CpunetError
+            If too few pulses would be held out.
+        """
+        rng = np.random.default_rng(seed)
+        parts = []
+        for side in (sim, data):
+            pulses = side.prepared.pulses
+            rows, n = rng.permutation(len(pulses)), int(SHARE * len(pulses))
+            if n < FEWEST:
+                raise CpunetError(
+                    f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
+                    f"and {FEWEST} are needed; select more energies (--peak) or give more"
+                )
+            parts.append((pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]))
+        (fit_sim, held_sim), (fit_data, held_data) = parts
+        values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
+        n_sim, n_data = len(held_sim), len(held_data)
+        draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
+        nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
+        fit = Sides(fit_sim, fit_data, data_file, data)
+        return cls(fit, held_sim, held_data, values, nulls, seed)
+
+    def score(self, ren: REN) -> float:
+        """Distance of the translated held-out pulses to data: 1 is that of data to data.
+
+        The mean over the parameters of the Wasserstein distance over its null.
+
+        Raises
+        ------
+        CpunetError
+            If pulses cannot be translated.
+        """
+        generator = ren.seeded(self.seed)
+        remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+        windows = ren.apply(
+            self.sim.waveforms,
+            energy_kev=self.sim.energy_kev,
+            generator=generator,
+            remains_kev=drawn_kev(remains, len(self.sim), generator),
+        )
+        whole = np.isfinite(windows).all(axis=1)
+        if (lost := 1 - whole.mean()) > MOST_LOST:
+            raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
+        pulses = Pulses.of(windows[whole], dt_ns=self.sim.dt_ns)
+        values = pulse_parameters(pulses, ren.recipe.preparation, ren.recipe.scores)
+        ratios = [wasserstein(self.values[k], values[k]) / self.nulls[k] for k in values]
+        score = float(np.mean(ratios))
+        if not np.isfinite(score):
+            raise CpunetError("a parameter of the held-out pulses has no value")
+        return score
+
+    def train(self, recipe: Recipe, seed: int, device: str, report: Report) -> REN:
+        """Train on what is not held out.
+
+        Parameters
+        ----------
+        recipe, seed, device
+            As for `cpunet.jobs.training.train.train_run`.
+        report
+            Given the score of a CycleGAN now and then; what it raises ends the training.
+
+        Raises
+        ------
+        CpunetError
+            If the training fails.
+        """
+        model: nn.Module
+        if isinstance(recipe.training, MatchingConfig):
+            model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, Monitor())
+        else:
+            model = train(
+                self.fit.sim.waveforms,
+                self.fit.data.waveforms,
+                recipe,
+                seed=seed,
+                device=device,
+                keeping=Keeping(self._watch(recipe, device, report)),
+            )
+        info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}
+        with TemporaryDirectory(prefix="cpunet-tune-") as folder:
+            told = {"seconds": 0, "device": device, "seed": seed}
+            write_run(Path(folder), model, recipe, info | told)
+            return REN.load(folder, device)
+
+    def _watch(self, recipe: Recipe, device: str, report: Report) -> Callable[[State], None]:
+        """Score the generator that would be kept, each time its training gets so far."""
+        config, generator = recipe.cyclegan.training, recipe.cyclegan.generator
+        told = 0
+
+        def watch(state: State) -> None:
+            nonlocal told
+            part = state["iteration"] * REPORTS // config.iterations
+            if part in (told, REPORTS):  # the end has its own score
+                return
+            told = part
+            with _random_state_kept(device):
+                ren = self._averaged(state, recipe, generator, device)
+                report(state["iteration"], self.score(ren))
+
+        return watch
+
+    def _averaged(
+        self, state: State, recipe: Recipe, generator: PunetConfig, device: str
+    ) -> REN:
+        network = PositionalUNet(generator, recipe.preparation.length)
+        averages = state["averages"][0].items()
+        prefix = "module."
+        network.load_state_dict(
+            {k.removeprefix(prefix): v for k, v in averages if k.startswith(prefix)}
+        )
+        network = network.to(device)
+        config = recipe.cyclegan.training
+        pulses = torch.from_numpy(self.fit.sim.waveforms)[:, None].to(device)
+        deck = Deck(pulses, config.batch_size, seed=self.seed)
+        refresh_batch_statistics(network, deck, config.statistics_batches)
+        return REN(NetworkBackend(network), recipe, self.sim.dt_ns)
+
+
+def _random_state_kept(device: str) -> AbstractContextManager[None]:
+    """What is drawn inside must not change the training."""
+    cuda = [torch.device(device)] if device.startswith("cuda") else []
+    return torch.random.fork_rng(devices=cuda)

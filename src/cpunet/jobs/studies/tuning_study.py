@@ -1,0 +1,178 @@
+"""Trials in a journal: begun, lost, taken up again, and what they have found."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cpunet.errors import CpunetError
+from cpunet.recipes.schema import Recipe, SearchConfig
+from cpunet.training.search_space import holds, is_whole, value_of
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.trial import FrozenTrial
+
+JOURNAL = "journal.log"
+STUDY = "cpunet"
+WARM_UP = 4  # part of a training before which its scores say nothing
+# user attributes: of a trial, and of the study with a trial's number
+WORKER, REASON, SECONDS, LOST = "worker", "reason", "seconds", "lost"
+
+
+def require_optuna() -> Any:
+    """Optuna, told to keep quiet.
+
+    Raises
+    ------
+    CpunetError
+        If it is not installed.
+    """
+    try:
+        import optuna
+    except ImportError as error:
+        raise CpunetError(
+            "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
+        ) from error
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
+
+
+def open_study(folder: Path, recipe: Recipe) -> Study:
+    """The study in a folder, a new one if there is none."""
+    optuna = require_optuna()
+    from optuna.storages.journal import JournalFileBackend
+
+    study: Study = optuna.create_study(
+        study_name=STUDY,
+        storage=optuna.storages.JournalStorage(JournalFileBackend(str(folder / JOURNAL))),
+        pruner=optuna.pruners.MedianPruner(
+            n_startup_trials=4, n_warmup_steps=recipe.training.iterations // WARM_UP
+        ),
+        load_if_exists=True,
+    )
+    return study
+
+
+def queue_first(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> None:
+    """Queue the recipe as it is, and what processes that are gone have left undone."""
+    from optuna.trial import TrialState
+
+    if not study.trials:
+        own = {key: value_of(recipe, key) for key in space}
+        if all(holds(config, own[key]) for key, config in space.items()):
+            study.enqueue_trial(_labelled(own, space))
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        if _is_gone(str(trial.user_attrs.get(WORKER, ""))):
+            lose(study, trial)
+
+
+def this_worker() -> str:
+    """Name of this process: machine and number."""
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+def lose(study: Study, trial: FrozenTrial | Trial) -> None:
+    """Have a trial that was cut off done again."""
+    from optuna.trial import TrialState
+
+    study.set_user_attr(f"{LOST} {trial.number}", True)
+    study.tell(trial.number, state=TrialState.FAIL)
+    if trial.params:
+        study.enqueue_trial(trial.params)
+
+
+def _is_gone(worker: str) -> bool:
+    """Whether a process of this machine has ended; of others, nothing is known."""
+    host, _, pid = worker.rpartition(":")
+    if host != socket.gethostname():
+        return False
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        return False
+    return _is_zombie(int(pid))
+
+
+def _is_zombie(pid: int) -> bool:
+    """Whether a process has ended, but nobody has asked how, as in many containers."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (OSError, IndexError):
+        return False
+
+
+def counted(study: Study) -> list[FrozenTrial]:
+    """Trials that were begun and not lost."""
+    from optuna.trial import TrialState
+
+    begun = (t for t in study.trials if t.state != TrialState.WAITING)
+    lost = study.user_attrs
+    return [trial for trial in begun if f"{LOST} {trial.number}" not in lost]
+
+
+def suggested(trial: Trial, key: str, recipe: Recipe, config: SearchConfig) -> Any:
+    """The value of a setting that a trial is to try."""
+    if config.choices is not None:
+        labels = [json.dumps(choice) for choice in config.choices]
+        return json.loads(str(trial.suggest_categorical(key, labels)))
+    low, high = config.low, config.high
+    assert low is not None
+    assert high is not None
+    if is_whole(recipe, key, config):
+        return trial.suggest_int(key, int(low), int(high), log=config.log)
+    return trial.suggest_float(key, low, high, log=config.log)
+
+
+def _labelled(values: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
+    """Values as the journal has them: choices as text, since they may be lists."""
+    return {k: v if space[k].choices is None else json.dumps(v) for k, v in values.items()}
+
+
+def _plain(params: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
+    return {k: v if space[k].choices is None else json.loads(v) for k, v in params.items()}
+
+
+def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> dict[str, Any]:
+    """What the trials have found, ready for JSON; see `cpunet.jobs.studies.tune.tune_recipe`.
+
+    Raises
+    ------
+    CpunetError
+        If no trial has a score.
+    """
+    rows: list[dict[str, Any]] = [
+        {
+            "number": trial.number,
+            "state": trial.state.name.lower(),
+            "score": trial.value,
+            "values": _plain(trial.params, space),
+            "seconds": trial.user_attrs.get(SECONDS),
+            "reason": trial.user_attrs.get(REASON),
+        }
+        for trial in counted(study)
+    ]
+    scored = [row for row in rows if row["state"] == "complete"]  # pruned ones have scores too
+    if not scored:
+        reason = next((row["reason"] for row in rows if row["reason"]), "none was ended")
+        raise CpunetError(f"none of {len(rows)} trials has a score; the first: {reason}")
+    own = {key: value_of(recipe, key) for key in space}
+    optuna = require_optuna()
+    importances: dict[str, float] = {}
+    with suppress(ValueError, RuntimeError):  # too few trials, or all alike
+        importances = optuna.importance.get_param_importances(
+            study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
+        )
+    return {
+        "best": min(scored, key=lambda row: row["score"]),
+        "first": next((row["score"] for row in scored if row["values"] == own), None),
+        "trials": rows,
+        "importances": importances,
+    }

@@ -1,0 +1,239 @@
+"""Published weights become a run, published lists of pulses an LH5 file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from torch import nn
+
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.pickles import PickledPulse, as_pulse, entries
+from cpunet.pulses.writing import PulseWriter
+from cpunet.recipes import load_recipe
+from cpunet.restricted_unpickler import TruncatedError
+from cpunet.training.run_folder import RUN, versions, write_run
+from cpunet.translation.published import read_discriminator, read_generator
+
+QUIET = Monitor()
+BLOCK = 1024
+TABLE = "geds/raw"
+# What a report says of the training; the pulses are not part of what was published.
+UNKNOWN = {"file": "not published with the weights", "used": "an unknown number of"}
+
+
+def import_weights(
+    out: Path,
+    *,
+    ren: Path | None = None,
+    iren: Path | None = None,
+    discriminator_data: Path | None = None,
+    discriminator_sim: Path | None = None,
+    dt_ns: float = 16.0,
+    peak: str = "FEP",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Make a run folder of published state dicts, which `REN.load` and `IREN.load` take.
+
+    Parameters
+    ----------
+    out
+        Folder to make.
+    ren, iren
+        Generators: ``fep_REN.pt`` (simulation to data), ``fep_IREN.pt``; one at least.
+    discriminator_data, discriminator_sim
+        ``fep_netD_A.pth`` and ``fep_netD_B.pth``, kept for the record.
+    dt_ns
+        Sampling period of the pulses they were trained on in ns.
+    peak
+        What they were trained on.
+    force
+        Replace an existing run folder.
+    monitor
+        Told of what is kept of it.
+
+    Returns
+    -------
+    dict
+        What is in ``run.json``.
+
+    Raises
+    ------
+    CpunetError
+        If no generator is given, a file is no plain state dict or of another architecture,
+        the two generators differ in width, or `out` may not be written.
+    """
+    given = {
+        "ren": ren,
+        "iren": iren,
+        "discriminator_data": discriminator_data,
+        "discriminator_sim": discriminator_sim,
+    }
+    refuse_existing(out, *given.values(), force=force)
+    files = {part: path for part, path in given.items() if path is not None}
+    if ren is None and iren is None:
+        raise CpunetError("no generator given; name fep_REN.pt, fep_IREN.pt or both")
+    if not (np.isfinite(dt_ns) and dt_ns > 0):
+        raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
+    recipe = load_recipe("paper")
+    networks: dict[str, nn.Module] = {}
+    widths, overrides = set(), []
+    for part, path in files.items():
+        if part in ("ren", "iren"):
+            network = read_generator(path, recipe.preparation.length)
+            networks[part] = network
+            widths.add(network.latent_mean.out_channels // 8)
+        else:
+            networks[part], config = read_discriminator(path)
+            overrides = [
+                f"discriminator.{name}={getattr(config, name)}"
+                for name in ("embedding_rows", "embedding_dim", "hidden")
+            ]
+    if len(widths) > 1:
+        raise CpunetError(
+            f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
+        )
+    recipe = load_recipe("paper", [f"generator.width={widths.pop()}", *overrides])
+    info = {
+        "recipe": recipe.name,
+        "peak": peak,
+        "seed": None,
+        "dt_ns": dt_ns,
+        "seconds": 0.0,
+        "device": "elsewhere",
+        "sim": UNKNOWN,
+        "data": UNKNOWN,
+        "imported": {
+            part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+            for part, path in files.items()
+        },
+        "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+    }
+    with folder_written_aside(out, RUN, force=force, note=monitor.note) as folder:
+        write_run(folder, nn.ModuleDict(networks), recipe, info)
+    return info
+
+
+def import_pulses(
+    source: Path,
+    out: Path,
+    *,
+    dt_ns: float = 16.0,
+    table: str = TABLE,
+    units: str = "ADC",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Convert a pickled list of pulses to LH5, executing nothing of the pickle.
+
+    Pulses are dictionaries ``{wf, tp0, energy[, event]}``, pickled one after the other in
+    one file (streamed) or in lists (held one list at a time).
+
+    Parameters
+    ----------
+    source
+        File of pickles.
+    out
+        LH5 file to write: ``waveform``, ``energy`` (keV), ``event_number``, ``tp0``.
+    dt_ns
+        Sampling period in ns; the pickles do not tell.
+    table, units
+        Where in the LH5 file the pulses go, and the units of their samples.
+    force
+        Replace an existing file.
+    monitor
+        Told of the progress.
+
+    Returns
+    -------
+    dict
+        ``read`` (entries), ``written``, ``rejections`` (counts by reason) and ``truncated``
+        (the file ends within an entry, or is damaged there).
+
+    Raises
+    ------
+    CpunetError
+        If the pickle asks for more than arrays and plain containers, or holds no pulse.
+    """
+    refuse_existing(out, source, force=force)
+    counts: Counter[str] = Counter()
+    ended: list[str] = []
+    length = 0
+    writer = PulseWriter(
+        out,
+        table=table,
+        waveform_units=units,
+        attrs={"imported_from": source.name},
+        force=force,
+    )
+    with writer, monitor.stage("Pulses") as advance:
+        for block in _blocks(_entries(source, ended), counts):
+            length = length or len(block[0].samples)
+            same = [pulse for pulse in block if len(pulse.samples) == length]
+            counts["other_length"] += len(block) - len(same)
+            if same:
+                writer.append(*_columns(same, dt_ns))
+            counts["written"] += len(same)
+            advance(len(block))
+        if not counts["written"]:
+            why = f"; it ends early ({ended[0]})" if ended else ""
+            raise CpunetError(
+                f"{source}: no pulse among {counts['read']} entries{why}; expected "
+                "dictionaries with wf, tp0 and energy"
+            )
+    return {
+        "read": counts["read"],
+        "written": counts["written"],
+        "rejections": {k: n for k, n in counts.items() if k not in ("read", "written") and n},
+        "truncated": bool(ended),
+    }
+
+
+def _entries(source: Path, ended: list[str]) -> Iterator[Any]:
+    """Entries of all lists and single ones; where the file breaks off, `ended` says why."""
+    try:
+        yield from entries(source)
+    except TruncatedError as error:
+        ended.append(" ".join(str(error).split()))
+
+
+def _blocks(found: Iterator[Any], counts: Counter[str]) -> Iterator[list[PickledPulse]]:
+    """Pulses, many at a time; what is none is counted by reason."""
+    block: list[PickledPulse] = []
+    for entry in found:
+        number = counts["read"]
+        counts["read"] += 1
+        pulse, reason = as_pulse(entry, number)
+        if pulse is None:
+            counts[reason] += 1
+            continue
+        block.append(pulse)
+        if len(block) == BLOCK:
+            yield block
+            block = []
+    if block:
+        yield block
+
+
+def _columns(
+    block: list[PickledPulse], dt_ns: float
+) -> tuple[Pulses, dict[str, tuple[npt.ArrayLike, str]]]:
+    pulses = Pulses.of(
+        np.stack([pulse.samples for pulse in block]),
+        dt_ns=dt_ns,
+        energy_kev=np.array([pulse.numbers["energy"] for pulse in block]),
+        event_number=np.array([pulse.event for pulse in block]),
+    )
+    return pulses, {"tp0": (np.array([pulse.numbers["tp0"] for pulse in block]), "")}

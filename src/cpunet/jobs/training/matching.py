@@ -1,0 +1,205 @@
+"""A response, its noise and its inverse from prepared pulses of both sides."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.remains import Remains
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.noise import measured_noise
+from cpunet.jobs.common.remains import drawn_like, measured_remains, told_of
+from cpunet.networks.hybrid import HybridGenerator
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.pulses.container import Pulses
+from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.recipes.schema import Recipe
+from cpunet.training.diagnosis import beyond, diagnosis
+from cpunet.training.inverse import fit_inverse
+from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.matching import fit_response
+from cpunet.training.residual import fit_residual
+from cpunet.training.run_folder import load_network, read_recipe
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Prepared pulses of both sides, the file of the measured ones, and what was read of it.
+
+    Without the latter, `data_set`, remains of earlier pulses are not looked for.
+    """
+
+    sim: Pulses
+    data: Pulses
+    data_file: InputFile
+    data_set: InputSet | None = None
+
+
+def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
+    """The recipe with the configuration of a response: it may have begun to ring."""
+    if not isinstance(recipe.generator, ResponseConfig):
+        return recipe
+    own = {name: getattr(response, name) for name in ResponseConfig.model_fields}
+    del own["name"]
+    return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=own)})
+
+
+def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
+    """The response of a run, to start from.
+
+    Raises
+    ------
+    CpunetError
+        If the run has none.
+    """
+    recipe = read_recipe(run)
+    if not isinstance(recipe.generator, ResponseConfig):
+        raise CpunetError(
+            f"{run}: a network ({recipe.name}), from which no readout chain can start; give a "
+            "run of fast or best"
+        )
+    generator = ResponseGenerator(recipe.generator, dt_ns)
+    load_network(run, "ren", generator)
+    return generator.response
+
+
+def match(
+    sides: Sides,
+    recipe: Recipe,
+    seed: int,
+    listen: Listener,
+    monitor: Monitor,
+    known: ElectronicsResponse | None = None,
+) -> tuple[nn.Module, dict[str, Any], Recipe]:
+    """Measure the noise, fit the response, and invert it.
+
+    Parameters
+    ----------
+    sides
+        What to fit to.
+    recipe
+        With a response to be matched.
+    seed
+        Of everything random.
+    listen
+        Told step and chi-square.
+    monitor
+        Told of what is to be noted.
+    known
+        A response to start from.
+
+    Returns
+    -------
+    tuple
+        A module with ``ren`` and ``iren``, what ``run.json`` is to say of the fit, and the
+        recipe of the response as it was fitted.
+
+    Raises
+    ------
+    CpunetError
+        If there are too few pulses or baselines, or the fit diverges.
+    """
+    remains, drawn, told_of_remains = _remains(sides, recipe, monitor)
+    noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
+    if note is not None:
+        monitor.note(f"warning: {note}")
+
+    if known is not None:
+        recipe = _with_config(recipe, known.config)
+    response, fit = fit_response(
+        sides.sim,
+        sides.data,
+        noise,
+        recipe,
+        seed=seed,
+        known=known,
+        remains=drawn,
+        listener=listen,
+    )
+    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+    monitor.note(f"compared (simulated/measured pulses): {compared}")
+    beside = (
+        len(sides.sim) - sum(n for n, _ in fit.bands.values()),
+        len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+    )
+    if any(beside):
+        monitor.note(
+            f"in no band, since one side has too few of their energies: {beside[0]} simulated "
+            f"and {beside[1]} measured pulses"
+        )
+    monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
+    causes = diagnosis(fit.pulls) if fit.poor else []
+    for number, cause in enumerate(causes, 1):
+        monitor.note(f"  {number}. {cause}")
+    for found in beyond(response.describe()):
+        monitor.note(f"warning: {found}")
+    recipe = _with_config(recipe, response.config)
+    ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
+    ren.response = response
+    ren.set_noise(noise)
+    ren.remains = drawn
+    chain, parts, more = ren, {}, {}
+    if isinstance(recipe.generator, HybridConfig):
+        residual, kept = fit_residual(
+            chain,
+            sides.sim.waveforms,
+            sides.data.waveforms,
+            sides.sim.energy_kev,
+            recipe,
+            seed=seed,
+        )
+        if not kept.kept:
+            monitor.note("the residual does not help held-out pulses and is left out")
+        # beside the chain, not in it: what reads chains finds it where it always is
+        ren, parts, more = (
+            HybridGenerator(chain, residual),
+            {"residual": residual},
+            asdict(kept),
+        )
+    iren = fit_inverse(ren, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
+    told = {
+        "parameters": response.describe(),
+        **asdict(fit),
+        "verdict": fit.verdict,
+        "causes": causes,
+        "in_no_band": {"sim": beside[0], "data": beside[1]},
+        "noise": {
+            "baselines": noise.n_baselines,
+            "rms": noise.rms,
+            "rms_error": noise.rms_error,
+        },
+    }
+    if told_of_remains is not None:
+        told["remains"] = told_of_remains
+    if more:
+        told["residual"] = more
+    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
+
+
+def _remains(
+    sides: Sides, recipe: Recipe, monitor: Monitor
+) -> tuple[Remains | None, DrawnRemains | None, dict[str, Any] | None]:
+    """Remains under the data, those to be drawn if there surely are any, and what to tell."""
+    if sides.data_set is None:
+        return None, None, None
+    found, reason = measured_remains(sides.data_file, recipe.preparation)
+    if found is None:
+        monitor.note(f"remains of earlier pulses are not looked for: {reason}")
+        return None, None, told_of(None, None, reason)
+    drawn = drawn_like(found, sides.data_file, sides.data_set, recipe.preparation)
+    told = told_of(found, drawn, None)
+    if found.law is None:
+        return found, None, told
+    tenth = told["percent_above"]["10_kev"]["law"]
+    monitor.note(
+        f"remains of earlier pulses: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+        f"kHz, {tenth:.0f} % of the traces on more than 10 keV; translations are given them"
+    )
+    return found, drawn, told

@@ -1,0 +1,70 @@
+"""One training by the processes that torchrun starts: who may, and on which device each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import TrainingConfig
+from cpunet.training.team import ALONE, Launch, Team, launch, meeting
+
+
+@contextmanager
+def team_for(recipe: Recipe, device: str) -> Iterator[tuple[Team, str]]:
+    """Join the processes of torchrun, if it started any; give the team and the device.
+
+    An error inside ends all processes and is told by one of them, see
+    `cpunet.training.team.meeting`.
+
+    Parameters
+    ----------
+    recipe
+        What is to be trained.
+    device
+        As for `cpunet.jobs.training.train.train_run`; each process has the GPU of its local
+        rank.
+
+    Raises
+    ------
+    CpunetError
+        If the device is not there, the recipe is not trained by several processes, the batch
+        cannot be shared, or the processes do not find together.
+    """
+    launched = launch()
+    if launched is None:
+        yield ALONE, resolve_device(device)
+        return
+    with meeting(launched) as join:
+        _require_shareable(recipe, launched.team)
+        own = _own_device(resolve_device(device), launched)
+        with nullcontext() if own == "cpu" else torch.cuda.device(own):
+            yield join(own), own
+
+
+def _require_shareable(recipe: Recipe, team: Team) -> None:
+    if not isinstance(recipe.training, TrainingConfig):
+        raise CpunetError(
+            f"recipe {recipe.name}: takes a minute in one process; start it without torchrun"
+        )
+    team.share_of(recipe.training.batch_size)
+
+
+def _own_device(device: str, launched: Launch) -> str:
+    if device == "cpu":
+        return device
+    if device != "cuda":
+        raise CpunetError(
+            f"--device {device}: each process takes the GPU of its number; give cuda"
+        )
+    count, number = torch.cuda.device_count(), launched.local_rank
+    if number >= count:
+        raise CpunetError(
+            f"no GPU for process {number} of this computer, which has {count}; start torchrun "
+            f"with --nproc-per-node {count}"
+        )
+    return f"cuda:{number}"

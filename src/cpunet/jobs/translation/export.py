@@ -1,0 +1,277 @@
+"""A run in; its graph for other tools, its noise, and a card that says what they are, out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.response import describe_responses
+from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.outputs import refuse_existing
+from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.regular_files import read_text
+from cpunet.training.run_folder import read_info
+from cpunet.translation.backends import NetworkBackend, ResponseBackend
+from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
+from cpunet.translation.translator import IREN, REN, Translator
+from cpunet.yaml_files import MOST_BYTES, plain_json
+
+QUIET = Monitor()
+_LANGUAGES = {
+    "onnx": f"ONNX, opset {OPSET}",
+    "torchscript": "TorchScript (`torch.jit.load`)",
+    "torch-export": "torch.export program (`torch.export.load`)",
+}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files that were written, and the largest difference of a sample from the run."""
+
+    graph: Path
+    card: Path
+    noise: Path | None
+    difference: float
+
+
+def export_run(
+    run: Path,
+    out: Path,
+    form: Format,
+    *,
+    inverse: bool = False,
+    report: Path | None = None,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> Exported:
+    """Write a run's deterministic part for other tools, checked against the run.
+
+    Beside ``NAME.onnx`` (or whatever `out` is called) stand ``NAME.card.md``, which says what
+    was trained on what, what goes in and comes out and how noise is added, and for a readout
+    chain ``NAME.noise.npz`` with its noise spectrum.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    out
+        File to write.
+    form
+        ``"onnx"``, ``"torchscript"`` or ``"torch-export"``.
+    inverse
+        Export IREN instead of REN.
+    report
+        Folder of a report on this run, whose scores go into the card.
+    force
+        Replace existing files.
+    monitor
+        Told of the progress.
+
+    Raises
+    ------
+    CpunetError
+        If the run is not finished, the report has no scores, a package is missing or the
+        exported graph differs from the run.
+    """
+    card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
+    for path in (out, card, noise_file):
+        refuse_existing(path, run, report, force=force)
+    kind: type[Translator] = IREN if inverse else REN
+    translator = kind.load(run)
+    info = read_info(run)
+    scores = None if report is None else _scores(report)
+    has_noise = isinstance(translator.backend, ResponseBackend)
+    with monitor.stage("Exporting"), written_aside(out) as aside:
+        difference = export(graph_of(translator), aside, form)
+    if isinstance(translator.backend, ResponseBackend):
+        with written_aside(noise_file) as aside:
+            _write_noise(aside, translator.backend.chain.noise)
+    done = Exported(out, card, noise_file if has_noise else None, difference)
+    with written_aside(card) as aside:
+        aside.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
+    return done
+
+
+def _write_noise(path: Path, noise: BaselineNoise) -> None:
+    if noise.kinds is None or noise.lines is None or noise.shares is None:
+        raise ValueError("the noise of a run has kinds")
+    with path.open("wb") as stream:
+        np.savez(
+            stream,
+            continua=noise.kinds,
+            lines=noise.lines,
+            shares=noise.shares,
+            samples=noise.samples,
+            dt_ns=noise.dt_ns,
+        )
+
+
+def _scores(report: Path) -> Mapping[str, Any]:
+    path = report / "metrics.json"
+    try:
+        peaks = plain_json(read_text(path, MOST_BYTES))["peaks"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CpunetError(
+            f"{path}: no scores; give the folder that `cpunet validate` made"
+        ) from error
+    if not isinstance(peaks, dict):
+        raise CpunetError(f"{path}: no scores of peaks; validate again")
+    return peaks
+
+
+def _card(
+    run: Path,
+    translator: Translator,
+    info: Mapping[str, Any],
+    done: Exported,
+    form: Format,
+    scores: Mapping[str, Any] | None,
+) -> str:
+    parts = [
+        f"# {done.graph.name}\n",
+        f"{type(translator).__name__} of a cpunet run: "
+        + ("simulated → measured-like" if translator.part == "ren" else "measured → simulated")
+        + f" pulses. {_LANGUAGES[form]}; any batch size. Largest difference from the run in "
+        f"batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of the "
+        f"pulse height (refused above {TOLERANCE:g}).\n",
+        "## Made from\n",
+        *_origin(run, translator, info),
+        "## In and out\n",
+        *_interface(translator),
+        "## Noise\n",
+        *_noise(translator, done),
+        "## Valid for\n",
+        f"Pulses sampled every {translator.dt_ns:g} ns, of the detector and readout of the "
+        f"data. It was trained on {info['peak']}; what it does at other energies is for a "
+        "validation to say. Pile-up, saturated pulses and other samplings are not covered.\n",
+        "## Scores\n",
+        *_score_table(scores),
+    ]
+    return "\n".join(parts)
+
+
+def _origin(run: Path, translator: Translator, info: Mapping[str, Any]) -> list[str]:
+    lines = [f"* recipe {info['recipe']} (seed {info['seed']}), trained on {info['peak']}"]
+    for side, what in (("sim", "simulation"), ("data", "data")):
+        told = info.get(side)
+        if isinstance(told, dict) and "sha256" in told:
+            name = Path(str(told.get("file"))).name
+            lines.append(
+                f"* {what}: {name}, {told.get('used')} of {told.get('read')} pulses used, "
+                f"sha256 {str(told.get('sha256'))[:12]}…"
+            )
+    if imported := info.get("imported"):
+        names = ", ".join(Path(str(part.get("file"))).name for part in imported.values())
+        lines.append(f"* weights imported from {names}")
+    return [*lines, *_fitted(run, translator), ""]
+
+
+def _fitted(run: Path, translator: Translator) -> list[str]:
+    """What was found of a readout chain; of a network, what it was made as."""
+    generator = translator.recipe.generator
+    if not isinstance(generator, ResponseConfig):
+        return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
+    told = describe_responses([run])["runs"][0]
+    errors = told["parameter_errors"]
+    numbers = [
+        f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")
+        for name, value in told["parameters"].items()
+    ]
+    lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
+    if rms := told["values"].get("noise_rms_kev"):
+        lines.append(f"* noise of the data: {rms:.3g} keV RMS")
+    if isinstance(generator, HybridConfig):
+        settings = generator.residual.model_dump(mode="json")
+        lines.append(f"* network beside it: `{json.dumps(settings)}`")
+    return lines
+
+
+def _interface(translator: Translator) -> list[str]:
+    config = translator.recipe.preparation
+    n = config.length
+    simulated = (
+        f"`windows`, float32 (batch, {n}): simulated pulses, scaled to 0 … 1, sample "
+        f"{config.samples_before} the first after the last one below "
+        f"{config.align_fraction:g} of the maximum, padded with 0 before and with the last "
+        "value after."
+    )
+    measured = (
+        f"float32 (batch, {n}): sample {config.samples_before} aligned in the same way, the "
+        f"mean of the first {config.baseline_samples} samples 0, the mean of the last "
+        f"{config.tail_samples} {config.tail_level:g}"
+    )
+    forward = translator.part == "ren"
+    lines = [f"* in: {simulated if forward else f'`windows`, {measured}: measured pulses.'}"]
+    if isinstance(translator.backend, NetworkBackend):
+        channels = translator.backend.network.state_dict()["latent_mean.bias"].shape[0]
+        lines.append(f"* in: `epsilon`, float32 (batch, {channels}, {n // 16}), see Noise.")
+        lines.append(
+            "* out: `translated`, "
+            + (f"{measured}.\n" if forward else f"float32 (batch, {n}), as simulated pulses.\n")
+        )
+    elif forward:
+        lines.append(
+            f"* out: `records`, float32 (batch, {ROOM_BEFORE + n + ROOM_AFTER}): noise-free, "
+            f"per unit of charge; sample {ROOM_BEFORE} belongs to the window's first.\n\n"
+            f"Afterwards records are prepared as measured traces: {measured}."
+            "\n"
+        )
+    else:
+        lines.append(
+            f"* out: `pulses`, float32 (batch, {n}), within 0 … 1; afterwards scaled and "
+            "aligned as simulated pulses.\n"
+        )
+    return lines
+
+
+def _noise(translator: Translator, done: Exported) -> list[str]:
+    if isinstance(translator.backend, NetworkBackend):
+        return [
+            "The graph draws nothing. `epsilon` of independent N(0, 1) numbers gives a draw, "
+            "of zeros the latent mean. Electronic noise is not added.\n"
+        ]
+    if done.noise is None:
+        return ["None is added: the inverse removes it.\n"]
+    return [
+        f"The graph adds none. `{done.noise.name}` holds the electronic noise: spectra of "
+        "`continua` and `lines`, shape (kinds, bins), at the frequencies of a real FFT of "
+        "`samples` samples of `dt_ns`, as the mean square of a bin divided by `samples`, in "
+        "(prepared units × keV)², and the `shares` of the kinds. For one pulse: choose a kind "
+        "by its share, draw Gaussian noise of the continuum and sines of random phase for the "
+        "lines, divide by the energy in keV. Prepare the record, add the noise to all of it "
+        "(in the same units), then prepare again, so that alignment and scale suffer from "
+        "noise as those of data do.\n"
+    ]
+
+
+def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
+    if peaks is None:
+        return ["No report was given.\n"]
+    rows = [
+        "Overlap with data (IoU) in percent; the ceiling is that of data with data.\n",
+        "| peak | parameter | overlaps |",
+        "|---|---|---|",
+    ]
+    for peak, content in peaks.items():
+        if not isinstance(content, dict):
+            continue
+        for name, values in content.get("parameters", content).items():
+            iou = values.get("iou") if isinstance(values, dict) else None
+            if not isinstance(iou, dict):
+                continue
+            told = ", ".join(
+                f"{method} {score:.1f}"
+                for method, score in iou.items()
+                if isinstance(score, (int, float))
+            )
+            rows.append(f"| {peak} | {name.replace('_', ' ')} | {told} |")
+    return [*rows, ""]

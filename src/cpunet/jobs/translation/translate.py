@@ -1,0 +1,297 @@
+"""A file of pulses in, the translated file out, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.memory import give_back_large_arrays
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.common.output_lock import only_writer
+from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.jobs.translation.translation_blocks import (
+    NOISE_ROWS,
+    Counts,
+    interleaved,
+    noise_seed,
+    regrouped,
+)
+from cpunet.jobs.translation.translation_record import (
+    finished,
+    require_unchanged,
+    run_print,
+    source_print,
+    stamp,
+)
+from cpunet.jobs.translation.translation_writers import Writer, other_columns, writer_of
+from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.row_columns import RowColumns
+from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
+from cpunet.translation.learned_remains import NONE, wanted_remains
+from cpunet.translation.output_form import Formed, Normalised, OutputForm
+from cpunet.translation.to_adc import AdcForm, adc_scale
+from cpunet.translation.translator import IREN, REN, Translator
+
+QUIET = Monitor()
+BLOCK_SIZE = 4096  # pulses read at a time, fewer of long traces
+BLOCK_SAMPLES = 1 << 24
+
+
+class FileTranslation:
+    """A trained run and options, ready to translate files.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    options
+        How to translate.
+    device
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Raises
+    ------
+    CpunetError
+        If the run cannot be used, or does not say what the output in ADC needs.
+    """
+
+    def __init__(self, run: Path, options: TranslateOptions, device: str = "auto") -> None:
+        self.run, self.options = run, options
+        self.kind: type[Translator] = IREN if options.inverse else REN
+        self.translator = self.kind.load(run, resolve_device(device))
+        self.form = self._form()
+        self._print = run_print(run)
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of the output."""
+        if isinstance(self.form, AdcForm) and self.form.fills_in:
+            window = self.form.config.length
+            return [
+                f"warning: a network knows windows of {window} samples alone; beyond them "
+                "stand baseline and decay without noise"
+            ]
+        return []
+
+    def __call__(
+        self,
+        source: InputFile,
+        out: Path,
+        *,
+        noise_key: str | None = None,
+        resume: bool = False,
+        force: bool = False,
+        monitor: Monitor = QUIET,
+    ) -> dict[str, Any]:
+        """Translate a file; see `translate_file`.
+
+        Parameters
+        ----------
+        noise_key
+            Name that the noise depends on besides the seed, so that files differ; None for
+            noise as from Python.
+        """
+        refuse_inputs(out, self.run, *source.files)
+        with only_writer(out):
+            before = source_print(source)
+            options = asdict(self.options) | {"noise_key": noise_key}
+            made = {"source": before, "run": self._print, "options": options}
+            if resume and not force and out.exists():
+                return finished(out, made) | {"skipped": True}
+            refuse_existing(out, force=force)
+            pulses = self.opened(source)
+            others = other_columns(pulses, self.options, monitor.note)
+            attrs = {TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)}
+            writer = writer_of(pulses, out, self.form, self.options, attrs, force=force)
+            with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
+                counts = self._translate(pulses, noise_key, writer, others, advance)
+                self._require_some(source, counts)
+                require_unchanged(source, before)
+                told = counts.told(adc=self.options.adc is not None)
+                stamp(writer, made | {"counts": told, "cpunet": cpunet.__version__})
+            return told
+
+    def opened(self, source: InputFile) -> PulseSource:
+        """Open a file of pulses that this run can translate.
+
+        Raises
+        ------
+        CpunetError
+            If it cannot be read, is sampled otherwise or is of the other side.
+        """
+        pulses = source.open()
+        self._require_sampling(source, pulses)
+        require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
+        return pulses
+
+    def blocks(
+        self, pulses: Iterable[Pulses], noise_key: str | None = None
+    ) -> Iterator[Formed]:
+        """Translate pulses that come in blocks; the noise depends on their order alone."""
+        for number, block in enumerate(regrouped(pulses, NOISE_ROWS)):
+            yield self._formed(block, number, noise_key)
+
+    def _form(self) -> OutputForm:
+        adc = self.options.adc
+        remains = wanted_remains(self.translator, self.options.remains, raw=adc is not None)
+        if adc is None or not isinstance(self.translator, REN):
+            return Normalised(self.translator, remains)
+        scale = adc_scale(
+            self.run, self.translator, adc_per_kev=adc.adc_per_kev, baseline=adc.baseline
+        )
+        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains)
+
+    def _require_sampling(self, source: InputFile, pulses: PulseSource) -> None:
+        if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
+            raise CpunetError(
+                f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
+                f"{self.translator.dt_ns:g} ns; resample the pulses"
+            )
+
+    def _remedy(self, pulses: PulseSource) -> str:
+        """What to do with pulses of the other side."""
+        found = recorded_side(pulses)
+        if found is not None and "translated" in found.why:
+            return f"translate the {self.kind.takes} ones that they were made of"
+        return "leave out --inverse" if self.options.inverse else "give --inverse"
+
+    def _require_some(self, source: InputFile, counts: Counts) -> None:
+        if counts.translated:
+            return
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.rejections.items())
+        raise CpunetError(
+            f"{source.path}: none of {counts.read} pulses can be translated "
+            f"({reasons}); are these {self.translator.takes} pulses?"
+        )
+
+    def _translate(
+        self,
+        pulses: PulseSource,
+        noise_key: str | None,
+        writer: Writer,
+        others: RowColumns,
+        advance: Advance,
+    ) -> Counts:
+        give_back_large_arrays()
+        counts, start = Counts(), 0
+        times = self.options.realisations
+        for formed in self.blocks(_read(pulses, advance), noise_key):
+            columns: dict[str, Any] = {"rejection": (formed.codes, "")}
+            if formed.remains_kev is not None:
+                columns["remains_kev"] = (formed.remains_kev, "keV")
+            given = len(formed.codes) // (times or 1)
+            if times is not None:
+                columns["realisation"] = (np.tile(np.arange(times), given), "")
+            writer.append(formed.pulses, columns, others.read(start, given, times or 1))
+            counts.add(formed)
+            start += given
+        if pulses.n_pulses not in (None, start):
+            raise CpunetError(
+                f"{pulses.path}: {start} pulses read of {pulses.n_pulses}; it changed while "
+                "it was read, so translate it once it is complete"
+            )
+        return counts
+
+    def _formed(self, block: Pulses, number: int, noise_key: str | None) -> Formed:
+        seeds = [
+            noise_seed(self.options.seed, noise_key, number, realisation)
+            for realisation in range(self.options.realisations or 1)
+        ]
+        return interleaved(
+            [
+                self.form(
+                    block, noise=self.options.noise, generator=self.translator.seeded(seed)
+                )
+                for seed in seeds
+            ]
+        )
+
+
+def translate_file(
+    run: Path,
+    source: InputFile,
+    out: Path,
+    *,
+    inverse: bool = False,
+    noise: bool = True,
+    seed: int = 0,
+    table: str | None = None,
+    append_column: str | None = None,
+    realisations: int | None = None,
+    adc: Adc | None = None,
+    remains: str = NONE,
+    device: str = "auto",
+    resume: bool = False,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Translate all pulses of a file, block by block, keeping their rows and other columns.
+
+    Pulses that cannot be translated stay as rows of NaN (of 0 in ADC); the column
+    ``rejection`` says why (0: translated), and the counts are returned.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    source
+        Simulated pulses, or measured ones for `inverse`.
+    out
+        LH5 file to write.
+    inverse
+        Apply IREN (data → simulation-like) instead of REN.
+    noise, seed
+        Add noise, drawn with this seed, or none.
+    table
+        Where in the LH5 file to put the pulses; ``geds/ren`` or ``geds/iren`` if None.
+    append_column
+        Copy the file and add the pulses to the table that was read, as a column of this name.
+    realisations
+        Draw the noise so many times for each pulse: its row is repeated, and the column
+        ``realisation`` counts.
+    adc
+        Raw traces in ADC counts instead of normalised windows.
+    remains
+        Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
+        behind the data's quality cuts), ``"none"``, or a rate in kHz.
+    resume
+        Leave an output as it is that was made of this source with this run and these options.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Returns
+    -------
+    dict
+        ``read``, ``translated`` and ``rejections`` (counts of rows by reason); in ADC also
+        ``saturated``, and ``skipped`` for an output that was there.
+
+    Raises
+    ------
+    CpunetError
+        If run, source or output cannot be used, options contradict each other, no pulse can be
+        translated, the source changes meanwhile, or another process writes the same output.
+    """
+    options = TranslateOptions(
+        inverse, noise, seed, table, append_column, realisations, adc, remains
+    )
+    translation = FileTranslation(run, options, device)
+    for note in translation.notes:
+        monitor.note(note)
+    return translation(source, out, resume=resume, force=force, monitor=monitor)
+
+
+def _read(pulses: PulseSource, advance: Advance) -> Iterator[Pulses]:
+    """Blocks of a file that fit in memory, whatever the length of its traces."""
+    for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
+        yield block
+        advance(len(block))

@@ -1,0 +1,243 @@
+"""Many files of pulses into a folder, in several processes, to be gone on with."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.translation.file_workers import Relay, in_processes
+from cpunet.jobs.translation.translate import FileTranslation
+from cpunet.jobs.translation.translate_options import TranslateOptions
+from cpunet.outputs import refuse_existing, refuse_inputs
+
+QUIET = Monitor()
+DEFAULTS = TranslateOptions()
+OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
+
+Told = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Task:
+    source: InputFile
+    out: Path
+
+
+def translate_files(
+    run: Path,
+    sources: Sequence[InputFile],
+    out: Path,
+    options: TranslateOptions = DEFAULTS,
+    *,
+    jobs: int = 1,
+    device: str = "auto",
+    resume: bool = False,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> Told:
+    """Translate files into files of the same names in a folder.
+
+    What comes out depends on the seed and on a file's name, neither on the number of processes
+    nor on the other files.  A file that cannot be translated does not keep the others from
+    being.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    sources
+        Files of pulses.
+    out
+        Folder; made if it is not there.
+    options
+        How to translate, see `cpunet.jobs.translation.translate.translate_file`.
+    jobs
+        Number of processes, with a thread each.
+    device
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    resume
+        Skip files whose outputs are there, made of the same sources in the same way.
+    force
+        Replace outputs that are there.
+    monitor
+        Told of the progress.
+
+    Returns
+    -------
+    dict
+        ``files`` and ``skipped`` (numbers of files), and the counts of all their rows.
+
+    Raises
+    ------
+    CpunetError
+        Before anything is read, if the run cannot be used, or outputs are there (without
+        `resume` and `force`) or would have the same names; in the end, if files failed.
+    """
+    tasks = [_Task(source, out / _name(source.path)) for source in sources]
+    read = [run, *(given for source in sources for given in source.files)]
+    if out.exists() and not out.is_dir():
+        raise CpunetError(f"{out}: is a file, but several outputs need a folder")
+    for task in tasks:
+        refuse_inputs(task.out, *read)
+    _require_apart(tasks, resume=resume, force=force)
+    make = _Maker(run, options, device, resume, force)
+    for note in FileTranslation(run, options, device).notes:
+        monitor.note(note)
+    told: list[Told] = []
+    failed: list[str] = []
+    with (
+        monitor.stage("Translating", _rows(sources)) as advance,
+        closing(_results(make, tasks, jobs, advance, monitor.note)) as results,
+    ):
+        for number, result in results:
+            if isinstance(result, CpunetError):
+                failed.append(_naming(tasks[number], result))
+                monitor.note(f"error: {failed[-1]}")
+            else:
+                told.append(result)
+    if failed:
+        done = f"; {len(told)} are in {out}" if told else ""
+        raise CpunetError(
+            f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{done}; "
+            "go on with --resume"
+        )
+    return _summed(told)
+
+
+def expanded(names: Sequence[Path]) -> list[Path]:
+    """File names, those with ``*``, ``?`` or ``[`` replaced by the files that fit them.
+
+    Raises
+    ------
+    CpunetError
+        If no file fits.
+    """
+    found: list[Path] = []
+    for name in names:
+        if name.exists() or not glob.has_magic(str(name)):
+            found.append(name)
+            continue
+        fitting = sorted(glob.glob(str(name), recursive=True))  # noqa: PTH207 (absolute ones too)
+        if not fitting:
+            raise CpunetError(f"{name}: no such files; check the name")
+        found += map(Path, fitting)
+    return found
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes in each process what translates a file."""
+
+    run: Path
+    options: TranslateOptions
+    device: str
+    resume: bool
+    force: bool
+
+    def __call__(self) -> Callable[[_Task, Monitor], Told]:
+        # a network's last bits depend on the number of threads, and processes share the cores
+        torch.set_num_threads(1)
+        translation = FileTranslation(self.run, self.options, self.device)
+
+        def work(task: _Task, monitor: Monitor) -> Told:
+            return translation(
+                task.source,
+                task.out,
+                noise_key=task.out.name,
+                resume=self.resume,
+                force=self.force,
+                monitor=monitor,
+            )
+
+        return work
+
+
+def _results(
+    make: _Maker,
+    tasks: Sequence[_Task],
+    jobs: int,
+    advance: Advance,
+    note: Callable[[str], None],
+) -> Generator[tuple[int, Told | CpunetError]]:
+    if min(jobs, len(tasks)) > 1:
+        yield from in_processes(make, tasks, jobs, advance, note)
+        return
+    with _threads_kept():
+        work = make()
+        for number, task in enumerate(tasks):
+            try:
+                yield number, work(task, Relay(advance, note))
+            except CpunetError as error:
+                yield number, error
+
+
+@contextmanager
+def _threads_kept() -> Iterator[None]:
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _name(path: Path) -> str:
+    return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
+
+
+def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None:
+    several = [name for name, n in Counter(task.out.name for task in tasks).items() if n > 1]
+    if several:
+        raise CpunetError(
+            f"{len(several)} names occur twice among the files, as {several[0]}; "
+            "translate these into folders of their own"
+        )
+    shared = next((t.source.energy for t in tasks if ":" in (t.source.energy or "")), None)
+    if shared is not None and len(tasks) > 1:
+        raise CpunetError(
+            f"--energy {shared} belongs to one file of pulses, not to {len(tasks)}; "
+            "translate them one by one"
+        )
+    for task in tasks:
+        if not resume:
+            refuse_existing(task.out, force=force)
+
+
+def _rows(sources: Sequence[InputFile]) -> int | None:
+    """Pulses of all files; None if one does not tell."""
+    total = 0
+    for source in sources:
+        try:
+            n = source.open().n_pulses
+        except CpunetError:
+            n = 0  # it will fail in its turn
+        if n is None:
+            return None
+        total += n
+    return total
+
+
+def _naming(task: _Task, error: CpunetError) -> str:
+    """The error, with the file that it belongs to."""
+    text = str(error)
+    named = str(task.source.path) in text or str(task.out) in text
+    return text if named else f"{task.source.path}: {text}"
+
+
+def _summed(told: Sequence[Told]) -> Told:
+    rejections: Counter[str] = Counter()
+    for one in told:
+        rejections.update(one.get("rejections", {}))
+    names = ("read", "translated", "saturated")
+    sums = {n: sum(one[n] for one in told) for n in names if all(n in one for one in told)}
+    skipped = sum(bool(one.get("skipped")) for one in told)
+    return {"files": len(told), "skipped": skipped, **sums, "rejections": dict(rejections)}

@@ -1,0 +1,280 @@
+"""A pulse-shape library in, the same library behind the learned electronics out."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.pulses.preparation import Rejection
+from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.pulses.reading.source import BLOCK_BYTES, MOST_SAMPLES
+from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
+from cpunet.translation.translator import REN
+
+QUIET = Monitor()
+WAVEFORM = re.compile(r"waveform_\d{3}_deg")
+TEMPLATES_AT_A_TIME = 1024
+KEPT = 256  # templates to measure the linearity with
+# A template of charge ends near its highest value; one of current, or aligned at it, does not.
+LEAST_END = 0.5
+
+
+@dataclass
+class _Tally:
+    """What became of the templates, and some of them."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    libraries: list[str] = field(default_factory=list)
+    not_ending: int = 0
+    kept: list[FloatArray] = field(default_factory=list)
+    translate: TemplateTranslator | None = None
+
+    def add(
+        self, templates: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], seed: int
+    ) -> None:
+        known = codes != Rejection.NAN
+        moving = known & templates.any(axis=1)
+        self.counts["templates"] += len(codes)
+        self.counts["outside"] += int(np.isnan(templates).all(axis=1).sum())
+        self.counts["damaged"] += int((~known & ~np.isnan(templates).all(axis=1)).sum())
+        for code in codes[known & (codes != Rejection.ACCEPTED)]:
+            self.counts[Rejection(int(code)).label] += 1
+        good = np.flatnonzero(moving & (codes == Rejection.ACCEPTED))
+        self.counts["translated"] += int((known & (codes == Rejection.ACCEPTED)).sum())
+        highest = np.abs(templates[good]).max(axis=1)
+        self.not_ending += int((np.abs(templates[good, -1]) < LEAST_END * highest).sum())
+        self.counts["moving"] += len(good)
+        few = np.random.default_rng(seed).permutation(good)[:8]
+        self.kept.append(np.asarray(templates[few], np.float32))
+
+
+def translate_library(
+    run: Path,
+    source: Path,
+    out: Path,
+    *,
+    currents: bool = False,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Translate every template of a library without noise; all else is copied as it is.
+
+    A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
+    charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
+    `cpunet.jobs.simulation.pulse_shape_library.write_library` make them; a file may hold
+    several, at any depth.  Names, units, shapes, types and the time axis stay; a missing
+    ``t0``, without which reboost cannot read a library, becomes 0.  Templates with NaN stay
+    as they are.
+    Files are streamed.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    source
+        LH5 file of one library or more.
+    out
+        LH5 file to write.
+    currents
+        Write currents instead, as `reboost.hpge.psd.maximum_current` takes them: in 1/ns,
+        averaged as for a current amplitude, the highest sample at time 0, which ``t0`` then
+        counts from; ``drift_time_*_deg`` become the times of that sample, so that a template
+        shifted by its own stands where its pulse was.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Returns
+    -------
+    dict
+        ``libraries`` (their paths), ``templates``, ``translated``, ``outside`` (all NaN),
+        ``rejections`` (counts by reason) and ``linearity`` (see
+        `cpunet.translation.library_mode.Linearity`).
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no library of charge templates, or the run cannot translate it.
+    """
+    refuse_existing(out, run, source, force=force)
+    ren = REN.load(run, resolve_device(device))
+    tally = _Tally()
+    with opened(source) as given:
+        _require_whole(given, source, set())
+        paths = _libraries(given)
+        if not paths:
+            raise CpunetError(
+                f"{source}: no pulse-shape library (no array waveform_000_deg or the like); "
+                "give a struct{r, z, dt, t0, waveform_000_deg}"
+            )
+        total = sum(_n_templates(given, path, source) for path in paths)
+    with opened(source) as given, written_aside(out) as aside:
+        with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
+            _copy(given, made.h5, _Job(ren, tally, source, currents, advance))
+        _check(tally, source)
+        assert tally.translate is not None
+        apart = linearity(tally.translate, np.concatenate(tally.kept)[-KEPT:])
+    numbers = {"templates", "translated", "outside", "moving"}
+    return {
+        "libraries": paths,
+        "templates": tally.counts["templates"],
+        "translated": tally.counts["translated"],
+        "outside": tally.counts["outside"],
+        "rejections": {k: n for k, n in tally.counts.items() if k not in numbers and n},
+        "linearity": asdict(apart),
+    }
+
+
+def _require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
+    """Refuse links that lead nowhere or in circles, and arrays that are mere claims."""
+    info = h5py.h5o.get_info(group.id)
+    if (info.fileno, info.addr) in seen:
+        raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
+    seen.add((info.fileno, info.addr))
+    for name in group:
+        item = group.get(name)
+        if item is None:
+            raise CpunetError(f"{source}: {group.name}: link {name} leads nowhere; remove it")
+        if isinstance(item, h5py.Group):
+            _require_whole(item, source, seen)
+        elif isinstance(item, h5py.Dataset):
+            require_stored(source, item)
+
+
+def _libraries(file: h5py.File) -> list[str]:
+    """Paths of all groups with templates."""
+    found: set[str] = set()
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        group, _, last = name.rpartition("/")
+        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
+            found.add(group)
+
+    file.visititems(visit)
+    return sorted(found)
+
+
+def _n_templates(file: h5py.File, path: str, source: Path) -> int:
+    """Number of templates; refuses a library that is not of the schema."""
+    library = file[path or "/"]
+    where = f"{source}: {path or '/'}"
+    if missing := sorted({"r", "z", "dt"} - set(library)):
+        raise CpunetError(
+            f"{where}: no {missing[0]} beside the waveforms; complete the library"
+        )
+    for name in ("r", "z"):
+        if not is_column(library[name]) or library[name].ndim != 1:
+            raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
+    total = 0
+    for name in filter(WAVEFORM.fullmatch, library):
+        if not isinstance(library[name], h5py.Dataset):
+            raise CpunetError(f"{where}/{name}: is no array; complete the library")
+        shape = library[name].shape
+        expected = (len(library["r"]), len(library["z"]))
+        if library[name].dtype.kind not in "iuf":
+            raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
+        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MOST_SAMPLES:
+            raise CpunetError(
+                f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
+                "(r, z, samples)"
+            )
+        total += shape[0] * shape[1]
+    _dt_ns(library, where)
+    return total
+
+
+def _dt_ns(library: h5py.Group, where: str) -> float:
+    dt = library["dt"]
+    if not is_column(dt) or dt.size != 1:
+        raise CpunetError(f"{where}: dt is no number; complete the library")
+    units = text_attribute(dt, "units")
+    if units not in TIME_UNITS:
+        raise CpunetError(
+            f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
+        )
+    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
+    if not 1e-3 <= value <= 1e9:
+        raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
+    return value
+
+
+@dataclass(frozen=True)
+class _Job:
+    ren: REN
+    tally: _Tally
+    source: Path
+    currents: bool
+    advance: Advance
+
+
+def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
+    """Copy a group with all below it, translating the templates of libraries."""
+    for key, value in given.attrs.items():
+        made.attrs[key] = value
+    angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
+    replaced = {f"waveform_{angle}" for angle in angles}
+    if angles:
+        where = f"{job.source}: {given.name.strip('/') or '/'}"
+        job.tally.translate = TemplateTranslator(job.ren, _dt_ns(given, where))
+        if job.currents:
+            replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
+    for name, item in given.items():
+        if isinstance(item, h5py.Group):
+            _copy(item, made.create_group(name), job)
+        elif name not in replaced:
+            given.copy(name, made, name)
+    for angle in sorted(angles):
+        item = given[f"waveform_{angle}"]
+        arrays = (current_arrays if job.currents else charge_arrays)(item, made, angle)
+        _translate(item, arrays, job)
+    if angles and "t0" not in made:
+        add_t0(given["dt"], made, BEFORE_NS if job.currents else 0.0)
+        made.attrs["datatype"] = f"struct{{{','.join(made)}}}"
+
+
+def _translate(given: h5py.Dataset, made: Arrays, job: _Job) -> None:
+    translate = job.tally.translate
+    assert translate is not None
+    n_r, n_z, n_samples = given.shape
+    step = max(TEMPLATES_AT_A_TIME // n_z, given.chunks[0] if given.chunks else 1)
+    step = min(step, max(1, BLOCK_BYTES // (4 * n_z * n_samples)))
+    for first in range(0, n_r, step):
+        rows = slice(first, min(first + step, n_r))
+        templates = given[rows].reshape(-1, n_samples)
+        results, codes = translate(templates)
+        # what holds NaN is outside the crystal, and stays as it is
+        unknown = codes == Rejection.NAN
+        results[unknown] = templates[unknown]
+        made.put(rows, results, translate.dt_ns)
+        job.tally.add(templates, codes, seed=first)
+        job.advance(len(templates))
+
+
+def _check(tally: _Tally, source: Path) -> None:
+    if not tally.counts["moving"]:
+        raise CpunetError(
+            f"{source}: none of {tally.counts['templates']} templates can be translated; are "
+            "they charge pulses?"
+        )
+    if 2 * tally.not_ending > tally.counts["moving"]:
+        raise CpunetError(
+            f"{source}: {tally.not_ending} of {tally.counts['moving']} templates end below "
+            "half of their maximum: these are currents, or behind electronics already; give "
+            "the library of charge pulses"
+        )

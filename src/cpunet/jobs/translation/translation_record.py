@@ -1,0 +1,138 @@
+"""What a translated file says of how it was made, and whether it is the one that is wanted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.training.run_folder import RECIPE, WEIGHTS
+from cpunet.yaml_files import plain_json
+
+RECORD = "cpunet_translation"  # attribute of the file
+
+Record = dict[str, Any]
+
+
+class Stamped(Protocol):
+    """A file in the making."""
+
+    def stamp(self, name: str, text: str) -> None:
+        """Set an attribute of the file."""
+        ...
+
+
+def source_print(source: InputFile) -> Record:
+    """Sizes and times of change of the files that are read.
+
+    Raises
+    ------
+    CpunetError
+        If one is not there.
+    """
+    paths = [source.path]
+    elsewhere = (source.energy or "").rpartition(":")[0]
+    if elsewhere and Path(elsewhere).is_file():
+        paths.append(Path(elsewhere))
+    prints = []
+    for path in paths:
+        try:
+            stat = path.stat()
+        except OSError:
+            raise CpunetError(f"{path}: no such file; check the name") from None
+        prints.append({"name": path.name, "bytes": stat.st_size, "changed": stat.st_mtime_ns})
+    return {
+        "files": prints,
+        "table": source.table,
+        "energy": source.energy,
+        "kev_per_adc": source.kev_per_adc,
+        "dt_ns": source.dt_ns,
+    }
+
+
+def require_unchanged(source: InputFile, before: Record) -> None:
+    """Raise a `CpunetError` if a file changed since `before` was taken."""
+    if source_print(source) != before:
+        raise CpunetError(
+            f"{source.path}: changed while it was read; translate it once it is complete"
+        )
+
+
+def run_print(run: Path) -> str:
+    """Fingerprint of a run's weights and recipe."""
+    digest = hashlib.sha256()
+    for name in (WEIGHTS, RECIPE):
+        try:
+            digest.update((run / name).read_bytes())
+        except OSError as error:
+            raise CpunetError(f"{run / name}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()
+
+
+def finished(out: Path, wanted: Record) -> dict[str, Any]:
+    """Counts of an output that is there already and was made as wanted.
+
+    Parameters
+    ----------
+    out
+        A translated file.
+    wanted
+        ``source``, ``run`` and ``options``.
+
+    Raises
+    ------
+    CpunetError
+        If it says nothing of how it was made, or was made of another source, with another
+        run or with other options.
+    """
+    found = _read(out)
+    for what, value in wanted.items():
+        if found.get(what) == value:
+            continue
+        told = f"another {what}"
+        if what == "options" and isinstance(found.get(what), dict):
+            other = [name for name in value if found[what].get(name, ...) != value[name]]
+            told = f"other options ({', '.join(other)})"
+        raise CpunetError(f"{out}: was made with {told}; choose another --out or give --force")
+    counts = found.get("counts")
+    if not isinstance(counts, dict) or not all(map(_is_count, _counted(counts))):
+        raise CpunetError(
+            f"{out}: does not say how many pulses it holds; choose another --out or give "
+            "--force"
+        )
+    return dict(counts)
+
+
+def _counted(counts: Mapping[str, Any]) -> list[Any]:
+    """What must be whole numbers among the counts of a translation."""
+    rejections = counts.get("rejections", {})
+    reasons = rejections.values() if isinstance(rejections, dict) else [None]
+    optional = [counts[name] for name in ("saturated",) if name in counts]
+    return [counts.get("read"), counts.get("translated"), *optional, *reasons]
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def stamp(file: Stamped, record: Record) -> None:
+    """Write into a file how it was made."""
+    file.stamp(RECORD, json.dumps(record))
+
+
+def _read(out: Path) -> Record:
+    try:
+        with opened(out) as file:
+            record = plain_json(file.attrs[RECORD])
+    except (CpunetError, LookupError, ValueError, TypeError):
+        record = None
+    if not isinstance(record, dict):
+        raise CpunetError(
+            f"{out}: is no translation that is finished; choose another --out or give --force"
+        )
+    return record

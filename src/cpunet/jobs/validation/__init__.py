@@ -1,0 +1,1 @@
+"""How well a run does: scores, baseline methods, figures, reports, comparisons."""

@@ -1,0 +1,89 @@
+"""Energies of a validation: peaks, the sidebands beside them, and ranges of continuum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cpunet.analysis.range_survival import survival_by_range
+from cpunet.jobs.common.inputs import InputSet
+from cpunet.jobs.validation.translations import Translations
+from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.recipes.schema import Recipe
+
+Range = tuple[float, float]
+
+CUT_PEAK = "DEP"  # by which A/E cuts are set
+
+
+def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelection:
+    """Select named peaks and ranges, and with them all sidebands and continua."""
+    chosen = parse_selection(",".join(names), recipe.peaks)
+    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    more += recipe.scores.continuum_kev.values()
+    return EnergySelection(
+        chosen.name, chosen.peaks, chosen.chosen, (*chosen.ranges_kev, *more)
+    )
+
+
+def range_survivals(
+    sim: InputSet,
+    data: InputSet,
+    made: Translations,
+    ae_survival: Mapping[str, Any],
+    recipe: Recipe,
+) -> dict[str, Any]:
+    """Survival of lines, less what their sidebands say is under them, and of continua.
+
+    Parameters
+    ----------
+    sim, data
+        Prepared pulses of all energies of `validation_selection`.
+    made
+        What the methods make of the simulated ones.
+    ae_survival
+        Cuts by method, see `cpunet.jobs.validation.pulse_tests.survivals`.
+    recipe
+        With the ranges.
+
+    Returns
+    -------
+    dict
+        As `survival_by_range`, or ``missing`` and the reason.
+    """
+    cuts = ae_survival.get(CUT_PEAK, {}).get("cut")
+    if not cuts:
+        reason = ae_survival.get("missing", f"there are no events of the {CUT_PEAK}")
+        return {"missing": f"there is no A/E cut: {reason}"}
+    windows = {"raw": sim.prepared.pulses.waveforms, **made.noisy}
+    windows["data"] = data.prepared.pulses.waveforms
+    methods = [method for method in windows if method in cuts]
+    amplitudes: dict[str, Values] = {m: current_amplitude(windows[m]) for m in methods}
+    sim_kev, data_kev = (side.prepared.pulses.energy_kev for side in (sim, data))
+    return dict(
+        survival_by_range(
+            amplitudes,
+            {method: data_kev if method == "data" else sim_kev for method in methods},
+            {m: np.nan if cuts[m] is None else cuts[m] for m in methods},
+            {name: line for name, line in _lines(recipe).items() if name != CUT_PEAK},
+            recipe.scores.continuum_kev,
+        )
+    )
+
+
+def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
+    """Range and sidebands of each peak."""
+    near, far = recipe.scores.sideband_kev
+    return {
+        name: (
+            (peak.energy_kev - peak.half_width_kev, peak.energy_kev + peak.half_width_kev),
+            [
+                (peak.energy_kev - far, peak.energy_kev - near),
+                (peak.energy_kev + near, peak.energy_kev + far),
+            ],
+        )
+        for name, peak in recipe.peaks.items()
+    }

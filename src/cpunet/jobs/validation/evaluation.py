@@ -1,0 +1,222 @@
+"""A run applied to simulated and measured pulses, and all that is compared of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cpunet
+from cpunet.analysis.linearity import linearity_residual
+from cpunet.analysis.verdicts import summaries, verdict_table
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.inputs import (
+    InputFile,
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_same_sampling,
+)
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.truth import Responses
+from cpunet.jobs.validation.energy_ranges import range_survivals, validation_selection
+from cpunet.jobs.validation.peak_details import PeakDetails, peak_details
+from cpunet.jobs.validation.peak_sets import PeakSets, peak_sets
+from cpunet.jobs.validation.pulse_tests import survivals
+from cpunet.jobs.validation.rivals import fit_rivals
+from cpunet.jobs.validation.scoring import ByMethod, score_peak
+from cpunet.jobs.validation.translations import translate_all
+from cpunet.pulses.peaks import parse_selection
+from cpunet.training.loop import Record
+from cpunet.training.run_folder import read_info, read_losses
+from cpunet.translation.translator import IREN, REN
+
+PAIRS = 200  # of pulses whose sums are translated, in the test of linearity
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What figures and report are made of.
+
+    Parameters
+    ----------
+    ren, iren
+        The run's translators.
+    info, losses
+        Its provenance and its training records.
+    sim, data
+        Prepared pulses of both sides.
+    sets, values, details
+        By peak: pulses; parameters by method; further comparisons.  The latter two are
+        there for peaks that are scored.
+    metrics
+        The content of ``metrics.json``.
+    """
+
+    ren: REN
+    iren: IREN
+    info: Mapping[str, Any]
+    losses: list[Record]
+    sim: InputSet
+    data: InputSet
+    sets: list[PeakSets]
+    values: Mapping[str, ByMethod]
+    details: Mapping[str, PeakDetails]
+    metrics: dict[str, Any]
+
+
+def evaluate(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    *,
+    truth: Path | None,
+    rivals: bool,
+    seed: int,
+    device: str,
+    monitor: Monitor,
+) -> Evaluation:
+    """Translate, compare and judge; see `cpunet.jobs.validation.validate.validate_run`.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, or no peak can be scored.
+    """
+    info = read_info(run)
+    ren = REN.load(run, resolve_device(device))
+    iren = IREN.load(run, resolve_device(device))
+    recipe = ren.recipe
+    names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
+    sim_set, data_set = _load_both(ren, sim, data, names, monitor)
+    responses = None if truth is None else Responses(truth, sim_set)
+    others = fit_rivals(
+        sim_set,
+        data_set,
+        data,
+        parse_selection(str(info["peak"]), recipe.peaks),
+        recipe,
+        remains=ren.remains,
+        fitted=rivals,
+        monitor=monitor,
+    )
+    made = translate_all(ren, others, sim_set, responses, seed, monitor)
+    sets = [peak_sets(name, recipe, sim_set, data_set, made) for name in names]
+    values: dict[str, ByMethod] = {}
+    peaks: dict[str, Any] = {}
+    with monitor.stage("Scoring", len(sets)) as advance:
+        for peak in sets:
+            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, seed)
+            advance(1)
+    if all("missing" in scores for scores in peaks.values()):
+        raise CpunetError(
+            f"{data_set.path}: no peak has pulses on both sides; "
+            "check the calibration (--kev-per-adc, --data-energy)"
+        )
+    scored = [peak for peak in sets if values[peak.name]]
+    with monitor.stage("Comparing in detail", len(scored)) as advance:
+        details = {}
+        for peak in scored:
+            details[peak.name] = peak_details(
+                peak, values[peak.name], recipe.scores.bootstraps, seed
+            )
+            advance(1)
+    kept = survivals(values, seed)
+    metrics = {
+        "compared": _compared(run, info, sim_set, data_set),
+        "peaks": peaks,
+        "ae_survival": kept,
+        "ae_details": {
+            "survival by energy range": range_survivals(sim_set, data_set, made, kept, recipe),
+            "A/E and drift time together": {
+                name: of_peak.plane_scores() for name, of_peak in details.items()
+            },
+            "A/E against drift time": {
+                name: of_peak.ae_against_time for name, of_peak in details.items()
+            },
+        },
+        "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
+        "noise": {name: _noise(peaks[name]["noise"]) for name in details},
+        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
+        "rivals": {
+            "fits": {name: rival.describe() for name, rival in others.methods.items()},
+            "missing": others.missing,
+        },
+        "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
+        | {"peak": info["peak"]},
+        "remains": (info.get("fit") or {}).get("remains"),
+        "rejections": {
+            "sim": sim_set.prepared.rejections,
+            "data": data_set.prepared.rejections,
+        },
+    }
+    metrics["verdicts"] = {"summary": _summary(metrics), "table": verdict_table(metrics)}
+    return Evaluation(
+        ren, iren, info, read_losses(run), sim_set, data_set, sets, values, details, metrics
+    )
+
+
+def _load_both(
+    ren: REN, sim: InputFile, data: InputFile, names: list[str], monitor: Monitor
+) -> tuple[InputSet, InputSet]:
+    selection = validation_selection(names, ren.recipe)
+    sim_set = load_simulated(sim, ren.recipe, selection, monitor)
+    data_set = load_measured(data, ren.recipe, selection, monitor)
+    require_same_sampling(sim_set, data_set)
+    if not np.isclose(sim_set.dt_ns, ren.dt_ns):
+        raise CpunetError(
+            f"{sim_set.path}: sampled every {sim_set.dt_ns:g} ns, the run was trained on "
+            f"{ren.dt_ns:g} ns; resample the pulses"
+        )
+    return sim_set, data_set
+
+
+def _compared(
+    run: Path, info: Mapping[str, Any], sim: InputSet, data: InputSet
+) -> dict[str, Any]:
+    """What a reader must know of the comparison before its scores."""
+    fit = info.get("fit") or {}
+    compared = {
+        "simulation": str(sim.path),
+        "data": str(data.path),
+        "run": str(run),
+        "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
+        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
+        f"{str(info.get('started', ''))[:10]}",
+    }
+    if fit.get("verdict"):
+        compared["fit"] = str(fit["verdict"])
+    return compared | {"scored with": f"cpunet {cpunet.__version__}"}
+
+
+def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
+    """How far the translation of a sum is from the sum of translations."""
+    found = linearity_residual(
+        lambda windows: ren.apply(windows, noise=False),
+        peak.raw.waveforms,
+        np.random.default_rng(seed),
+        PAIRS,
+        edge_samples=ren.recipe.scores.edge_samples,
+    )
+    return {"peak": peak.name} | found
+
+
+def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:
+    """Size of the noise by method, without the spectrum."""
+    sizes, judged = ("n", "samples", "rms", "rms_std"), ("rms_ratio", "sigma")
+    shown = (*sizes, *judged, "worst_band_sigma", "spectrum_sigma", "missing")
+    return {
+        method: {key: found[key] for key in shown if key in found}
+        for method, found in spectra.items()
+        if method != "frequency_mhz"
+    }
+
+
+def _summary(metrics: Mapping[str, Any]) -> list[str]:
+    """What is said first: the translation, peak by peak."""
+    found = summaries(metrics)
+    return [of_peak["ren"] for of_peak in found.values() if "ren" in of_peak]

@@ -1,0 +1,198 @@
+"""Single figures of a validation as files for a paper or a talk."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from cpunet.analysis.report import DPI, REPORT
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.figure_store import STORE, made_of, read_drawings, write_drawings
+from cpunet.jobs.validation.figures import LOSSES, Drawing, drawings, figure_names, of_losses
+from cpunet.outputs import made_here, refuse_existing
+from cpunet.training.run_folder import read_info, read_losses, read_recipe
+
+QUIET = Monitor()
+FORMATS = (".png", ".pdf", ".svg")
+
+
+def draw_figures(
+    folder: Path,
+    names: list[str],
+    sim: InputFile | None,
+    data: InputFile | None,
+    out: Path,
+    *,
+    suffix: str = ".png",
+    truth: Path | None = None,
+    rivals: bool = True,
+    seed: int = 0,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> list[Path]:
+    """Draw figures by name into a folder.
+
+    They are drawn of what a validation stored in its report.  Of a run without a report, the
+    pulses are scored once and the results stored in its folder for the next time.
+
+    Parameters
+    ----------
+    folder
+        Report folder of a validation, or folder of a training run.
+    names
+        As the report calls them, ``"SEP drift_time"`` or ``"SEP_drift_time"``, or a part of
+        that: ``"single pulse"`` draws that of all peaks.
+    sim, data
+        Simulated and measured pulses, for a run; not needed where results of a run are stored,
+        and for its losses.
+    out
+        Folder, made if need be.
+    suffix
+        ``.png``, ``.pdf`` or ``.svg``.
+    truth, rivals, seed, device, monitor
+        As for `cpunet.jobs.validation.validate.validate_run`.
+    force
+        Replace existing files.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    CpunetError
+        If a name fits no figure (the message lists them), pulses are needed and not given,
+        or a file exists.
+    """
+    if suffix not in FORMATS:
+        raise CpunetError(f"format {suffix!r} is not known; use {', '.join(FORMATS)}")
+    read = [folder, truth, *(file for side in (sim, data) if side for file in side.files)]
+
+    def files_of(known: Collection[str]) -> dict[str, Path]:
+        chosen = chosen_names(names, known)
+        files = {name: out / f"{name.replace(' ', '_')}{suffix}" for name in chosen}
+        for file in files.values():
+            refuse_existing(file, *read, force=force)
+        return files
+
+    found = _stored(folder, names, sim, data)
+    if found is None:
+        assert sim is not None  # or `_stored` had raised
+        assert data is not None
+        files_of(_possible(folder))  # before a minute goes into scores
+        info = read_info(folder)
+        sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
+        given = _Given(folder, sim, data, truth, rivals, seed)
+        found = given.drawings(device, monitor)
+    files = files_of(found)
+    for name, file in files.items():
+        with written_aside(file) as aside:
+            found[name].draw().savefig(aside, format=suffix[1:], dpi=DPI)
+    return list(files.values())
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A run, and what it is to be scored on."""
+
+    run: Path
+    sim: InputFile
+    data: InputFile
+    truth: Path | None
+    rivals: bool
+    seed: int
+
+    def drawings(self, device: str, monitor: Monitor) -> dict[str, Drawing]:
+        """Take figures stored in the run's folder, if of the same; else score, and store."""
+        how = self.truth, self.rivals, self.seed
+        made = made_of(self.run, self.sim, self.data, *how)
+        store = self.run / STORE
+        if store.is_file():
+            found, of = read_drawings(store)
+            if of == made:
+                return found
+        scored = evaluate(
+            self.run,
+            self.sim,
+            self.data,
+            truth=self.truth,
+            rivals=self.rivals,
+            seed=self.seed,
+            device=device,
+            monitor=monitor,
+        )
+        found = drawings(scored)
+        try:
+            with written_aside(store) as aside:
+                write_drawings(aside, found, made)
+        except CpunetError as error:
+            monitor.note(f"warning: {error}; the next figure takes as long")
+        return found
+
+
+def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
+    """Names of figures that are asked for, or have a name that is as a part.
+
+    Raises
+    ------
+    CpunetError
+        If one fits none; the message lists them.
+
+    Examples
+    --------
+    >>> chosen_names(["noise", "sep_mean_pulse"], ["SEP mean pulse", "SEP noise", "DEP noise"])
+    ['SEP noise', 'DEP noise', 'SEP mean pulse']
+    """
+    found = []
+    plain = {name: name.replace("_", " ").casefold() for name in known}
+    for wanted in names:
+        asked = wanted.replace("_", " ").casefold()
+        fits = [n for n, p in plain.items() if p == asked]
+        fits = fits or [n for n, p in plain.items() if asked in p]
+        if not fits or not asked.strip():
+            raise CpunetError(f"no figure {wanted[:60]!r}; there are: {', '.join(known)}")
+        found += fits
+    return list(dict.fromkeys(found))
+
+
+def _stored(
+    folder: Path, names: list[str], sim: InputFile | None, data: InputFile | None
+) -> dict[str, Drawing] | None:
+    """Figures that need no scoring; None if pulses are given to be scored."""
+    if made_here(folder, REPORT):
+        if sim is not None or data is not None:
+            raise CpunetError(
+                f"{folder}: is a report, drawn of what it stores; leave out --sim and --data, "
+                "or give the run"
+            )
+        if not (folder / STORE).is_file():
+            raise CpunetError(
+                f"{folder}: stores no results to draw (an older report); validate again, or "
+                "give the run with --sim and --data"
+            )
+        return read_drawings(folder / STORE)[0]
+    if names == [LOSSES]:
+        return {LOSSES: of_losses(read_losses(folder))}
+    if sim is not None and data is not None:
+        return None
+    if (folder / STORE).is_file() and sim is None and data is None:
+        return read_drawings(folder / STORE)[0]
+    chosen_names(
+        names, figure_names([*read_recipe(folder).peaks, str(read_info(folder)["peak"])])
+    )
+    raise CpunetError(
+        "simulated and measured pulses are needed; give --sim and --data, or a report"
+    )
+
+
+def _possible(run: Path) -> list[str]:
+    """Names of the figures that a validation of a run may have."""
+    peaks = [*read_recipe(run).peaks, str(read_info(run)["peak"])]
+    return figure_names(dict.fromkeys(peaks))

@@ -1,0 +1,101 @@
+"""Figures as numbers in a file, to be drawn again without scoring again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet import npz_files
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.translation.translation_record import run_print, source_print
+from cpunet.jobs.validation.figures import Drawing
+
+STORE = "figures.npz"
+_INDEX = "index"
+_ARRAY = "array"  # in the index, stands for an array of the file
+
+Made = dict[str, Any]
+
+
+def made_of(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    truth: Path | None,
+    rivals: bool,
+    seed: int,
+) -> Made:
+    """What figures depend on, for `write_drawings`."""
+    return {
+        "run": run_print(run),
+        "sim": source_print(sim),
+        "data": source_print(data),
+        "truth": None if truth is None else source_print(InputFile(truth)),
+        "rivals": rivals,
+        "seed": seed,
+    }
+
+
+def write_drawings(file: Path, drawings: Mapping[str, Drawing], made: Made) -> None:
+    """Store figures by name, and what they were made of."""
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    content = {
+        name: {"kind": drawing.kind, "values": _told(drawing.values, arrays)}
+        for name, drawing in drawings.items()
+    }
+    text = json.dumps({"made": made, "figures": content})
+    with file.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **{_INDEX: np.array(text)}, **arrays)
+
+
+def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
+    """Read stored figures by name, and what they were made of.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read.
+    """
+    try:
+        arrays = npz_files.read_arrays(file, npz_files.keys(file))
+        index = json.loads(str(arrays[_INDEX]))
+        drawings = {
+            name: Drawing(one["kind"], _found(one["values"], arrays))
+            for name, one in index["figures"].items()
+        }
+        made = index["made"]
+        if not isinstance(made, dict):
+            raise ValueError("not said of what the figures were made")
+    except (*npz_files.DAMAGED, AttributeError) as error:
+        raise CpunetError(
+            f"{file}: cannot be read ({npz_files.said(error)}); remove it, and score the run "
+            "again"
+        ) from error
+    return drawings, made
+
+
+def _told(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+    """What JSON can hold of a value; its arrays are put aside."""
+    if isinstance(value, Mapping):
+        return {str(key): _told(part, arrays) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_told(part, arrays) for part in value]
+    if isinstance(value, np.ndarray):
+        name = f"{_ARRAY}{len(arrays)}"
+        arrays[name] = value
+        return {_ARRAY: name}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _found(value: Any, arrays: Mapping[str, Any]) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {_ARRAY}:
+            return arrays[value[_ARRAY]]
+        return {key: _found(part, arrays) for key, part in value.items()}
+    return [_found(part, arrays) for part in value] if isinstance(value, list) else value

@@ -1,0 +1,268 @@
+"""The figures of a validation: what each is drawn of, and who draws it.
+
+A `Drawing` holds numbers and text alone, so that figures can be stored and drawn again without
+scoring again, see `cpunet.jobs.validation.figure_store`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
+from cpunet.analysis.baseline_spectra import spectrum_of_noise
+from cpunet.analysis.comparisons import data_axis
+from cpunet.analysis.drift_slices import Slices, Superpulse
+from cpunet.analysis.figures import (
+    MeanPulse,
+    cycle_figure,
+    loss_curves,
+    mean_pulses,
+    parameter_histograms,
+)
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
+from cpunet.analysis.slice_figure import slice_figure
+from cpunet.jobs.validation.evaluation import Evaluation
+from cpunet.jobs.validation.peak_details import PeakDetails
+from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.training.loop import Record
+from cpunet.translation.translator import IREN, REN
+
+# methods in the figures; more lines could not be told apart
+DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
+SINGLE = ("raw", "rc", "ren", "truth")  # in the figure of a single pulse
+SHOWN = 10  # pulses in a figure of cycles, as in the paper
+SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
+CYCLES = ("forward cycle", "backward cycle")
+OF_PEAKS = (
+    *PARAMETERS,
+    "mean pulse",
+    "single pulse",
+    "superpulses",
+    "A over E",
+    "A over E and drift time",
+    "noise",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A figure to be drawn.
+
+    Parameters
+    ----------
+    kind
+        Who draws it: a key of `_DRAW`.
+    values
+        Its arguments: numbers, text, arrays, and lists and mappings of these.
+    """
+
+    kind: str
+    values: Mapping[str, Any]
+
+    def draw(self) -> Figure:
+        """Make the figure."""
+        return _DRAW[self.kind](**self.values)
+
+
+def figure_names(peaks: Iterable[str]) -> list[str]:
+    """Names of all figures that a validation of these peaks may have."""
+    names = [f"{peak} {figure}" for peak in peaks for figure in (*CYCLES, *OF_PEAKS)]
+    return [SPECTRUM, *names, ROC, LOSSES]
+
+
+def drawings(found: Evaluation) -> dict[str, Drawing]:
+    """All figures of a validation by name."""
+    peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
+    energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
+    made = {SPECTRUM: Drawing("spectrum", {"energy_kev": energies, "peaks": peaks})}
+    scored = [peak for peak in found.sets if found.values[peak.name]]
+    fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
+    forward, backward = CYCLES
+    made[f"{fullest.name} {forward}"] = _forward(fullest, found.ren, found.iren)
+    made[f"{fullest.name} {backward}"] = _backward(fullest, found.ren, found.iren)
+    for peak in scored:
+        made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
+    if DEP in {peak.name for peak in scored} and len(scored) > 1:
+        made[ROC] = _roc(found, [peak.name for peak in scored])
+    if found.losses:
+        made[LOSSES] = of_losses(found.losses)
+    return made
+
+
+def of_losses(records: list[Record]) -> Drawing:
+    """The losses of a training."""
+    return Drawing("losses", {"records": records})
+
+
+def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
+    name, details = peak.name, found.details[peak.name]
+    scores = found.metrics["peaks"][name]
+    made = {
+        parameter: _histograms(name, parameter, found, scores["parameters"][parameter])
+        for parameter in scores["parameters"]
+        if np.isfinite(found.values[name]["data"][parameter]).any()
+    }
+    made["mean pulse"] = _mean_pulse(peak)
+    row = _drawable(peak)
+    if row is not None:
+        made["single pulse"] = _single_pulse(peak, row, found)
+    if details.slices:
+        made["superpulses"] = _superpulses(details, peak)
+    if "missing" not in details.ae_against_time:
+        made["A over E"] = _ae(details, name)
+    if "missing" not in details.plane:
+        made["A over E and drift time"] = _plane(details, name)
+    if "missing" not in scores["noise"]["data"]:
+        shown = ("frequency_mhz", "data", "ren")
+        noise = {method: n for method, n in scores["noise"].items() if method in shown}
+        made["noise"] = Drawing("noise", {"noise": noise, "peak": name})
+    return made
+
+
+def _histograms(
+    peak: str, parameter: str, found: Evaluation, comparison: Mapping[str, Any]
+) -> Drawing:
+    values = found.values[peak]
+    return Drawing(
+        "histograms",
+        {
+            "values": {m: v[parameter] for m, v in values.items() if m in DRAWN},
+            "max_bins": found.ren.recipe.scores.max_bins,
+            "parameter": parameter,
+            "peak": peak,
+            "comparison": comparison,
+        },
+    )
+
+
+def _mean_pulse(peak: PeakSets) -> Drawing:
+    pulses = peak.by_method()
+    # one set of pulses at a time
+    sets = ((method, pulses[method].waveforms) for method in pulses if method in DRAWN)
+    means = {method: MeanPulse.of(one)._asdict() for method, one in sets if len(one)}
+    return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
+
+
+def _drawable(peak: PeakSets) -> int | None:
+    """The first simulated event that every method has, with an edge."""
+    for row in peak.known_to_all():
+        windows = peak.without_noise(np.array([row])).values()
+        edges = (align_half_maximum(w, 100, 150) for w in windows)
+        if all(np.isfinite(edge).any() for edge in edges):
+            return int(row)
+    return None
+
+
+def _single_pulse(peak: PeakSets, row: int, found: Evaluation) -> Drawing:
+    sets = peak.without_noise(np.array([row]))
+    pulses = {method: sets[method][0] for method in SINGLE if method in sets}
+    before = found.ren.recipe.preparation.samples_before
+    beside = DataPulse.beside(pulses, peak.data.waveforms, peak.dt_ns, before)
+    return Drawing(
+        "single pulse",
+        {
+            "pulses": pulses,
+            "data": beside._asdict(),
+            "dt_ns": peak.dt_ns,
+            "samples_before": before,
+            "title": f"{peak.name}, simulated pulse {row}",
+        },
+    )
+
+
+def _superpulses(details: PeakDetails, peak: PeakSets) -> Drawing:
+    shown = ("data", "superpulse", "ren")
+    sets = {m: asdict(s) for m, s in details.slices.items() if m in shown}
+    return Drawing("superpulses", {"sets": sets, "dt_ns": peak.dt_ns, "peak": peak.name})
+
+
+def _ae(details: PeakDetails, name: str) -> Drawing:
+    table = dict(details.ae_against_time)
+    table["methods"] = {m: rows for m, rows in table["methods"].items() if m in DRAWN}
+    return Drawing("A over E", {"table": table, "peak": name})
+
+
+def _roc(found: Evaluation, peaks: list[str]) -> Drawing:
+    ae = {
+        peak: {
+            method: values["current_amplitude"]
+            for method, values in found.values[peak].items()
+            if method in DRAWN
+        }
+        for peak in peaks
+    }
+    return Drawing("A over E survival", {"ae": ae, "dep": DEP})
+
+
+def _plane(details: PeakDetails, name: str) -> Drawing:
+    table = dict(details.plane)
+    shown = ("data", "raw", "ren", "truth")
+    table["counts"] = {m: c for m, c in table["counts"].items() if m in shown}
+    return Drawing("A over E and drift time", {"table": table, "peak": name})
+
+
+def _forward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
+    """Ten simulated pulses there and back again."""
+    sim = peak.raw.waveforms[:SHOWN]
+    like_data = ren.apply(sim, noise=False)
+    titles = ("Simulation", "REN (simulation)", "IREN (REN (simulation))")
+    return _cycle(sim, like_data, iren.apply(like_data, noise=False), titles, ren.dt_ns)
+
+
+def _backward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
+    """Ten measured pulses there and back again."""
+    data = peak.data.waveforms[:SHOWN]
+    like_sim = iren.apply(data, noise=False)
+    titles = ("Data", "IREN (data)", "REN (IREN (data))")
+    return _cycle(data, like_sim, ren.apply(like_sim, noise=False), titles, ren.dt_ns)
+
+
+def _cycle(start: Any, middle: Any, end: Any, titles: tuple[str, ...], dt_ns: float) -> Drawing:
+    windows = {"start": start, "middle": middle, "end": end}
+    return Drawing("cycle", windows | {"titles": list(titles), "dt_ns": dt_ns})
+
+
+def _draw_histograms(values: Mapping[str, Any], max_bins: int, **more: Any) -> Figure:
+    return parameter_histograms(values, data_axis(values["data"], max_bins), **more)
+
+
+def _draw_mean_pulse(sets: Mapping[str, Any], **more: Any) -> Figure:
+    return mean_pulses({method: MeanPulse(**one) for method, one in sets.items()}, **more)
+
+
+def _draw_single_pulse(data: Mapping[str, Any], **more: Any) -> Figure:
+    return single_pulse_figure(data=DataPulse(**data), **more)
+
+
+def _draw_superpulses(sets: Mapping[str, Any], **more: Any) -> Figure:
+    def slices(one: Mapping[str, Any]) -> Slices:
+        pulses = tuple(Superpulse(**pulse) for pulse in one["pulses"])
+        return Slices(**{**one, "pulses": pulses})
+
+    return slice_figure({method: slices(one) for method, one in sets.items()}, **more)
+
+
+def _draw_noise(noise: Mapping[str, Any], peak: str) -> Figure:
+    return spectrum_of_noise(noise, peak)
+
+
+_DRAW: Mapping[str, Callable[..., Figure]] = {
+    "spectrum": spectrum_figure,
+    "cycle": cycle_figure,
+    "histograms": _draw_histograms,
+    "mean pulse": _draw_mean_pulse,
+    "single pulse": _draw_single_pulse,
+    "superpulses": _draw_superpulses,
+    "A over E": ae_figure,
+    "A over E and drift time": two_dimensional_figure,
+    "A over E survival": roc_figure,
+    "noise": _draw_noise,
+    "losses": loss_curves,
+}

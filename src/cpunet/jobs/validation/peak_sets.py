@@ -1,0 +1,149 @@
+"""The pulses of one peak by method, as a validation compares them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.paired import PairedScores, scores_of_squares
+from cpunet.analysis.style import NO_NOISE
+from cpunet.jobs.common.inputs import InputSet
+from cpunet.jobs.validation.translations import Translations
+from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import Values
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import Recipe
+
+FEWEST = 10  # pulses, below which a distribution says nothing
+
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PeakSets:
+    """The pulses of one peak: rows of the simulated and of the measured ones.
+
+    Parameters
+    ----------
+    name
+        A peak of the recipe, or a range in keV.
+    simulated, measured
+        All prepared pulses of the two sides.
+    sim_rows, data_rows
+        Those of the peak.
+    made
+        What all methods make of the simulated pulses.
+    """
+
+    name: str
+    simulated: Pulses
+    measured: Pulses
+    sim_rows: Rows
+    data_rows: Rows
+    made: Translations
+
+    @property
+    def raw(self) -> Pulses:
+        """The simulated pulses of the peak."""
+        return self.simulated[self.sim_rows]
+
+    @property
+    def data(self) -> Pulses:
+        """The measured pulses of the peak."""
+        return self.measured[self.data_rows]
+
+    @property
+    def dt_ns(self) -> float:
+        """Sampling period in ns."""
+        return self.simulated.dt_ns
+
+    def by_method(self) -> WhenAsked[Pulses]:
+        """Pulses with noise, from the simplest method to the known answer, the data's first.
+
+        They are copied from the whole set each time they are asked for.
+        """
+        makers: dict[str, Callable[[], Pulses]] = {
+            "data": lambda: self.data,
+            "raw": lambda: self.raw,
+        }
+        for name, whole in self.made.whole.items():
+            rows = self._whole(whole)
+            if len(rows) >= FEWEST or name == "ren":
+                makers[name] = partial(self._noisy, name, rows)
+        return WhenAsked(makers)
+
+    def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
+        """Parameters of the rivals' and of the truth's pulses without noise."""
+        found = {}
+        for name, kept in self.made.clean.items():
+            rows = self._whole(kept.whole)
+            if name not in ("raw", "ren") and len(rows) >= FEWEST:
+                found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
+        return found
+
+    def known_to_all(self) -> Rows:
+        """Places within the peak of the events that every method has without noise."""
+        whole = [kept.whole[self.sim_rows] for kept in self.made.clean.values()]
+        return np.flatnonzero(np.logical_and.reduce(whole))
+
+    def without_noise(self, places: Rows) -> dict[str, FloatArray]:
+        """Windows by method of some events, the truth among them if it is known."""
+        return self.made.without_noise(self.sim_rows[places])
+
+    def paired_scores(self) -> dict[str, PairedScores] | None:
+        """Scores of single pulses by method; None if the truth is not known."""
+        rows = self.sim_rows[self.known_to_all()]
+        scores = {
+            name: scores_of_squares(kept.squares[rows])
+            for name, kept in self.made.clean.items()
+            if kept.squares is not None
+        }
+        return scores or None
+
+    def not_prepared(self) -> dict[str, int]:
+        """How many translated pulses cannot be prepared as data are, by method."""
+        whole = dict(self.made.whole)
+        for name, kept in self.made.clean.items():
+            if name not in ("raw", "ren"):
+                whole[f"{name}{NO_NOISE}"] = kept.whole
+        counts = {name: int((~kept[self.sim_rows]).sum()) for name, kept in whole.items()}
+        return {name: count for name, count in counts.items() if count}
+
+    def missing(self) -> str | None:
+        """Say what keeps the peak from being scored, if anything does."""
+        sides = (("simulated", self.sim_rows), ("measured", self.data_rows))
+        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < FEWEST]
+        return f"{' and '.join(few)} pulses (at least {FEWEST} are needed)" if few else None
+
+    def _whole(self, flags: npt.NDArray[np.bool_]) -> Rows:
+        return self.sim_rows[flags[self.sim_rows]]
+
+    def _noisy(self, name: str, rows: Rows) -> Pulses:
+        return Pulses.of(self.made.noisy[name][rows], dt_ns=self.dt_ns)
+
+
+def peak_sets(
+    name: str, recipe: Recipe, sim_set: InputSet, data_set: InputSet, made: Translations
+) -> PeakSets:
+    """Choose the pulses of one peak, or of a range of energies, from both sets.
+
+    Parameters
+    ----------
+    name
+        A peak of the recipe, or a range in keV.
+    recipe
+        The run's settings.
+    sim_set, data_set
+        Prepared pulses.
+    made
+        What the methods make of the simulated ones.
+    """
+    selection = parse_selection(name, recipe.peaks)
+    sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
+    rows = [np.flatnonzero(selection.select(side.energy_kev)) for side in (sim, data)]
+    return PeakSets(name, sim, data, rows[0], rows[1], made)

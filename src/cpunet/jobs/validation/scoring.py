@@ -1,0 +1,82 @@
+"""Scores of one peak: distributions, single pulses, noise, and what tells them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from cpunet.analysis.baseline_spectra import baseline_spectra
+from cpunet.analysis.comparisons import compare
+from cpunet.analysis.style import NO_NOISE
+from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.jobs.validation.pulse_tests import told_apart
+from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.recipes.schema import Recipe
+
+ByMethod = dict[str, dict[str, Values]]
+
+
+def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:
+    """Compare the pulses of a peak, method by method.
+
+    Parameters
+    ----------
+    peak
+        Its pulses.
+    recipe
+        The run's settings.
+    seed
+        Of bootstraps and folds.
+
+    Returns
+    -------
+    values
+        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, but only those
+        of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
+    scores
+        The peak's entry in ``metrics.json``, ready for JSON.
+    """
+    scores: dict[str, Any] = {
+        "n_sim": len(peak.sim_rows),
+        "n_data": len(peak.data_rows),
+        "not_prepared": peak.not_prepared(),
+    }
+    missing = peak.missing()
+    if missing is not None:
+        return {}, scores | {"parameters": {}, "missing": missing}
+    pulses = peak.by_method()
+    values = {
+        method: all_parameters(of_method, recipe.preparation, recipe.scores)
+        for method, of_method in pulses.items()
+    } | peak.noise_free_parameters()
+    chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
+    scores["two_sample"] = told_apart(pulses, chief, seed)
+    scores["parameters"] = _compared(chief, recipe, seed)
+    further = {
+        method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
+        for method, of_method in values.items()
+        if not method.endswith(NO_NOISE)
+    }
+    scores["further"] = _compared(further, recipe, seed)
+    align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
+    scores["noise"] = baseline_spectra(
+        {
+            method: of_method.waveforms[:, : recipe.preparation.baseline_samples].copy()
+            for method, of_method in pulses.items()
+        },
+        {method: align + values[method]["t01"] / dt_ns for method in pulses},
+        recipe.preparation.baseline_samples,
+        dt_ns,
+    )
+    paired = peak.paired_scores()
+    if paired is not None:
+        scores["paired"] = paired
+    return values, scores
+
+
+def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Any]:
+    methods: Mapping[str, Mapping[str, Values]] = {
+        method: of_method for method, of_method in values.items() if method != "data"
+    }
+    return dict(compare(values["data"], methods, recipe.scores, seed))

@@ -1,0 +1,207 @@
+"""All simulated pulses through every method, once: windows with noise, numbers without.
+
+Of pulses without noise a validation needs a few numbers each, and the samples of some twenty
+events.  Those are translated again where they are shown; to keep all would double the memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.paired import pair_squares
+from cpunet.electronics.finishing import blocks, finish, finish_both
+from cpunet.electronics.rivals.translating import translate_like_data
+from cpunet.jobs.common.inputs import InputSet
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.truth import Responses
+from cpunet.jobs.validation.rivals import FittedRivals
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import Values, pulse_parameters
+from cpunet.recipes.schema import Recipe
+from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.output_form import drawn_kev
+from cpunet.translation.translator import REN
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFree:
+    """What is kept of the pulses of one method without noise.
+
+    Parameters
+    ----------
+    parameters
+        Those of `pulse_parameters`, row by row; NaN where a pulse cannot be prepared.
+    whole
+        Which pulses could be prepared.
+    squares
+        Differences from the truth, see `pair_squares`; None if that is not known.
+    """
+
+    parameters: Mapping[str, Values]
+    whole: Flags
+    squares: Values | None
+
+
+@dataclass(frozen=True, eq=False)
+class Translations:
+    """What all methods make of the simulated pulses, row by row.
+
+    Parameters
+    ----------
+    noisy
+        Windows by method, rivals, ``ren`` and ``truth``; rows that cannot be prepared are
+        NaN.  Without the data's noise ``ren`` only.
+    whole
+        By the same names, which rows could be prepared.
+    clean
+        The same pulses without noise, and ``raw``.
+    truth
+        Windows of the noise-free truth, if it is known.
+    """
+
+    ren: REN
+    rivals: FittedRivals
+    simulated: Pulses
+    noisy: dict[str, FloatArray] = field(default_factory=dict)
+    whole: dict[str, Flags] = field(default_factory=dict)
+    clean: dict[str, NoiseFree] = field(default_factory=dict)
+    truth: FloatArray | None = None
+
+    def without_noise(self, rows: npt.NDArray[np.int64]) -> dict[str, FloatArray]:
+        """Windows of some pulses by method, the truth among them if it is known."""
+        pulses, config = self.simulated[rows], self.ren.recipe.preparation
+        found = {"raw": pulses.waveforms}
+        for name, rival in self.rivals.methods.items():
+            found[name] = translate_like_data(rival, pulses, config).waveforms
+        found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
+        return found if self.truth is None else found | {"truth": self.truth[rows]}
+
+
+def translate_all(
+    ren: REN,
+    rivals: FittedRivals,
+    sim: InputSet,
+    responses: Responses | None,
+    seed: int,
+    monitor: Monitor,
+) -> Translations:
+    """Translate the simulated pulses by every method, with noise and without.
+
+    Parameters
+    ----------
+    ren, rivals
+        The methods.
+    sim
+        Prepared pulses.
+    responses
+        True noise-free records of these, if known.
+    seed
+        Of the noise, the same for all methods.
+    monitor
+        Told of the progress.
+    """
+    pulses, recipe = sim.prepared.pulses, ren.recipe
+    others = [*rivals.methods, *(["truth"] if responses is not None else [])]
+    shape = (len(pulses), recipe.preparation.length)
+    noisy = {
+        name: np.empty(shape, np.float32)
+        for name in (*rivals.methods, "ren", "truth")  # from the simplest to the answer
+        if name == "ren" or (name in others and rivals.noise is not None)
+    }
+    truth = None if responses is None else np.empty(shape, np.float32)
+    true_records = iter(()) if responses is None else responses.blocks()
+    generator = ren.seeded(seed)
+    # as the data that they are compared with have them
+    remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+    rngs = {name: np.random.default_rng(seed) for name in others}
+    parts: dict[str, list[NoiseFree]] = {}
+    with monitor.stage("Translating", len(pulses)) as advance:
+        for rows in blocks(len(pulses)):
+            block = pulses[rows]
+            clean = {"raw": block.waveforms}
+            for name in others:
+                records = (
+                    next(true_records)
+                    if name == "truth"
+                    else rivals.methods[name].translate(block.waveforms)
+                )
+                clean[name], drawn = _finished(records, block, rivals, recipe, rngs[name])
+                if drawn is not None:
+                    noisy[name][rows] = drawn
+            clean["ren"] = ren.apply(block.waveforms, noise=False)
+            noisy["ren"][rows] = ren.apply(
+                block.waveforms,
+                energy_kev=block.energy_kev,
+                generator=generator,
+                remains_kev=drawn_kev(remains, len(block), generator),
+            )
+            if truth is not None:
+                truth[rows] = clean["truth"]
+            for name, numbers in _numbers(clean, recipe, sim.dt_ns).items():
+                parts.setdefault(name, []).append(numbers)
+            advance(len(block))
+    whole = {name: _whole(windows) for name, windows in noisy.items()}
+    joined = {name: _joined(found) for name, found in parts.items()}
+    return Translations(ren, rivals, pulses, noisy, whole, joined, truth)
+
+
+def _finished(
+    records: FloatArray,
+    pulses: Pulses,
+    rivals: FittedRivals,
+    recipe: Recipe,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Windows without noise, and with it if there is any."""
+    if rivals.noise is None:
+        return finish(records, recipe.preparation, dt_ns=pulses.dt_ns), None
+    return finish_both(
+        records,
+        recipe.preparation,
+        dt_ns=pulses.dt_ns,
+        noise=rivals.noise,
+        energy_kev=pulses.energy_kev,
+        seed=rng,
+    )
+
+
+def _numbers(
+    clean: Mapping[str, FloatArray], recipe: Recipe, dt_ns: float
+) -> dict[str, NoiseFree]:
+    """What is kept of one block."""
+    squares: Mapping[str, Values] = {}
+    if "truth" in clean:
+        methods = {name: windows for name, windows in clean.items() if name != "truth"}
+        squares = pair_squares(methods, clean["truth"], recipe.scores.edge_samples)
+    return {
+        name: NoiseFree(
+            pulse_parameters(
+                Pulses.of(windows, dt_ns=dt_ns), recipe.preparation, recipe.scores
+            ),
+            _whole(windows),
+            squares.get(name),
+        )
+        for name, windows in clean.items()
+    }
+
+
+def _joined(parts: list[NoiseFree]) -> NoiseFree:
+    squares = [part.squares for part in parts if part.squares is not None]
+    return NoiseFree(
+        {
+            name: np.concatenate([part.parameters[name] for part in parts])
+            for name in parts[0].parameters
+        },
+        np.concatenate([part.whole for part in parts]),
+        np.concatenate(squares) if squares else None,
+    )
+
+
+def _whole(windows: FloatArray) -> Flags:
+    return np.asarray(np.isfinite(windows).all(axis=1))

@@ -1,0 +1,157 @@
+"""How well a run translates: scores per peak, figures and a page to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from cpunet.analysis.report import REPORT, write_report
+from cpunet.files import folder_written_aside
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.evaluation import Evaluation, evaluate
+from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
+from cpunet.jobs.validation.figures import Drawing, drawings
+from cpunet.jobs.validation.views import report_views
+from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.training.run_folder import read_info
+
+QUIET = Monitor()
+
+
+def validate_run(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    out: Path,
+    *,
+    truth: Path | None = None,
+    rivals: bool = True,
+    seed: int = 0,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Score a run on simulated and measured pulses and write the report folder.
+
+    Every peak of the recipe is scored, and the energies of the training if they are
+    none of them. SEP and DEP are no part of the training: they are the test.
+
+    Parameters
+    ----------
+    run
+        Folder of the training run.
+    sim, data
+        Simulated and measured pulses.
+    out
+        Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, of
+        which `cpunet.jobs.validation.figure_files.draw_figures` draws them again.
+    truth
+        ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
+    rivals
+        Fit the rival methods too, which takes most of the time.
+    seed
+        Of noise and bootstraps.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Returns
+    -------
+    dict
+        The content of ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, or no peak can be scored.
+    """
+    found, _ = validated(
+        run, sim, data, out, truth=truth, rivals=rivals, seed=seed, device=device, force=force,
+        monitor=monitor,
+    )  # fmt: skip
+    return found.metrics
+
+
+def validated(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    out: Path | None,
+    *,
+    truth: Path | None = None,
+    rivals: bool = True,
+    seed: int = 0,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> tuple[Evaluation, dict[str, Drawing]]:
+    """As `validate_run`, with all that was found, and its figures by name.
+
+    Parameters
+    ----------
+    out
+        Report folder; None for none.
+    run, sim, data, truth, rivals, seed, device, force, monitor
+        As for `validate_run`.
+    """
+    info = read_info(run)
+    sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
+    score = partial(
+        evaluate, run, sim, data, truth=truth, rivals=rivals, seed=seed, device=device,
+        monitor=monitor,
+    )  # fmt: skip
+    if out is None:
+        found = score()
+        return found, drawings(found)
+    read = (run, *sim.files, *data.files, truth)
+    with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
+        found = score()
+        to_draw = drawings(found)
+        made = made_of(run, sim, data, truth, rivals, seed)
+        write_drawings(folder / STORE, to_draw, made)
+        with monitor.stage("Drawing", len(to_draw)) as advance:
+            notes = _notes(found.info, truth)
+            figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
+            write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
+    return found, to_draw
+
+
+def _of_remains(info: Mapping[str, Any]) -> list[str]:
+    """What earlier pulses have left under the data, if anything surely."""
+    told = (info.get("fit") or {}).get("remains") or {}
+    if not told.get("rate_khz"):
+        return []
+    shares = ", ".join(
+        f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
+        for size, share in told["percent_above"].items()
+    )
+    return [
+        f"Traces of the training lie on remains of earlier pulses, {told['rate_khz']:.2f} ± "
+        f"{told['rate_error_khz']:.2f} kHz decaying with {told['decay_us']:.1f} µs: percent of "
+        f"the traces, measured (by the law), {shares}. Translations, rivals and the truth have "
+        "remains drawn by this law, as likely as they pass the quality cuts."
+    ]
+
+
+def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
+    """Draw a figure, and tell of it."""
+    figure = drawing.draw()
+    advance(1)
+    return figure
+
+
+def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:
+    notes = [
+        f"Peaks other than {info['peak']} took no part in the training.",
+        "IoU is the overlap of two distributions in percent. Two samples of the same "
+        "distribution do not reach 100 at finite size: the ceiling is what data score "
+        "against data at these sizes.",
+    ]
+    notes += _of_remains(info)
+    if truth is None:
+        notes.append("No truth was given, so single pulses are not scored.")
+    return notes
