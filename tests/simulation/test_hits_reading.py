@@ -165,3 +165,11 @@ def test_foreign_files_are_one_line(tmp_path: Path, content: bytes) -> None:
 def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(CpunetError, match="cannot be read"):
         read_hits(tmp_path / "none.lh5")
+
+
+def test_a_detector_is_not_chosen_where_none_is_named(tmp_path: Path) -> None:
+    path, x = tmp_path / "hits.npz", np.arange(3.0)
+    np.savez(path, x_mm=x, y_mm=x, z_mm=x, edep_keV=x + 1, offsets=np.array([0, 3]))
+    assert read_hits(path).hits.n_events == 1
+    with pytest.raises(CpunetError, match="name no detector to pick V01 by; leave"):
+        read_hits(path, detector="V01")

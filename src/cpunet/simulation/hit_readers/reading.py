@@ -130,6 +130,7 @@ def _steps(path: Path, detector: str | None, units: Units) -> Steps:
     if start.startswith(_HDF5_MAGIC):
         return _hdf5(path, detector, units)
     if start.startswith(_ZIP_MAGIC):
+        _without_detectors(path, detector)
         return read_npz(path)
     if start.startswith(b"#class tools::wcsv::ntuple"):
         return read_csv(path, detector, units)
@@ -147,8 +148,18 @@ def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
     if is_remage:
         return read_remage(path, detector, units)
     if is_kept:
+        _without_detectors(path, detector)
         return read_hit_table(path, units)
     raise CpunetError(
         f"{path}: HDF5 without hits; expected stp (remage), {TABLE} (cpunet simulate) or "
         f"{NTUPLE} (g4simple)"
     )
+
+
+def _without_detectors(path: Path, detector: str | None) -> None:
+    """Refuse the choice of a detector where all hits are of one."""
+    if detector is not None:
+        raise CpunetError(
+            f"{path}: its hits name no detector to pick {detector} by; leave "
+            "--hits-detector out"
+        )
