@@ -33,7 +33,6 @@ ROOT = Path(__file__).resolve().parents[1]
 POOL = 500  # different events; the file repeats them
 DSP = ROOT / "workflow" / "scripts" / "dsp.py"
 CONFIG = ROOT / "workflow" / "config" / "dsp.yaml"
-COMMAND = (sys.executable, "-c", "from cpunet.cli.main import main; main()")
 MILLION = 1_000_000
 TENTH = 10  # of the events are drifted one by one
 
@@ -72,10 +71,28 @@ def write_steps(path: Path, pool: Hits, n_events: int, block: int = 20_000) -> i
     return n_steps
 
 
+# Runs a program and tells the largest memory of its own; that of the parent, from which it was
+# forked, would count in the usage that the system tells.
+RUNNER = """
+import runpy, sys
+from pathlib import Path
+sys.argv = sys.argv[1:]
+try:
+    if sys.argv[0] == "cpunet":
+        from cpunet.cli.main import main
+        main()
+    else:
+        runpy.run_path(sys.argv[0], run_name="__main__")
+finally:
+    told = Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
+    sys.stderr.write(f"\\nVmHWM {told}\\n")
+"""
+
+
 def measured(*words: object) -> Cost:
-    """Run a process to its end."""
+    """Run a program to its end."""
     process = subprocess.Popen(
-        [str(word) for word in words],
+        [sys.executable, "-c", RUNNER, *(str(word) for word in words)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
@@ -85,13 +102,14 @@ def measured(*words: object) -> Cost:
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         sys.exit(said)
-    return Cost(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+    kilobytes = float(said.rpartition("VmHWM ")[2])
+    return Cost(usage.ru_utime + usage.ru_stime, kilobytes / 1024)
 
 
 def simulated(folder: Path, steps: Path, mode: str) -> Cost:
     """Steps to pulses, drifted one by one or interpolated in a library."""
     words = ["--detector", "icpc", "--hits", steps, "--hits-detector", "V01", mode]
-    return measured(*COMMAND, "simulate", *words, "--out", folder / "pulses.lh5", "--force")
+    return measured("cpunet", "simulate", *words, "--out", folder / "pulses.lh5", "--force")
 
 
 def chain(folder: Path, steps: Path) -> dict[str, Cost]:
@@ -102,10 +120,8 @@ def chain(folder: Path, steps: Path) -> dict[str, Cost]:
     parameters = [DSP, raw, dsp, "--config", CONFIG, "--table", "V01/raw"]
     return {
         "pulses, library": simulated(folder, steps, "--library"),
-        "raw traces": measured(*COMMAND, *translate, "--out", raw, "--force"),
-        "parameters": measured(
-            sys.executable, *parameters, "--run", folder / "run", "--tau-us", 400
-        ),
+        "raw traces": measured("cpunet", *translate, "--out", raw, "--force"),
+        "parameters": measured(*parameters, "--run", folder / "run", "--tau-us", 400),
     }
 
 
