@@ -19,7 +19,7 @@ from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 _AXES = ("xloc", "yloc", "zloc")
 
 
-ROWS = 20_000  # of a part: some ten MB of steps
+ROWS = 5_000  # of a part: some ten MB of steps
 
 
 def read_remage(
