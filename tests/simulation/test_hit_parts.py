@@ -10,7 +10,7 @@ import pytest
 from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.jobs import hit_sources
+from cpunet.jobs.simulation import hit_sources
 from cpunet.jobs.simulation.hit_sources import HitFile, Window
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import hit_parts, read_hits
