@@ -90,6 +90,23 @@ def test_a_run(home, run):
     assert run.ren.translate(np.zeros((0, 1200)), noise=False).shape == (0, 800)
 
 
+def test_a_run_of_a_network(tmp_path):
+    from cpunet.training.cyclegan import CycleGan
+    from cpunet.training.run_folder import write_run
+
+    tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
+    recipe = load_recipe("paper", tiny)
+    info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+    write_run(tmp_path, CycleGan(recipe), recipe, info | {"seconds": 1, "device": "cpu"})
+    run = cpunet.Run.load(tmp_path)
+    assert repr(run) == f"<Run {tmp_path}: paper, FEP>"
+    assert "<img" not in run._repr_html_()
+    with pytest.raises(cpunet.CpunetError, match="which has no response in closed form"):
+        run.response_figure()
+    with pytest.raises(cpunet.CpunetError, match="has kept no losses; train it again"):
+        run.loss_figure()
+
+
 def test_memory_and_file_have_the_same_pulses(home, run, tmp_path):
     kept = run.translate(home / "sim.lh5", seed=4)
     stored = cpunet.translate(run.folder, home / "sim.lh5", tmp_path / "t.lh5", seed=4)

@@ -19,11 +19,11 @@ from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.response import describe_responses, learned_chain
+from cpunet.jobs.inspection.response import chain_of, describe_responses
 from cpunet.jobs.training.train import train_run
+from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, read_losses, read_recipe
-from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import IREN, REN
 
 if TYPE_CHECKING:
@@ -132,13 +132,7 @@ class Run:
         CpunetError
             If the run is no readout chain.
         """
-        backend = self.ren.backend
-        if not isinstance(backend, ResponseBackend):
-            raise CpunetError(
-                f"{self.folder}: a network has no response to draw; give a run of the recipe "
-                "fast, or look at loss_figure()"
-            )
-        chain = learned_chain(backend.chain.response, self.folder.name)
+        chain = chain_of(self.folder)
         tail_ns = self.recipe.preparation.samples_after * self.dt_ns
         return response_figure([chain], tail_ns=tail_ns)
 
@@ -181,7 +175,7 @@ class Run:
         verdict = (self.info.get("fit") or {}).get("verdict")
         parts = [html.heading("cpunet run"), html.facts(self._facts())]
         parts.append(html.lines([str(verdict)] if verdict else []))
-        if isinstance(self.ren.backend, ResponseBackend):
+        if isinstance(self.recipe.generator, ResponseConfig):
             parts.append(html.picture(self.response_figure()))
         return "".join(parts)
 
