@@ -144,12 +144,13 @@ def test_pulses_sharper_than_simulated(sides, check):
     assert "no readout makes pulses sharper" in done.out
 
 
-def test_too_few_pulses(sides, check):
-    few = sides.write_data(traces=sides.traces[:50], kev=sides.kev[:50])
-    done = check(sides.write_sim(), few)
+@pytest.mark.parametrize("n", [50, 3])
+def test_too_few_pulses(sides, check, n):
+    few = sides.write_data(traces=sides.traces[:n], kev=sides.kev[:n])
+    done = check(sides.write_sim(), few, "--out", sides.folder / f"{n}.png")
     assert done.code == 1
     told = next(line for line in done.out.splitlines() if line.startswith("stop"))
-    assert "measured pulses of 50 can be used" in told
+    assert f"measured pulses of {n} can be used" in told
     assert "more files, or more energies" in told
 
 

@@ -117,6 +117,54 @@ def test_import_weights(command, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["library", "translate", "RUN", "FINE", "--format", "simflow"], "knows 16 ns alone"),
+        (["library", "translate", "RUN", "COARSE", "--format", "simflow"], "every 16 ns, prod"),
+        (["library", "translate", "RUN", "FINE", "--low-rank", "4"], "of --format simflow"),
+        (
+            ["library", "translate", "RUN", "FINE", "--format", "simflow", "--currents"],
+            "leave out --currents",
+        ),
+        (
+            ["library", "translate", "RUN", "FINE", "--format", "simflow", "--detector", "B9"],
+            "no library of B9; the file has V01",
+        ),
+        (["library", "merge", "FINE"], "no realistic library; make it with"),
+        (["library", "expand", "FINE"], "no library of components"),
+        (["export", "RUN", "--to", "legend-pars"], "no response in closed form"),
+        (["export", "RUN", "--to", "legend-pars", "--inverse"], "those of REN"),
+        (
+            ["validate", "RUN", "--sim", "a", "--data", "b", "--ae-range", "2350,900"],
+            "give two energies",
+        ),
+        (["export", "RUN", "--detector", "V01"], "those of --to legend-pars; add it"),
+    ],
+)
+def test_what_production_cannot_use_is_refused(command, trained, tmp_path, words, told):
+    fine = library_file(tmp_path / "fine.lh5", n_samples=1500, dt_ns=1.0)
+    coarse = library_file(tmp_path / "coarse.lh5")
+    names = {"RUN": trained, "FINE": fine, "COARSE": coarse}
+    refused = command(*(names.get(word, word) for word in words), "--out", tmp_path / "out")
+    assert refused.code == 2
+    assert told in " ".join(refused.err.split())
+    assert len(refused.err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_lithium_layer_is_tabulated(command, tmp_path):
+    out = tmp_path / "lithium.lh5"
+    done = command("library", "lithium", "--thickness-mm", "0.8", "--out", out)
+    assert done.code == 0, done.err
+    assert "mm arrives, half of that within" in done.out
+    assert lh5.read("lithium", str(out))["arrived"].nda.shape == (10_000, 80)
+    for wrong in (["--thickness-mm", "0"], ["--recombination-mm", "2"]):
+        refused = command("library", "lithium", *wrong, "--out", tmp_path / "x.lh5")
+        assert refused.code == 2
+        assert not (tmp_path / "x.lh5").exists()
+
+
 @pytest.mark.parametrize("name", ["export", "import", "library"])
 def test_help(command, name):
     assert command(name, "--help").code == 0

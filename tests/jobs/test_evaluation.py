@@ -99,6 +99,8 @@ def test_peaks_sidebands_and_continua_are_loaded() -> None:
 
 def test_what_is_compared(whole) -> None:
     json.dumps(whole.metrics, allow_nan=True)
+    lines = whole.metrics["ae_energy"]
+    assert "ranges of energy" in lines["missing"] if "missing" in lines else lines["methods"]
     ranges = whole.metrics["ae_details"]["survival by energy range"]
     assert ranges["Qbb"]["ren"]["peak"] == 25
     assert ranges["SEP"]["data"]["sideband"] == 5

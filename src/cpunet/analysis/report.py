@@ -23,6 +23,8 @@ from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
+from cpunet.analysis.ae_energy_figure import ae_energy_html
 from cpunet.analysis.nested_tables import nested_html
 from cpunet.analysis.report_tables import (
     compared_html,
@@ -110,7 +112,8 @@ def write_report(
         ``drift_slices``, ``linearity``, ``noise``: any nesting, shown as tables;
         ``compared``: names and values of what was compared;
         ``training``: how the network was trained; ``rejections``: counts by reason,
-        possibly nested.  Numbers that are not finite are written as ``null``.
+        possibly nested; ``ae_energy``: the result of `ae_energy.against_energy`.  Numbers
+        that are not finite are written as ``null``.
     figures
         Figures by name; the names become file names and captions.
     notes
@@ -128,6 +131,7 @@ def write_report(
         png = _png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
         drawn[name] = _figure_html(name, figure, png)
+    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, ""))
     first, of_noise, of_ae, others = _shared_out(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
@@ -146,6 +150,7 @@ def write_report(
         pulses=_views_html(views, ("pulses", "scatter")),
         survival=survival_html(metrics.get("ae_survival", {})),
         ae=_gallery(of_ae),
+        ae_energy=ae_energy,
         noise=_gallery(of_noise),
         details=_details_html(metrics),
         figures=_gallery(others) or gap("no figures were drawn"),

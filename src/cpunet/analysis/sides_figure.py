@@ -40,7 +40,8 @@ def sides_figure(
     figure = Figure(figsize=(9.0, 6.0))
     (whole, edge), below = figure.subplots(2, 2)
     for side, pulses in waveforms.items():
-        some = pulses[np.linspace(0, len(pulses) - 1, PULSES).astype(int)]
+        shown = min(len(pulses), PULSES)
+        some = pulses[np.linspace(0, len(pulses) - 1, shown).astype(int)]
         length = pulses.shape[1]
         aligned = align_half_maximum(np.asarray(some, np.float32), length, length)
         time_ns = (np.arange(2 * length) - length) * dt_ns
@@ -50,7 +51,7 @@ def sides_figure(
             lines = axes.plot(
                 scale * time_ns, aligned.T, color=colour, linewidth=0.7, alpha=0.8
             )
-            lines[0].set_label(f"{label(side)}, {PULSES} of {len(pulses)}")
+            lines[0].set_label(f"{label(side)}, {shown} of {len(pulses)}")
     whole.set_title("Pulses, aligned at half of their maximum")
     edge.set_title("Their edges")
     edge.set_xlim(*EDGE_NS)

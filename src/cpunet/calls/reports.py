@@ -170,6 +170,7 @@ def validate(
     truth: str | Path | None = None,
     rivals: bool = True,
     seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
     device: str = "auto",
     force: bool = False,
     progress: bool | Monitor = True,
@@ -190,6 +191,8 @@ def validate(
         Fit what one would use instead, too.
     seed
         Of noise and bootstraps.
+    ae_range_kev
+        More energies to read on both sides, for A/E against energy: such as (900, 2350).
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     force
@@ -216,6 +219,7 @@ def validate(
         truth=None if truth is None else Path(truth),
         rivals=rivals,
         seed=seed,
+        ae_range_kev=ae_range_kev,
         device=device,
         force=force,
         monitor=monitor,

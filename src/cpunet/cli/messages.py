@@ -148,7 +148,11 @@ class LogMonitor(Monitor):
             if now - last >= LOG_EVERY_S:
                 last = now
                 rate = done / (now - start)
-                left = f", {(total - done) / rate:.0f} s left" if total and done else ""
+                left = (
+                    f", {(total - done) / rate:.0f} s left"
+                    if total and 0 < done < total
+                    else ""
+                )
                 state = f", {self._state}" if self._state else ""
                 _print(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}{state}")
 

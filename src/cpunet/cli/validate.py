@@ -10,7 +10,16 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
+from cpunet.cli.values import parse_numbers
+from cpunet.errors import CpunetError
 
+AeRange = Annotated[
+    str | None,
+    typer.Option(
+        "--ae-range",
+        help="More energies for A/E against energy: 900,2350 (keV), if the files have them.",
+    ),
+]
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 
 
@@ -21,6 +30,7 @@ def validate(
     out_folder: Out,
     truth: options.Truth = None,
     rivals: options.Rivals = True,
+    ae_range: AeRange = None,
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,
@@ -39,6 +49,12 @@ def validate(
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.validation.validate import validate_run
 
+    span = None
+    if ae_range is not None:
+        low, high = parse_numbers(ae_range, 2, "--ae-range")
+        if not 0 < low < high:
+            raise CpunetError(f"--ae-range {ae_range}: give two energies, from < to")
+        span = (low, high)
     metrics = validate_run(
         run,
         InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
@@ -47,6 +63,7 @@ def validate(
         truth=truth,
         rivals=rivals,
         seed=seed,
+        ae_range_kev=span,
         device=device,
         force=force,
         monitor=monitor(),

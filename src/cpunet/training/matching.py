@@ -40,6 +40,9 @@ from cpunet.training.response_starts import (
 # Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
 # deviations from which on that is not as it is simulated.
 ONSET, OFF = -15, 4.0
+# Chi-square per moment from which on, with such an onset, nothing else is tried: simulation and
+# data are of different detectors.  Without a ringing that is there it is 50.
+ANOTHER_DETECTOR = 100.0
 # Pulses of each side with which a poor fit is looked at.
 CHECKED = 4096
 # Rounds of optimal weights: those of the second are of where the first has led.
@@ -170,6 +173,8 @@ def fit_response(
         fit = _refined(problem, found, everything, training, listener)
         if not fit.poor:
             return problem.response, fit
+    elif found.cost > ANOTHER_DETECTOR * problem.moments and _onset_is_off(problem, training):
+        return problem.response, _with_wrong_physics(problem, found, training, listener)
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
     if is_poor(problem, found):
         problem, found = free_decay_if_better(problem, found, training, told, listener)

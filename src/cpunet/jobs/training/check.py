@@ -179,6 +179,8 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
         return findings
     for one, side in ((sim, "simulated"), (data, "measured")):
         findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
+    if min(len(sim.prepared), len(data.prepared)) < FEWEST:
+        return findings  # the shapes of so few say nothing
     findings.append(_spread(sim, data))
     findings.append(_amplitude(sim, data))
     return findings

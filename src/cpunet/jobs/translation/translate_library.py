@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,21 +13,26 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
-from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
+from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
+from cpunet.jobs.translation.library_file import (
+    WAVEFORM,
+    libraries,
+    n_templates,
+    require_whole,
+    sampling_period_ns,
+)
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.pulses.preparation import Rejection
-from cpunet.pulses.reading.columns import TIME_UNITS
-from cpunet.pulses.reading.source import BLOCK_BYTES, MOST_SAMPLES
+from cpunet.pulses.reading.source import BLOCK_BYTES
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 
 QUIET = Monitor()
-WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 TEMPLATES_AT_A_TIME = 1024
 KEPT = 256  # templates to measure the linearity with
 # A template of charge ends near its highest value; one of current, or aligned at it, does not.
@@ -116,14 +120,14 @@ def translate_library(
     ren = REN.load(run, resolve_device(device))
     tally = _Tally()
     with opened(source) as given:
-        _require_whole(given, source, set())
-        paths = _libraries(given)
+        require_whole(given, source, set())
+        paths = libraries(given)
         if not paths:
             raise CpunetError(
                 f"{source}: no pulse-shape library (no array waveform_000_deg or the like); "
                 "give a struct{r, z, dt, t0, waveform_000_deg}"
             )
-        total = sum(_n_templates(given, path, source) for path in paths)
+        total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
         with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
             _copy(given, made.h5, _Job(ren, tally, source, currents, advance))
@@ -139,79 +143,6 @@ def translate_library(
         "rejections": {k: n for k, n in tally.counts.items() if k not in numbers and n},
         "linearity": asdict(apart),
     }
-
-
-def _require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
-    """Refuse links that lead nowhere or in circles, and arrays that are mere claims."""
-    info = h5py.h5o.get_info(group.id)
-    if (info.fileno, info.addr) in seen:
-        raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
-    seen.add((info.fileno, info.addr))
-    for name in group:
-        item = group.get(name)
-        if item is None:
-            raise CpunetError(f"{source}: {group.name}: link {name} leads nowhere; remove it")
-        if isinstance(item, h5py.Group):
-            _require_whole(item, source, seen)
-        elif isinstance(item, h5py.Dataset):
-            require_stored(source, item)
-
-
-def _libraries(file: h5py.File) -> list[str]:
-    """Paths of all groups with templates."""
-    found: set[str] = set()
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        group, _, last = name.rpartition("/")
-        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
-            found.add(group)
-
-    file.visititems(visit)
-    return sorted(found)
-
-
-def _n_templates(file: h5py.File, path: str, source: Path) -> int:
-    """Number of templates; refuses a library that is not of the schema."""
-    library = file[path or "/"]
-    where = f"{source}: {path or '/'}"
-    if missing := sorted({"r", "z", "dt"} - set(library)):
-        raise CpunetError(
-            f"{where}: no {missing[0]} beside the waveforms; complete the library"
-        )
-    for name in ("r", "z"):
-        if not is_column(library[name]) or library[name].ndim != 1:
-            raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
-    total = 0
-    for name in filter(WAVEFORM.fullmatch, library):
-        if not isinstance(library[name], h5py.Dataset):
-            raise CpunetError(f"{where}/{name}: is no array; complete the library")
-        shape = library[name].shape
-        expected = (len(library["r"]), len(library["z"]))
-        if library[name].dtype.kind not in "iuf":
-            raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
-        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MOST_SAMPLES:
-            raise CpunetError(
-                f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
-                "(r, z, samples)"
-            )
-        total += shape[0] * shape[1]
-    _dt_ns(library, where)
-    return total
-
-
-def _dt_ns(library: h5py.Group, where: str) -> float:
-    dt = library["dt"]
-    if not is_column(dt) or dt.size != 1:
-        raise CpunetError(f"{where}: dt is no number; complete the library")
-    units = text_attribute(dt, "units")
-    if units not in TIME_UNITS:
-        raise CpunetError(
-            f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
-        )
-    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
-    if not 1e-3 <= value <= 1e9:
-        raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
-    return value
 
 
 @dataclass(frozen=True)
@@ -231,7 +162,7 @@ def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
     replaced = {f"waveform_{angle}" for angle in angles}
     if angles:
         where = f"{job.source}: {given.name.strip('/') or '/'}"
-        job.tally.translate = TemplateTranslator(job.ren, _dt_ns(given, where))
+        job.tally.translate = TemplateTranslator(job.ren, sampling_period_ns(given, where))
         if job.currents:
             replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
     for name, item in given.items():

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cpunet.analysis.ae_energy import against_energy
 from cpunet.analysis.range_survival import survival_by_range
 from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.validation.translations import Translations
@@ -19,11 +20,13 @@ Range = tuple[float, float]
 CUT_PEAK = "DEP"  # by which A/E cuts are set
 
 
-def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelection:
+def validation_selection(
+    names: Sequence[str], recipe: Recipe, more_kev: Sequence[Range] = ()
+) -> EnergySelection:
     """Select named peaks and ranges, and with them all sidebands and continua."""
     chosen = parse_selection(",".join(names), recipe.peaks)
     more = [band for _, bands in _lines(recipe).values() for band in bands]
-    more += recipe.scores.continuum_kev.values()
+    more += [*recipe.scores.continuum_kev.values(), *more_kev]
     return EnergySelection(
         chosen.name, chosen.peaks, chosen.chosen, (*chosen.ranges_kev, *more)
     )
@@ -71,6 +74,21 @@ def range_survivals(
             {name: line for name, line in _lines(recipe).items() if name != CUT_PEAK},
             recipe.scores.continuum_kev,
         )
+    )
+
+
+def ae_against_energy(
+    sim: InputSet, data: InputSet, made: Translations, recipe: Recipe
+) -> dict[str, Any]:
+    """Place and width of A/E's single-site peak against energy, of data and translation.
+
+    All energies that were read take part, see `cpunet.analysis.ae_energy.against_energy`.
+    """
+    windows = {"data": data.prepared.pulses.waveforms, "ren": made.noisy["ren"]}
+    return against_energy(
+        {method: current_amplitude(of_method) for method, of_method in windows.items()},
+        {"data": data.prepared.pulses.energy_kev, "ren": sim.prepared.pulses.energy_kev},
+        {name: span for name, (span, _) in _lines(recipe).items()},
     )
 
 

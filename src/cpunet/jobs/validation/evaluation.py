@@ -23,7 +23,12 @@ from cpunet.jobs.common.inputs import (
 )
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
-from cpunet.jobs.validation.energy_ranges import range_survivals, validation_selection
+from cpunet.jobs.validation.energy_ranges import (
+    Range,
+    ae_against_energy,
+    range_survivals,
+    validation_selection,
+)
 from cpunet.jobs.validation.peak_details import PeakDetails, peak_details
 from cpunet.jobs.validation.peak_sets import PeakSets, peak_sets
 from cpunet.jobs.validation.pulse_tests import survivals
@@ -79,6 +84,7 @@ def evaluate(
     seed: int,
     device: str,
     monitor: Monitor,
+    ae_range_kev: Range | None = None,
 ) -> Evaluation:
     """Translate, compare and judge; see `cpunet.jobs.validation.validate.validate_run`.
 
@@ -92,7 +98,8 @@ def evaluate(
     iren = IREN.load(run, resolve_device(device))
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
-    sim_set, data_set = _load_both(ren, sim, data, names, monitor)
+    more = () if ae_range_kev is None else (ae_range_kev,)
+    sim_set, data_set = _load_both(ren, sim, data, names, more, monitor)
     responses = None if truth is None else Responses(truth, sim_set)
     others = fit_rivals(
         sim_set,
@@ -139,6 +146,7 @@ def evaluate(
                 name: of_peak.ae_against_time for name, of_peak in details.items()
             },
         },
+        "ae_energy": ae_against_energy(sim_set, data_set, made, recipe),
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
         "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
@@ -161,9 +169,14 @@ def evaluate(
 
 
 def _load_both(
-    ren: REN, sim: InputFile, data: InputFile, names: list[str], monitor: Monitor
+    ren: REN,
+    sim: InputFile,
+    data: InputFile,
+    names: list[str],
+    more_kev: tuple[Range, ...],
+    monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
-    selection = validation_selection(names, ren.recipe)
+    selection = validation_selection(names, ren.recipe, more_kev)
     sim_set = load_simulated(sim, ren.recipe, selection, monitor)
     data_set = load_measured(data, ren.recipe, selection, monitor)
     require_same_sampling(sim_set, data_set)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
+from cpunet.analysis.ae_energy_figure import ae_energy_figure
 from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.analysis.baseline_spectra import spectrum_of_noise
 from cpunet.analysis.comparisons import data_axis
@@ -74,7 +76,7 @@ class Drawing:
 def figure_names(peaks: Iterable[str]) -> list[str]:
     """Names of all figures that a validation of these peaks may have."""
     names = [f"{peak} {figure}" for peak in peaks for figure in (*CYCLES, *OF_PEAKS)]
-    return [SPECTRUM, *names, ROC, LOSSES]
+    return [SPECTRUM, AE_ENERGY, *names, ROC, LOSSES]
 
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
@@ -82,6 +84,8 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     made = {SPECTRUM: Drawing("spectrum", {"energy_kev": energies, "peaks": peaks})}
+    if methods := found.metrics["ae_energy"].get("methods"):
+        made[AE_ENERGY] = Drawing(AE_ENERGY, {"methods": methods})
     scored = [peak for peak in found.sets if found.values[peak.name]]
     fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
     forward, backward = CYCLES
@@ -260,6 +264,7 @@ _DRAW: Mapping[str, Callable[..., Figure]] = {
     "mean pulse": _draw_mean_pulse,
     "single pulse": _draw_single_pulse,
     "superpulses": _draw_superpulses,
+    AE_ENERGY: ae_energy_figure,
     "A over E": ae_figure,
     "A over E and drift time": two_dimensional_figure,
     "A over E survival": roc_figure,

@@ -32,6 +32,7 @@ def validate_run(
     truth: Path | None = None,
     rivals: bool = True,
     seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
     device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -56,6 +57,8 @@ def validate_run(
         Fit the rival methods too, which takes most of the time.
     seed
         Of noise and bootstraps.
+    ae_range_kev
+        More energies to read on both sides, for A/E against energy: such as 900 to 2350.
     device, force, monitor
         As for `cpunet.jobs.training.train.train_run`.
 
@@ -70,8 +73,8 @@ def validate_run(
         If the input cannot be used, or no peak can be scored.
     """
     found, _ = validated(
-        run, sim, data, out, truth=truth, rivals=rivals, seed=seed, device=device, force=force,
-        monitor=monitor,
+        run, sim, data, out, truth=truth, rivals=rivals, seed=seed, ae_range_kev=ae_range_kev,
+        device=device, force=force, monitor=monitor,
     )  # fmt: skip
     return found.metrics
 
@@ -85,6 +88,7 @@ def validated(
     truth: Path | None = None,
     rivals: bool = True,
     seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
     device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -95,14 +99,14 @@ def validated(
     ----------
     out
         Report folder; None for none.
-    run, sim, data, truth, rivals, seed, device, force, monitor
+    run, sim, data, truth, rivals, seed, ae_range_kev, device, force, monitor
         As for `validate_run`.
     """
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     score = partial(
         evaluate, run, sim, data, truth=truth, rivals=rivals, seed=seed, device=device,
-        monitor=monitor,
+        monitor=monitor, ae_range_kev=ae_range_kev,
     )  # fmt: skip
     if out is None:
         found = score()

@@ -1,0 +1,149 @@
+"""Ideal libraries made realistic: time and memory, and A/E of real events read out of them.
+
+    python benchmarks/simflow_library.py RUN [--detector icpc] [--grid-mm 0.5] [--ranks 16,64]
+    python benchmarks/simflow_library.py RUN --detector geometry_A.yaml --hits g4_h20mm.npz
+
+RUN holds a readout chain.  Each step is a process of its own, so that its peak memory is known.
+With ``--hits``, whose frame must be the detector's, A/E of events above 600 keV by reboost from
+the library is put beside charges drifted one by one and translated as a whole: at the library's
+own azimuth, and at that of the hits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import awkward as ak
+import numpy as np
+from reboost import units
+from reboost.hpge import psd, utils
+
+from cpunet.jobs.translation.simflow_files import read_library
+from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.events import simulate_events
+from cpunet.simulation.field_lookup import drift_maps, in_active_volume
+from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.translation.library_mode import TemplateTranslator
+from cpunet.translation.peak_currents import currents_about_peak, heights
+from cpunet.translation.translator import REN
+
+SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
+
+
+def run(*words: object) -> None:
+    """Run a command, and print what it took."""
+    begun = time.monotonic()
+    program = "from cpunet.cli.main import main; main()"
+    process = subprocess.Popen([sys.executable, "-c", program, *map(str, words)])
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        sys.exit(f"cpunet {words[0]} failed")
+    print(
+        f"  {' '.join(map(str, words[:2]))}: {time.monotonic() - begun:.0f} s, "
+        f"{used.ru_utime + used.ru_stime:.0f} s of CPU, {used.ru_maxrss / 1000:.0f} MB",
+        flush=True,
+    )
+
+
+def events_of(path: Path, detector: str) -> Hits:
+    """Events above 600 keV: their hits merged, those in the lithium left out."""
+    hits = read_hits(path).hits
+    hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
+    maps = drift_maps(compute_fields(read_detector(detector)), SETTINGS)
+    places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
+    hits = hits.where(np.array([in_active_volume(maps, *place) for place in places]))
+    return hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
+
+
+def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
+    """A/E of whole events, translated."""
+    fields, found = compute_fields(read_detector(detector)), []
+    translate = TemplateTranslator(REN.load(folder), 1.0)
+    for first in range(0, hits.n_events, 500):
+        waveforms = simulate_events(fields, hits[first : first + 500], SETTINGS).waveforms
+        found.append(heights(currents_about_peak(translate(waveforms)[0])[0]) / mode)
+    return np.concatenate(found)
+
+
+def read_out(path: Path, name: str, hits: Hits) -> np.ndarray:
+    """A/E by reboost."""
+    maps = utils.load_hpge_drift_time_maps(str(path), name, (0, 45))
+    template = utils.load_hpge_pulse_shape_library(
+        str(path), name, "waveform_000_deg", out_of_bounds_val=0
+    )
+    counts = np.diff(hits.offsets)
+    x, y, z, kev = (
+        units.attach_units(ak.unflatten(values, counts), unit)
+        for values, unit in (
+            (hits.x_mm, "mm"),
+            (hits.y_mm, "mm"),
+            (hits.z_mm, "mm"),
+            (hits.edep_kev, "keV"),
+        )
+    )
+    r = units.attach_units(ak.unflatten(np.hypot(hits.x_mm, hits.y_mm), counts), "mm")
+    times = psd.drift_time_crystal_axes(x, y, z, maps)
+    highest = psd.maximum_current(kev, times, r=r, z=z, template=template, times=None)
+    return np.asarray(highest) / hits.energy_kev
+
+
+def compare(folder: Path, detector: str, hits: Hits, path: Path) -> None:
+    """Print how far A/E from the library is from the full translation."""
+    library = read_library(path)
+    mode = library.told["mode_per_ns"]
+    turned = replace(hits, x_mm=np.hypot(hits.x_mm, hits.y_mm), y_mm=np.zeros(len(hits.x_mm)))
+    for title, these in (("azimuth 0", turned), ("own azimuth", hits)):
+        full = drifted(folder, detector, these, mode)
+        begun = time.monotonic()
+        apart = 100 * (read_out(path, library.detector, these) / full - 1)
+        taken = time.monotonic() - begun
+        quantiles = np.percentile(np.abs(apart), [50, 90, 99, 100])
+        print(
+            f"  {hits.n_events} events, {title}: A/E apart by "
+            + ", ".join(f"{q:.3f}" for q in quantiles)
+            + f" % (50, 90, 99, 100 %); within 0.2 %: {100 * (np.abs(apart) < 0.2).mean():.2f}"
+            f" %; reboost {taken:.0f} s",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Make, translate, compare."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--detector", default="icpc")
+    parser.add_argument("--grid-mm", type=float, default=0.5)
+    parser.add_argument("--ranks", default="16,64")
+    parser.add_argument("--hits", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        ideal, whole = Path(folder) / "ideal.lh5", Path(folder) / "psl.lh5"
+        run("library", "make", "--detector", given.detector, "--grid-mm", given.grid_mm,
+            "--out", ideal)  # fmt: skip
+        words = ["library", "translate", given.run, ideal, "--format", "simflow"]
+        name = read_detector(given.detector).name
+        words += ["--detector", name] if name else []
+        run(*words, "--out", whole)
+        files = [ideal, whole]
+        for rank in given.ranks.split(","):
+            files.append(Path(folder) / f"rank{rank}.lh5")
+            run(*words, "--low-rank", rank, "--out", files[-1])
+        for file in files:
+            print(f"  {file.name}: {file.stat().st_size / 1e6:.1f} MB")
+        if given.hits:
+            compare(given.run, given.detector, events_of(given.hits, given.detector), whole)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""What the lithium layer's delayed charge, and trapping, do to A/E and late charge.
+
+    python benchmarks/surface_and_trapping.py RUN [--detector icpc]
+
+Pulses are those of RUN's readout chain, without noise and decays.  From depths of a lithium
+layer of 1 mm at half of the crystal's height: the share that is collected, A/E and late charge
+against a hit at the layer's inner boundary.  Of hits all over the crystal: what trapping
+changes, median and the range from 16 to 84 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+
+from cpunet.electronics.exponentials import Exponentials
+from cpunet.jobs.inspection.response import learned_chain
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.lithium import LithiumLayer, arrived, delayed
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.signals import hit_signals
+from cpunet.translation.peak_currents import currents_about_peak, heights
+from cpunet.translation.translator import REN
+
+DEPTHS_MM = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6)
+LENGTH, PLATEAU = 12_000, 10_000  # ns
+HITS = 500
+TRAPPING = ("hole_trapping_per_us", "electron_trapping_per_us")
+
+
+def settings(**more: float) -> SimulationSettings:
+    """Samples of 1 ns, as long as the record."""
+    return SimulationSettings(dt_ns=1.0, length_ns=LENGTH, **more)
+
+
+def told(undecayed: Exponentials, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A/E, and late charge (ns): the area missing after 80 % of what has come in 10 us."""
+    step = undecayed.step(np.arange(LENGTH, dtype=float))
+    size = scipy.fft.next_fast_len(2 * LENGTH, real=True)
+    impulse = scipy.fft.rfft(np.diff(step, prepend=0.0), size)
+    signal = scipy.fft.irfft(scipy.fft.rfft(fine.astype(float), size) * impulse, size)
+    signal = signal[:, :LENGTH] / signal[:, PLATEAU : PLATEAU + 1]
+    currents, _ = currents_about_peak(signal)
+    late = np.arange(PLATEAU) > (signal < 0.8).argmin(axis=1)[:, None]
+    return heights(currents), ((1 - signal[:, :PLATEAU]) * late).sum(axis=1)
+
+
+def of_the_layer(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:
+    """Print a table by depth."""
+    layer = LithiumLayer(1.0)
+    r = detector.crystal_radius - detector.li_thickness - 0.1
+    pulse = hit_signals(fields, r, 0, 0.5 * detector.crystal_length, 1000.0, settings())
+    assert pulse.valid.all()
+    share = arrived(layer, DEPTHS_MM, np.arange(LENGTH, dtype=float))
+    late = delayed(np.repeat(pulse.waveforms, len(DEPTHS_MM), axis=0), share)
+    amplitude, charge = told(chain, late)
+    print("depth mm   collected %   A/E against bulk   late charge ns (less bulk's)")
+    for depth, end, a, lq in zip(DEPTHS_MM, share[:, -1], amplitude, charge, strict=True):
+        relative, more = a / amplitude[0], lq - charge[0]
+        print(f"{depth:8.2f} {100 * end:13.1f} {relative:18.4f} {more:16.1f}")
+
+
+def of_trapping(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:
+    """Print what each kind of trapping changes."""
+    rng = np.random.default_rng(0)
+    r = detector.crystal_radius * np.sqrt(rng.random(4 * HITS))
+    z = detector.crystal_length * rng.random(4 * HITS)
+    phi = rng.uniform(0, 2 * np.pi, 4 * HITS)
+    places = (r * np.cos(phi), r * np.sin(phi), z)
+    without = hit_signals(fields, *places, 1000.0, settings())
+    chosen = np.flatnonzero(without.valid & without.collected)[:HITS]
+    places = tuple(axis[chosen] for axis in places)
+    amplitude, charge = told(chain, without.waveforms[chosen])
+    print("trapping         collected   A/E             late charge ns")
+    for name in TRAPPING:
+        for rate in (0.005, 0.02):
+            with_it = hit_signals(fields, *places, 1000.0, settings(**{name: rate}))
+            waveforms = with_it.waveforms
+            a, lq = told(chain, waveforms / waveforms[:, -1:])
+            lines = [
+                np.quantile(change, (0.5, 0.16, 0.84))
+                for change in (
+                    -100 * with_it.trapped,
+                    100 * (a / amplitude - 1),
+                    lq - charge,
+                )
+            ]
+            print(
+                f"{name.partition('_')[0]:9}{rate:g}/us  "
+                + "  ".join(f"{m:+.3f} ({lo:+.3f} to {hi:+.3f})" for m, lo, hi in lines)
+            )
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--detector", default="icpc")
+    given = parser.parse_args()
+    backend = REN.load(given.run).backend
+    chain = learned_chain(backend.chain.response, "run").undecayed
+    detector = read_detector(given.detector)
+    fields = compute_fields(detector)
+    of_the_layer(chain, detector, fields)
+    of_trapping(chain, detector, fields)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""A/E against energy in a picture and in a table: points, and the lines through them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpunet.analysis.ae_energy import REFERENCE_KEV
+from cpunet.analysis.nested_tables import html_table, with_std
+from cpunet.analysis.style import colours, label, styled
+
+FIGURE = "A over E and energy"
+
+
+@styled
+def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
+    """Place of the single-site peak less 1, and its width, against energy.
+
+    Parameters
+    ----------
+    methods
+        ``methods`` of `ae_energy.against_energy`.
+    """
+    figure = Figure(figsize=(6.4, 5.6))
+    above, below = figure.subplots(2, 1, sharex=True)
+    palette = colours(methods)
+    for method, found in methods.items():
+        points, colour = found["points"], palette[method]
+        energy, mean, error, sigma, sigma_error = (
+            np.array([point[name] for point in points], float)
+            for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
+        )
+        scale, line, law = found["scale"], found["mean"], found["resolution"]
+        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
+        above.errorbar(energy, 100 * (mean / scale - 1), 100 * error / scale, **look)
+        below.errorbar(energy, 100 * sigma / mean, 100 * sigma_error / mean, **look)
+        along = np.linspace(energy.min(), energy.max(), 100)
+        told = f"{label(method)}: {line['per_mev_percent']:+.3f} ± "
+        told += f"{line['per_mev_error_percent']:.3f} % per MeV"
+        above.plot(along, 100 * (line["a"] * along + line["b"] - 1), color=colour, label=told)
+        width = np.sqrt(law["a"] + (law["b"] / along) ** law["c"])
+        below.plot(along, 100 * width, color=colour)
+    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
+    below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
+    above.legend()
+    return figure
+
+
+def ae_energy_html(found: Mapping[str, Any], figure: str) -> str:
+    """Return the section's content: a sentence, a table of the lines, and the figure."""
+    if not found:
+        return ""
+    if "missing" in found:
+        return f'<p class="gap">None recorded: {escape(str(found["missing"]))}.</p>'
+    rows = []
+    for method, one in found["methods"].items():
+        line, law = one["mean"], one["resolution"]
+        rows.append(
+            [
+                label(method),
+                with_std(line["per_mev_percent"], line["per_mev_error_percent"]),
+                f"{line['chi_square']:.1f} / {line['degrees']}",
+                f"{100 * np.sqrt(law['a']):.2f}",
+                f"{law['b']:.2f}",
+                f"{law['at_reference_percent']:.2f}",
+            ]
+        )
+    head = [
+        "Method",
+        "Slope [% per MeV]",
+        "χ² / degrees",
+        "Width at all energies [%]",
+        "Noise [keV]",
+        f"Width at {REFERENCE_KEV:g} keV [%]",
+    ]
+    about = (
+        "Place and width of the single-site peak of A/E in ranges of energy: a Gaussian with a "
+        "tail below. The lines are those that `cpunet export --to legend-pars` writes."
+    )
+    if found.get("multi_site"):
+        about += (
+            " There are too few events off the lines, so that SEP and FEP take part, although "
+            "most of their events have several sites: slopes can be compared, but are no more "
+            "than a guess of that of single sites. With `--ae-range 900,2350` the continuum is "
+            "read, if the files have it."
+        )
+    return f"<p>{escape(about)}</p>\n{html_table(head, rows, words={0})}\n{figure}"

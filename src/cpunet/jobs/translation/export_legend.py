@@ -1,0 +1,233 @@
+"""A run in; what it has learned as parameters of LEGEND's simulation chain out.
+
+The files are those of legend-simflow: electronics (``elecmod``), the mean of A/E against energy
+(``aoemeanmod``) and its resolution (``aoeresmod``), each under the detector's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+import cpunet
+from cpunet.electronics.equivalent import Equivalent, ae_ratios, current_delay_ns
+from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
+from cpunet.electronics.exponentials import Exponentials
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.hdf5_files import opened
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.response import describe_responses, learned_chain
+from cpunet.jobs.translation.library_file import require_whole
+from cpunet.jobs.translation.simflow_checks import (
+    IdealLibrary,
+    chosen_libraries,
+    known_detector,
+)
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.outputs import FolderKind, refuse_existing
+from cpunet.regular_files import read_text
+from cpunet.training.run_folder import read_info, weights_sha256
+from cpunet.translation.backends import ResponseBackend
+from cpunet.translation.translator import REN
+from cpunet.yaml_files import MOST_BYTES, plain_json
+
+QUIET = Monitor()
+WHOLE = "cpunet.yaml"
+LEGEND_PARS = FolderKind(
+    name="legend-pars",
+    command="cpunet export --to legend-pars",
+    known_by=WHOLE,
+    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
+)
+TEMPLATES = 2000  # of a library, on which the two-number kernel is tried
+EVERY_DETECTOR = "default"  # the name under which production looks for what has none
+SAME = ("recipe", "peak", "seed")  # of a report and its run
+
+
+def export_legend_pars(
+    run: Path,
+    out: Path,
+    *,
+    detector: str | None = None,
+    report: Path | None = None,
+    library: Path | None = None,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Write a folder of parameters as LEGEND's simulation chain reads them.
+
+    ``elecmod.yaml`` holds sigma and tau of the nearest Gaussian ⊗ exponential, in ns;
+    ``aoemeanmod.yaml`` the translation's mean of A/E against energy in keV, 1 at 1592.5 keV;
+    ``aoeresmod.yaml`` the data's resolution of A/E; ``cpunet.yaml`` the whole chain with its
+    errors, the error that two numbers make, and delays by which drift times are counted.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run with a readout chain.
+    out
+        Folder to make.
+    detector
+        Name of the entries; by default that of the detector that the run was trained with,
+        or else ``default``.
+    report
+        Folder of a report on this run: A/E is taken from there.  Without, its two files are
+        not written.
+    library
+        Library of ideal charge pulses, on which the error of two numbers is measured.
+    force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Returns
+    -------
+    dict
+        The content of ``cpunet.yaml``, under the detector's name.
+
+    Raises
+    ------
+    CpunetError
+        If the run has no readout chain, or the report is of another run or has no A/E.
+    """
+    given = (run, report, library)
+    refuse_existing(out, *given, force=force)
+    info = read_info(run)
+    told = describe_responses([run])["runs"][0]
+    known = known_detector(run, info)
+    name = detector or known or EVERY_DETECTOR
+    ae = None if report is None else _against_energy(report, info)
+    undecayed = _chain(run).undecayed
+    with monitor.stage("Two numbers for the chain"):
+        nearest = fitted_kernel(undecayed)
+        equivalent: dict[str, Any] = asdict(nearest)
+        if library is not None:
+            wanted = () if detector is None else (detector,)
+            equivalent["of_library"] = _of_library(library, wanted, known, undecayed, nearest)
+    whole = {
+        "made_of": {
+            "cpunet": cpunet.__version__,
+            "weights": weights_sha256(run),
+            **{key: info[key] for key in (*SAME, "dt_ns")},
+        },
+        "electronics": {
+            "equivalent": equivalent,
+            "chain": told["parameters"],
+            "chain_errors": told["parameter_errors"],
+            "numbers": told["values"],
+        },
+        "drift_time": {
+            "current_maximum_delay_ns": current_delay_ns(undecayed),
+            "about": "time of the largest averaged current less this is a charge's drift time",
+        },
+        "ae_against_energy": {} if ae is None else ae["methods"],
+    }
+    pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}}
+    pars |= {} if ae is None else _ae_pars(ae)
+    with folder_written_aside(
+        out, LEGEND_PARS, *given, force=force, note=monitor.note
+    ) as folder:
+        for kind, content in pars.items():
+            _write(folder / f"{kind}.yaml", {name: content})
+        _write(folder / WHOLE, {name: whole})
+    return {name: whole}
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    text = yaml.safe_dump(_plain(content), sort_keys=False, allow_unicode=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Plain Python all through; YAML knows no other numbers."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _chain(run: Path) -> Any:
+    backend = REN.load(run).backend
+    assert isinstance(backend, ResponseBackend)  # or it had no response to describe
+    chain: ResponseGenerator = backend.chain
+    return learned_chain(chain.response, run.name)
+
+
+def _against_energy(report: Path, info: Mapping[str, Any]) -> dict[str, Any]:
+    path = report / "metrics.json"
+    try:
+        metrics = plain_json(read_text(path, MOST_BYTES))
+        training, found = metrics["training"], metrics["ae_energy"]
+        other = [key for key in SAME if training[key] != info[key]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CpunetError(
+            f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
+        ) from error
+    if other:
+        raise CpunetError(
+            f"{report}: of a run with {other[0]} {training[other[0]]}, this one has "
+            f"{info[other[0]]}; validate this run"
+        )
+    if "missing" in found:
+        raise CpunetError(f"{report}: no A/E against energy: {found['missing']}")
+    return dict(found)
+
+
+def _ae_pars(ae: Mapping[str, Any]) -> dict[str, Any]:
+    """Entries of production for A/E: the mean of the translation, the width of the data."""
+    mean = ae["methods"]["ren"]["mean"]
+    width = ae["methods"]["data"]["resolution"]
+    return {
+        "aoemeanmod": {
+            "psl": {"expression": "x*a+b", "pars": {k: mean[k] for k in ("a", "b")}}
+        },
+        "aoeresmod": {
+            "expression": "SigmaFit",
+            "parameters": {k: width[k] for k in ("a", "b", "c")},
+        },
+    }
+
+
+def _of_library(
+    source: Path,
+    wanted: Sequence[str],
+    known: str | None,
+    undecayed: Exponentials,
+    nearest: Equivalent,
+) -> dict[str, Any]:
+    """What two numbers do to A/E of a detector's places, against the chain."""
+    with opened(source) as file:
+        require_whole(file, source, set())
+        held = chosen_libraries(file, source, wanted, known)
+        library = IdealLibrary.of(file, held[0], source)
+        values = file[f"{library.path}/waveform_{library.angles[0]}"]
+        charge = _some(values)
+    if not len(charge):
+        raise CpunetError(f"{source}: {library.path}: no template of charge")
+    rng = np.random.default_rng(0)
+    share = rng.random((len(charge), 1), np.float32)
+    two_sites = share * charge + (1 - share) * charge[rng.permutation(len(charge))]
+    alone = ae_ratios(charge, undecayed, nearest)
+    usual = float(np.median(alone))  # taken off, as A/E is calibrated
+    return {"library": library.path, "templates": len(charge)} | {
+        name: {"rms_percent": float(apart.std()), "largest_percent": float(np.abs(apart).max())}
+        for name, apart in (
+            ("single_site", 100 * (alone / usual - 1)),
+            ("two_sites", 100 * (ae_ratios(two_sites, undecayed, nearest) / usual - 1)),
+        )
+    }
+
+
+def _some(values: Any) -> npt.NDArray[np.float32]:
+    """Templates of every few rows of r, not more than some thousand."""
+    n_r, n_z, _ = values.shape
+    step = max(1, n_r * n_z // TEMPLATES)
+    rows = [np.asarray(values[i], np.float32) for i in range(0, n_r, step)]
+    block = np.concatenate(rows)
+    return block[np.isfinite(block).all(axis=1) & block.any(axis=1)]

@@ -1,0 +1,90 @@
+"""What a pulse-shape library must be before anything is done with it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.hdf5_files import is_column, require_stored, text_attribute
+from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.pulses.reading.source import MOST_SAMPLES
+
+WAVEFORM = re.compile(r"waveform_\d{3}_deg")
+
+
+def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
+    """Refuse links that lead nowhere or in circles, and arrays that are mere claims."""
+    info = h5py.h5o.get_info(group.id)
+    if (info.fileno, info.addr) in seen:
+        raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
+    seen.add((info.fileno, info.addr))
+    for name in group:
+        item = group.get(name)
+        if item is None:
+            raise CpunetError(f"{source}: {group.name}: link {name} leads nowhere; remove it")
+        if isinstance(item, h5py.Group):
+            require_whole(item, source, seen)
+        elif isinstance(item, h5py.Dataset):
+            require_stored(source, item)
+
+
+def libraries(file: h5py.File) -> list[str]:
+    """Paths of all groups with templates."""
+    found: set[str] = set()
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        group, _, last = name.rpartition("/")
+        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
+            found.add(group)
+
+    file.visititems(visit)
+    return sorted(found)
+
+
+def n_templates(file: h5py.File, path: str, source: Path) -> int:
+    """Number of templates; refuses a library that is not of the schema."""
+    library = file[path or "/"]
+    where = f"{source}: {path or '/'}"
+    if missing := sorted({"r", "z", "dt"} - set(library)):
+        raise CpunetError(
+            f"{where}: no {missing[0]} beside the waveforms; complete the library"
+        )
+    for name in ("r", "z"):
+        if not is_column(library[name]) or library[name].ndim != 1:
+            raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
+    total = 0
+    for name in filter(WAVEFORM.fullmatch, library):
+        if not isinstance(library[name], h5py.Dataset):
+            raise CpunetError(f"{where}/{name}: is no array; complete the library")
+        shape = library[name].shape
+        expected = (len(library["r"]), len(library["z"]))
+        if library[name].dtype.kind not in "iuf":
+            raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
+        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MOST_SAMPLES:
+            raise CpunetError(
+                f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
+                "(r, z, samples)"
+            )
+        total += shape[0] * shape[1]
+    sampling_period_ns(library, where)
+    return total
+
+
+def sampling_period_ns(library: h5py.Group, where: str) -> float:
+    """Sampling period of a library's templates in ns."""
+    dt = library["dt"]
+    if not is_column(dt) or dt.size != 1:
+        raise CpunetError(f"{where}: dt is no number; complete the library")
+    units = text_attribute(dt, "units")
+    if units not in TIME_UNITS:
+        raise CpunetError(
+            f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
+        )
+    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
+    if not 1e-3 <= value <= 1e9:
+        raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
+    return value

@@ -1,0 +1,87 @@
+"""What a lithium layer collects, and when, as a file for reboost's surface model."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.simulation.lithium import LithiumLayer, arrived
+
+LENGTH_NS, STEP_MM = 10_000, 0.01  # as reboost tabulates
+
+
+def write_lithium_library(
+    layer: LithiumLayer,
+    out: Path,
+    *,
+    name: str = "lithium",
+    step_mm: float = STEP_MM,
+    force: bool = False,
+) -> dict[str, float]:
+    """Tabulate the charge that arrives from the depths of a layer.
+
+    The LH5 file holds ``struct{depth, dt, t0, arrived, activeness}``: depths in mm from the
+    surface, shares of the charge that have arrived after each nanosecond, shape (times,
+    depths) as `reboost.hpge.psd.make_convolved_surface_library` takes them, and those at the
+    end.
+
+    Parameters
+    ----------
+    layer
+        Its numbers.
+    out
+        LH5 file to write.
+    name
+        Of the group.
+    step_mm
+        From depth to depth.
+    force
+        Replace an existing file.
+
+    Returns
+    -------
+    dict
+        ``dead_mm``, the depth at which half of the charge arrives, and ``half_ns``, by when a
+        charge from there has delivered half of what it will.
+
+    Raises
+    ------
+    CpunetError
+        If the step is no part of the layer, or the file cannot be written.
+    """
+    refuse_existing(out, force=force)
+    if not (math.isfinite(step_mm) and 0 < step_mm <= layer.thickness_mm):
+        raise CpunetError(
+            f"depths every {step_mm} mm in a layer of {layer.thickness_mm} mm; give less"
+        )
+    depth = step_mm * np.arange(round(layer.thickness_mm / step_mm))
+    time = np.arange(LENGTH_NS, dtype=float)
+    share = arrived(layer, depth, time)
+    arrays = {
+        "depth": (depth, "mm"),
+        "dt": (np.array(1.0), "ns"),
+        "t0": (np.array(0.0), "ns"),
+        "arrived": (share.T.copy(), ""),
+        "activeness": (share[:, -1].copy(), ""),
+    }
+    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        group = made.h5.create_group(name)
+        for key, (values, units) in arrays.items():
+            group[key] = values
+            kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
+            group[key].attrs.update({"datatype": kind, "units": units})
+        group.attrs["datatype"] = f"struct{{{','.join(arrays)}}}"
+        group.attrs["cpunet"] = json.dumps({"cpunet": cpunet.__version__} | asdict(layer))
+    ends = share[:, -1]
+    dead = float(np.interp(0.5, ends, depth))
+    middle = arrived(layer, [dead], time)[0]
+    return {"dead_mm": dead, "half_ns": float(np.interp(0.5 * middle[-1], middle, time))}

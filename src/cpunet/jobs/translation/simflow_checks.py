@@ -1,0 +1,204 @@
+"""Which libraries of a file are translated for production, and why one cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened, text_attribute
+from cpunet.jobs.translation.library_file import (
+    WAVEFORM,
+    libraries,
+    n_templates,
+    sampling_period_ns,
+)
+from cpunet.regular_files import read_text
+from cpunet.translation.ring_padding import padded_axis
+from cpunet.yaml_files import MOST_BYTES, parsed, plain_json
+
+PERIOD_NS = 1.0
+PULSES = "geds/sim"  # of an output of `cpunet simulate`, which tells how it was made
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+LARGEST_MM = 500.0  # of any crystal
+
+Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class IdealLibrary:
+    """Where the templates of a detector stand.
+
+    Attributes
+    ----------
+    path
+        Of the group, the detector's name.
+    r_mm, z_mm, dt_ns
+        Nodes and sampling period.
+    angles
+        Such as ``"000_deg"``, ascending.
+    """
+
+    path: str
+    r_mm: Values
+    z_mm: Values
+    dt_ns: float
+    angles: tuple[str, ...]
+
+    @classmethod
+    def of(cls, file: h5py.File, path: str, source: Path) -> Self:
+        """Read the axes of a library.
+
+        Raises
+        ------
+        CpunetError
+            If these are no nodes, or templates are not sampled every nanosecond.
+        """
+        where = f"{source}: {path or '/'}"
+        if not path:
+            raise CpunetError(
+                f"{source}: the library stands at the top of the file; production finds it "
+                "under the detector's name: write it into a group of this name"
+            )
+        n_templates(file, path, source)
+        group = file[path]
+        dt_ns = sampling_period_ns(group, where)
+        if not np.isclose(dt_ns, PERIOD_NS):
+            raise CpunetError(
+                f"{where}: sampled every {dt_ns:g} ns, production reads templates of 1 ns; "
+                "make the library with a period of 1 ns, or leave out --format simflow"
+            )
+        names = sorted(filter(WAVEFORM.fullmatch, group))
+        angles = tuple(name.removeprefix("waveform_") for name in names)
+        r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
+        return cls(path, r_mm, z_mm, dt_ns, angles)
+
+    @property
+    def n_templates(self) -> int:
+        """Places times angles."""
+        return len(self.r_mm) * len(self.z_mm) * len(self.angles)
+
+    def padded_axes(self, rings: int) -> tuple[Values, Values]:
+        """Nodes with rings about them: none at a negative radius."""
+        return padded_axis(self.r_mm, 0, rings), padded_axis(self.z_mm, rings, rings)
+
+
+def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
+    units = text_attribute(column, "units")
+    if units not in MM_PER_UNIT:
+        raise CpunetError(
+            f"{where}: {name} is in {units!r}; known units are {', '.join(MM_PER_UNIT)}"
+        )
+    values = np.asarray(column[()], np.float64) * MM_PER_UNIT[units]
+    if len(values) < 2 or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
+        raise CpunetError(
+            f"{where}: {name} does not ascend from node to node; write the library again"
+        )
+    if np.abs(values).max() > LARGEST_MM:
+        raise CpunetError(
+            f"{where}: {name} reaches {np.abs(values).max():g} mm, beyond any crystal; are its "
+            f"units ({units}) right?"
+        )
+    return values
+
+
+def chosen_libraries(
+    file: h5py.File, source: Path, wanted: Sequence[str], known: str | None
+) -> list[str]:
+    """Paths of the libraries to translate.
+
+    Parameters
+    ----------
+    file, source
+        The file and its name.
+    wanted
+        Names that the user gives; empty for no choice.
+    known
+        The detector that the run was trained with, if it tells.
+
+    Raises
+    ------
+    CpunetError
+        If one is not there, or none is of the run's detector.
+    """
+    there = libraries(file)
+    if not there:
+        raise CpunetError(
+            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
+            "struct{r, z, dt, t0, waveform_000_deg}"
+        )
+    held = ", ".join(path or "/" for path in there)
+    for name in wanted:
+        if name not in there:
+            raise CpunetError(f"{source}: no library of {name}; the file has {held}")
+    if wanted:
+        return list(dict.fromkeys(wanted))
+    if known is None:
+        return there
+    if known not in there:
+        raise CpunetError(
+            f"{source}: a library of {held}, but the run was trained with a simulation of "
+            f"{known}; give the library of {known}, or --detector {there[0]} to use this one "
+            "all the same"
+        )
+    return [known]
+
+
+def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
+    """Name of the detector whose simulation a run was trained with, if that can be found."""
+    try:
+        described = parsed(read_text(Path(run) / "detector.yaml", MOST_BYTES))
+        name = described.get("name") if isinstance(described, dict) else None
+    except (OSError, ValueError, CpunetError):
+        name = None
+    if name:
+        return str(name)
+    sim = info.get("sim")
+    file = Path(str(sim.get("file"))) if isinstance(sim, Mapping) else None
+    if file is None or not file.is_file():
+        return None
+    try:
+        with opened(file) as content:
+            pulses = content.get(PULSES)
+            told = pulses.attrs.get("simulation") if pulses is not None else None
+        made = plain_json(str(told)) if told else {}
+        return str(made["detector"]["name"]) or None
+    except (CpunetError, ValueError, KeyError, TypeError):
+        return None
+
+
+def require_complete(
+    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary, source: Path
+) -> None:
+    """Refuse a library that lacks whole rows of places between others.
+
+    Raises
+    ------
+    CpunetError
+        If an azimuth has no template, or a row of r or of z has none although rows on both
+        sides of it have.
+    """
+    for angle, mask in inside.items():
+        if not mask.any():
+            raise CpunetError(
+                f"{source}: {library.path}: no template of {angle} can be translated; simulate "
+                "this azimuth again, or leave it out"
+            )
+        for name, axis, rows in (
+            ("r", library.r_mm, mask.any(axis=1)),
+            ("z", library.z_mm, mask.any(axis=0)),
+        ):
+            held = np.flatnonzero(rows)
+            missing = np.setdiff1d(np.arange(held[0], held[-1]), held) if len(held) else held
+            if len(missing):
+                raise CpunetError(
+                    f"{source}: {library.path}: {len(missing)} rows of {angle} are NaN between "
+                    f"others, the first at {name} {axis[missing[0]]:g} mm; simulate these "
+                    "places again"
+                )

@@ -1,0 +1,348 @@
+"""Realistic libraries as files: written, read, merged, and components made whole again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Self
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.hdf5_files import is_column, opened, require_all_stored
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.translation.low_rank import Loss
+from cpunet.translation.peak_currents import LENGTH, PEAK
+
+Floats = npt.NDArray[np.float32]
+Values = npt.NDArray[np.float64]
+
+TOLD = "cpunet"  # attribute of a library: JSON of how it was made
+_COMPONENTS = "components"
+_PACKED: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+
+
+@dataclass(frozen=True, eq=False)
+class AngleArrays:
+    """Where currents and drift times of one azimuth go."""
+
+    values: h5py.Dataset
+    times: h5py.Dataset
+    basis: Floats | None
+
+    def put(self, rows: slice, currents: Floats, loss: Loss) -> None:
+        """Write rows of r: currents (rows, z, samples), as they are or as coefficients."""
+        if self.basis is None:
+            self.values[rows] = currents
+            return
+        there = ~np.isnan(currents[:, :, 0])
+        coefficients = np.full((*there.shape, len(self.basis)), np.nan, np.float32)
+        coefficients[there] = currents[there] @ self.basis.T
+        loss.add(currents[there], coefficients[there], self.basis)
+        self.values[rows] = coefficients
+
+    def put_times(self, times_ns: Floats | Values) -> None:
+        """Write the drift times of all places."""
+        self.times[...] = times_ns
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A realistic library that is being written."""
+
+    group: h5py.Group
+    basis: Floats | None
+
+    @classmethod
+    def begin(
+        cls, group: h5py.Group, r_mm: Values, z_mm: Values, dt_ns: float, basis: Floats | None
+    ) -> Self:
+        """Write axes and components."""
+        _column(group, "r", r_mm, "mm")
+        _column(group, "z", z_mm, "mm")
+        _column(group, "dt", np.array(dt_ns, float), "ns")
+        _column(group, "t0", np.array(-PEAK * dt_ns, float), "ns")
+        if basis is not None:
+            _column(group, _COMPONENTS, basis, "")
+        return cls(group, basis)
+
+    def angle(self, angle: str) -> AngleArrays:
+        """Arrays of one azimuth, such as ``"000_deg"``."""
+        shape = (len(self.group["r"]), len(self.group["z"]))
+        name, length = f"waveform_{angle}", LENGTH
+        if self.basis is not None:
+            name, length = f"coefficients_{angle}", len(self.basis)
+        values = self.group.create_dataset(
+            name, (*shape, length), np.float32, chunks=(1, shape[1], length), **_PACKED
+        )
+        values.attrs.update({"datatype": "array<3>{real}", "units": ""})
+        times = self.group.create_dataset(f"drift_time_{angle}", shape, np.float32)
+        times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
+        return AngleArrays(values, times, self.basis)
+
+
+def _column(group: h5py.Group, name: str, values: npt.NDArray[Any], units: str) -> None:
+    group[name] = values
+    kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
+    group[name].attrs.update({"datatype": kind, "units": units})
+
+
+def describe(group: h5py.Group, told: str) -> None:
+    """Finish a library: LH5's attribute, and how it was made."""
+    group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
+    group.attrs[TOLD] = told
+    parent = group.parent
+    while parent.name != "/":  # LH5 wants every level to say what it holds
+        parent.attrs["datatype"] = f"struct{{{','.join(sorted(parent))}}}"
+        parent = parent.parent
+
+
+@dataclass(frozen=True, eq=False)
+class RealisticLibrary:
+    """Currents of a detector, in units of its most frequent A/E.
+
+    Attributes
+    ----------
+    detector
+        Its name in the file.
+    r_mm, z_mm
+        Nodes.
+    dt_ns, t0_ns
+        Sampling period, and time of the first sample before the maximum.
+    drift_time_ns
+        By azimuth in degrees, shape (r, z); NaN where there is no template.
+    told
+        How the library was made.
+    """
+
+    detector: str
+    r_mm: Values
+    z_mm: Values
+    dt_ns: float
+    t0_ns: float
+    drift_time_ns: dict[int, Floats]
+    told: dict[str, Any]
+    _stored: dict[int, Floats]
+    _basis: Floats | None
+
+    @property
+    def rank(self) -> int | None:
+        """Number of components; None for a library of whole templates."""
+        return None if self._basis is None else len(self._basis)
+
+    def template(self, r_mm: float, z_mm: float, angle: int = 0) -> Floats:
+        """The current of the node next to a place, shape (samples,)."""
+        i = int(np.abs(self.r_mm - r_mm).argmin())
+        j = int(np.abs(self.z_mm - z_mm).argmin())
+        stored = self._stored[angle][i, j]
+        return stored if self._basis is None else np.asarray(stored @ self._basis)
+
+    def currents(self, angle: int = 0) -> Floats:
+        """All templates of an azimuth, shape (r, z, samples)."""
+        stored = self._stored[angle]
+        return stored if self._basis is None else np.asarray(stored @ self._basis)
+
+    def for_reboost(self, angle: int = 0) -> Any:
+        """As `reboost.hpge.psd.maximum_current` takes it, 0 where there is no template.
+
+        Raises
+        ------
+        CpunetError
+            If reboost is not installed.
+        """
+        try:
+            utils, units = map(import_module, ("reboost.hpge.utils", "reboost.units"))
+        except ImportError as error:
+            raise CpunetError(
+                "reboost is not installed; `pip install reboost`, or use `currents`"
+            ) from error
+        currents = np.nan_to_num(self.currents(angle), nan=0.0)
+        times = self.t0_ns + self.dt_ns * np.arange(currents.shape[2])
+        mm, ns = units.ureg.mm, units.ureg.ns
+        return utils.HPGePulseShapeLibrary(currents, mm, mm, ns, self.r_mm, self.z_mm, times)
+
+
+def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
+    """Read a realistic library, of whole templates or of components.
+
+    Parameters
+    ----------
+    path
+        LH5 file that `cpunet library translate --format simflow` or `merge` made.
+    detector
+        Name of the library; may be left out if the file has one.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such library in the file.
+    """
+    with opened(path) as file:
+        require_all_stored(path, file)
+        names = realistic_libraries(file)
+        if detector is None and len(names) == 1:
+            detector = names[0]
+        if detector not in names:
+            held = ", ".join(names) or "none"
+            wish = "name the detector" if detector is None else f"no library of {detector}"
+            raise CpunetError(f"{path}: {wish}; the file has {held}")
+        group = file[detector]
+        basis = group.get(_COMPONENTS)
+        prefix = "waveform_" if basis is None else "coefficients_"
+        arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
+        try:
+            told = json.loads(group.attrs.get(TOLD, "{}"))
+        except ValueError:
+            told = {}
+        return RealisticLibrary(
+            str(detector),
+            np.asarray(group["r"][()], np.float64),
+            np.asarray(group["z"][()], np.float64),
+            float(group["dt"][()]),
+            float(group["t0"][()]),
+            {angle: group[n.replace(prefix, "drift_time_")][()] for angle, n in arrays.items()},
+            told,
+            {angle: group[name][()] for angle, name in arrays.items()},
+            None if basis is None else basis[()],
+        )
+
+
+def realistic_libraries(file: h5py.File) -> list[str]:
+    """Paths of groups that are realistic libraries."""
+    found: list[str] = []
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Group) and _is_realistic(item):
+            found.append(name)
+
+    file.visititems(visit)
+    return sorted(found)
+
+
+def _is_realistic(group: h5py.Group) -> bool:
+    if not all(is_column(group.get(name)) for name in ("r", "z", "dt", "t0")):
+        return False
+    shape = (len(group["r"]), len(group["z"]))
+    names = [n for n in group if n.startswith(("waveform_", "coefficients_"))]
+    times = [f"drift_time_{n.split('_', 1)[1]}" for n in names]
+    whole = [n for n in names if isinstance(group[n], h5py.Dataset) and group[n].ndim == 3]
+    return (
+        bool(names)
+        and whole == names
+        and all(
+            isinstance(group.get(t), h5py.Dataset)
+            and group[t].shape == shape == group[n].shape[:2]
+            for t, n in zip(times, names, strict=True)
+        )
+    )
+
+
+def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) -> list[str]:
+    """Copy realistic libraries of several detectors into one file, as production has it.
+
+    Parameters
+    ----------
+    sources
+        Files of whole templates or of components, each of one detector or more.
+    out
+        File to write.
+    force
+        Replace an existing file.
+
+    Returns
+    -------
+    list of str
+        Names of the detectors.
+
+    Raises
+    ------
+    CpunetError
+        If a file holds no realistic library, two are of one detector, or their time axes
+        differ.
+    """
+    refuse_existing(out, *sources, force=force)
+    first: dict[str, tuple[Path, tuple[float, float, int]]] = {}
+    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        for path in sources:
+            with opened(path) as file:
+                require_all_stored(path, file)
+                names = realistic_libraries(file)
+                if not names:
+                    raise CpunetError(
+                        f"{path}: no realistic library; make it with `cpunet library "
+                        "translate --format simflow`"
+                    )
+                for name in names:
+                    axis = _time_axis(file[name])
+                    _require_new(name, path, axis, first)
+                    first[name] = (path, axis)
+                    file.copy(file[name], made.h5, name)
+    return sorted(first)
+
+
+def _time_axis(group: h5py.Group) -> tuple[float, float, int]:
+    """Period, first time and number of samples."""
+    waveforms = (name for name in group if name.startswith("waveform_"))
+    array = _COMPONENTS if _COMPONENTS in group else next(waveforms)
+    return float(group["dt"][()]), float(group["t0"][()]), int(group[array].shape[-1])
+
+
+def _require_new(
+    name: str,
+    path: Path,
+    axis: tuple[float, float, int],
+    first: Mapping[str, tuple[Path, tuple[float, float, int]]],
+) -> None:
+    if name in first:
+        raise CpunetError(
+            f"{path}: a second library of {name}, which {first[name][0]} has already; give one "
+            "of each detector"
+        )
+    for other, (file, known) in first.items():
+        if axis != known:
+            raise CpunetError(
+                f"{path}: {name} has {axis[2]} samples of {axis[0]:g} ns from {axis[1]:g} ns, "
+                f"{other} of {file} {known[2]} of {known[0]:g} ns from {known[1]:g} ns; "
+                "translate both with one version"
+            )
+
+
+def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]:
+    """Make whole templates of components, so that reboost can read the file.
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no library of components.
+    """
+    refuse_existing(out, source, force=force)
+    done: list[str] = []
+    with opened(source) as file:
+        require_all_stored(source, file)
+        names = realistic_libraries(file)
+    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        for name in names:
+            library = read_library(source, name)
+            if library.rank is None:
+                continue
+            group = made.h5.create_group(name)
+            arrays = Made.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
+            for angle, times in library.drift_time_ns.items():
+                whole = arrays.angle(f"{angle:03d}_deg")
+                whole.put(slice(0, len(times)), library.currents(angle), Loss())
+                whole.put_times(times)
+            describe(group, json.dumps(library.told))
+            done.append(name)
+        if not done:
+            raise CpunetError(
+                f"{source}: no library of components; make one with --low-rank, or use the "
+                "file as it is"
+            )
+    return done

@@ -1,0 +1,302 @@
+"""A library of ideal charge pulses in, the realistic one of currents that reboost reads out.
+
+The layout is that of LEGEND's production (legend-simflow): per detector a ``struct{r, z, dt,
+t0, waveform_000_deg, drift_time_000_deg, ...}`` of currents in units of the most frequent A/E.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.hdf5_files import opened
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.translation.library_file import n_templates, require_whole
+from cpunet.jobs.translation.simflow_checks import (
+    IdealLibrary,
+    chosen_libraries,
+    known_detector,
+    require_complete,
+)
+from cpunet.jobs.translation.simflow_files import Made, describe
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.training.run_folder import read_info, weights_sha256
+from cpunet.translation.library_mode import TemplateTranslator
+from cpunet.translation.low_rank import MOST, Loss, components
+from cpunet.translation.peak_currents import (
+    LENGTH,
+    currents_about_peak,
+    heights,
+    most_frequent,
+)
+from cpunet.translation.ring_padding import RINGS, continued, with_rings
+from cpunet.translation.translator import REN
+
+QUIET = Monitor()
+ROWS = 16  # of r that are translated at once
+STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of the step of charge that tells the chain's delay
+# A template of charge ends near its highest value; one of current, or aligned at it, does not.
+LEAST_END = 0.5
+
+Floats = npt.NDArray[np.float32]
+
+
+def translate_for_simflow(
+    run: Path,
+    source: Path,
+    out: Path,
+    *,
+    detectors: Sequence[str] = (),
+    rings: int = RINGS,
+    rank: int | None = None,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> dict[str, Any]:
+    """Translate libraries of ideal charge pulses into what LEGEND's production reads.
+
+    Each template is put behind the learned electronics without noise, differentiated, averaged
+    three times over 48 ns and moved to have its maximum at sample 1,000 of 4,001; all are
+    divided by the mode of A/E over the library, written as float32, with the times of the
+    maxima, less the delay of the electronics alone, as ``drift_time_*_deg``.  Around the
+    crystal stand rings of nodes: their currents are means of their neighbours', drift times go
+    on as they did before.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run.
+    source
+        LH5 file of one library or more, of charge sampled every nanosecond.
+    out
+        LH5 file to write.
+    detectors
+        Names of the libraries to translate; by default the one of the detector that the run
+        was trained with, or all if the run does not tell it.
+    rings
+        Of nodes beyond the crystal.
+    rank
+        Write so many components and the coefficients of each node in place of templates; see
+        `cpunet.jobs.translation.simflow_files.read_library`.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Returns
+    -------
+    dict
+        By name of the library ``templates`` (places times angles), ``translated``,
+        ``padded``, ``healed`` (single places inside the crystal that had none),
+        ``mode_per_ns`` (A/E that currents are divided by), and ``loss`` of the components.
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no such library, or it is damaged, of another detector or sampling.
+    """
+    refuse_existing(out, run, source, force=force)
+    if not 0 <= rings <= 100:
+        raise CpunetError(f"{rings} rings of padding; give 0 to 100")
+    if rank is not None and not 1 <= rank <= 1000:
+        raise CpunetError(f"--low-rank {rank}: give 1 to 1000 components")
+    info = read_info(run)
+    ren = REN.load(run, resolve_device(device))
+    told: dict[str, Any] = {}
+    with opened(source) as given:
+        require_whole(given, source, set())
+        names = chosen_libraries(given, source, detectors, known_detector(run, info))
+        ideal = [IdealLibrary.of(given, name, source) for name in names]
+        total = sum(n_templates(given, one.path, source) for one in ideal)
+        made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
+        with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+            for library in ideal:
+                looked = _look(ren, library, given[library.path], source, total, monitor)
+                group = made.h5.create_group(library.path)
+                job = _Writing(looked, library, rings, rank)
+                told[library.path] = job.write(given[library.path], group, made_from, monitor)
+    return told
+
+
+@dataclass(eq=False)
+class _Looked:
+    """What was seen of all templates of a library, and the means to translate them."""
+
+    translate: TemplateTranslator
+    delay_ns: float
+    mode: float
+    kept: Floats
+    inside: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
+
+
+def _look(
+    ren: REN,
+    library: IdealLibrary,
+    given: h5py.Group,
+    source: Path,
+    total: int,
+    monitor: Monitor,
+) -> _Looked:
+    """Translate all for their A/E alone: its mode is wanted before any is written."""
+    translate = TemplateTranslator(ren, library.dt_ns)
+    step = np.zeros((1, STEP_LENGTH), np.float32)
+    step[:, STEP_SAMPLE:] = 1
+    _, delay = currents_about_peak(translate(step)[0])
+    rng = np.random.default_rng(0)
+    share = min(1.0, 2 * MOST / max(total, 1))
+    amplitudes, kept, inside = [], [], {}
+    moving = not_ending = 0
+    with monitor.stage(f"A/E of {library.path}", library.n_templates) as advance:
+        for angle in library.angles:
+            mask = np.zeros((len(library.r_mm), len(library.z_mm)), bool)
+            for first, block in _blocks(given[f"waveform_{angle}"], library, source):
+                there = ~np.isnan(block[:, :, 0])
+                templates = block[there]
+                currents, times = currents_about_peak(translate(templates)[0])
+                good = np.isfinite(times)
+                there[there] = good
+                mask[first : first + len(block)] = there
+                ends = np.abs(templates[good])
+                moving += len(ends)
+                not_ending += int((ends[:, -1] < LEAST_END * ends.max(axis=1)).sum())
+                amplitudes.append(heights(currents[good]))
+                kept.append(currents[good][rng.random(int(good.sum())) < share])
+                advance(block.shape[0] * block.shape[1])
+            inside[angle] = mask
+    if not moving:
+        raise CpunetError(
+            f"{source}: {library.path}: none of {library.n_templates} templates can be "
+            "translated; are they charge pulses?"
+        )
+    if 2 * not_ending > moving:
+        raise CpunetError(
+            f"{source}: {library.path}: {not_ending} of {moving} templates end below half of "
+            "their maximum: these are currents, or behind electronics already; give the "
+            "library of charge pulses"
+        )
+    require_complete(inside, library, source)
+    mode = most_frequent(np.concatenate(amplitudes))
+    some = np.concatenate(kept)
+    if len(some) > MOST:
+        some = some[np.sort(rng.choice(len(some), MOST, replace=False))]
+    return _Looked(
+        translate, float(delay[0]) - STEP_SAMPLE, mode, some / np.float32(mode), inside
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Writing:
+    """How one library is written."""
+
+    looked: _Looked
+    library: IdealLibrary
+    rings: int
+    rank: int | None
+
+    def write(
+        self, given: h5py.Group, group: h5py.Group, made_from: dict[str, str], monitor: Monitor
+    ) -> dict[str, Any]:
+        looked, library = self.looked, self.library
+        r_mm, z_mm = library.padded_axes(self.rings)
+        basis = None if self.rank is None else components(looked.kept, self.rank)
+        made = Made.begin(group, r_mm, z_mm, library.dt_ns, basis)
+        padded = healed = 0
+        loss = Loss()
+        for angle in library.angles:
+            arrays = made.angle(angle)
+            mask = looked.inside[angle]
+            times = np.full((len(r_mm), len(z_mm)), np.nan)
+            with monitor.stage(f"{library.path}, {angle}", len(r_mm)) as advance:
+                for rows, currents, when in self._rows(given[f"waveform_{angle}"], advance):
+                    arrays.put(rows, currents, loss)
+                    times[rows] = when
+            times = continued(times, self.rings)
+            arrays.put_times(times)
+            padded += int(np.isfinite(times).sum() - mask.sum())
+            inner = np.isfinite(times[: len(mask), self.rings :][:, : mask.shape[1]])
+            healed += int((inner & ~mask & enclosed(mask)).sum())
+        numbers: dict[str, Any] = {
+            "templates": library.n_templates,
+            "translated": sum(int(mask.sum()) for mask in looked.inside.values()),
+            "padded": padded,
+            "healed": healed,
+            "mode_per_ns": looked.mode,
+            "delay_ns": looked.delay_ns,
+        }
+        if basis is not None:
+            numbers["rank"] = len(basis)
+            numbers["loss"] = loss.told()
+        content = {"cpunet": cpunet.__version__, "rings": self.rings} | made_from | numbers
+        describe(group, json.dumps(content))
+        return numbers
+
+    def _rows(
+        self, given: h5py.Dataset, advance: Advance
+    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
+        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
+        n_r, n_z, _ = given.shape
+        rings, looked = self.rings, self.looked
+        for first in range(0, n_r + rings, ROWS):
+            last = min(first + ROWS, n_r + rings)
+            # what a node becomes depends on rows no further away than the rings
+            low, high = max(0, first - rings), min(last + rings, n_r)
+            shape = (last + rings - low, n_z + 2 * rings)
+            currents = np.full((*shape, LENGTH), np.nan, np.float32)
+            times = np.full(shape, np.nan)
+            if high > low:
+                charge = _charge(given[low:high])
+                there = ~np.isnan(charge[:, :, 0])
+                of_these, when = currents_about_peak(looked.translate(charge[there])[0])
+                inner = (slice(0, high - low), slice(rings, rings + n_z))
+                currents[inner][there] = of_these / np.float32(looked.mode)
+                times[inner][there] = when - looked.delay_ns
+            own = slice(first - low, last - low)
+            yield slice(first, last), with_rings(currents, rings)[own], times[own]
+            advance(last - first)
+
+
+def _blocks(
+    given: h5py.Dataset, library: IdealLibrary, source: Path
+) -> Iterator[tuple[int, Floats]]:
+    """Rows of templates of charge; refuses those of which a part is NaN."""
+    for first in range(0, given.shape[0], ROWS):
+        values = np.asarray(given[first : first + ROWS], np.float32)
+        bad = np.isnan(values)
+        part = bad.any(axis=2) & ~bad.all(axis=2)
+        if part.any():
+            i, j = np.argwhere(part)[0]
+            raise CpunetError(
+                f"{source}: {given.name}: {int(part.sum())} templates hold NaN among their "
+                f"samples, the first at r {library.r_mm[first + i]:g}, z "
+                f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
+                "charge was late"
+            )
+        yield first, _charge(values)
+
+
+def _charge(values: npt.NDArray[Any]) -> Floats:
+    """Templates as float32; those of nothing but zeros are none."""
+    charge = np.array(values, np.float32)
+    charge[~charge.any(axis=2)] = np.nan
+    return charge
+
+
+def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Places that have others on all four sides of them, however far."""
+    sides = [
+        np.logical_or.accumulate(np.flip(mask, axis) if back else mask, axis)
+        for axis in (0, 1)
+        for back in (False, True)
+    ]
+    below, above, left, right = sides
+    return np.asarray(below & np.flip(above, 0) & left & np.flip(right, 1))

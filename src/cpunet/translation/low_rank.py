@@ -1,0 +1,85 @@
+"""A library of currents as a few components, and coefficients of each place.
+
+Aligned at their maxima, the currents of a detector differ in few ways.  The components are
+those of a part of the templates; the error is measured on all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+
+from cpunet.errors import CpunetError
+from cpunet.translation.peak_currents import PEAK
+
+MOST = 2000  # templates that components are taken from
+Floats = npt.NDArray[np.float32]
+
+
+def components(templates: Floats, rank: int) -> Floats:
+    """The components that lose least of these templates, orthonormal, shape (rank, samples).
+
+    Raises
+    ------
+    CpunetError
+        If there are fewer templates than components.
+    """
+    if len(templates) < rank:
+        raise CpunetError(
+            f"--low-rank {rank} of {len(templates)} templates; give a smaller number"
+        )
+    n = len(templates)
+    gram = np.asarray(templates @ templates.T, np.float64)
+    values, vectors = scipy.linalg.eigh(gram, subset_by_index=(n - rank, n - 1))
+    kept = values > 1e-12 * values[-1]
+    made = (vectors[:, kept] / np.sqrt(values[kept])).T @ templates
+    # once more, for what single precision of the sums above has lost
+    orthonormal = np.linalg.qr(made[::-1].T)[0].T
+    return np.asarray(orthonormal, np.float32)
+
+
+@dataclass
+class Loss:
+    """What components lose of templates, in units of the most frequent A/E.
+
+    Attributes
+    ----------
+    largest, rms
+        Of the differences of all samples.
+    a_over_e_percent
+        The largest change of a template's A/E, and its RMS below.
+    """
+
+    largest: float = 0.0
+    a_over_e_percent: float = 0.0
+    rms: float = 0.0
+    a_over_e_rms_percent: float = 0.0
+    _samples: int = field(default=0, repr=False)
+    _templates: int = field(default=0, repr=False)
+
+    def add(self, templates: Floats, coefficients: Floats, basis: Floats) -> None:
+        """Count templates in, shape (n, samples), with their coefficients (n, rank)."""
+        if not len(templates):
+            return
+        apart = coefficients @ basis - templates
+        of_height = 100 * (apart[:, PEAK] / templates[:, PEAK]).astype(float)
+        self.largest = max(self.largest, float(np.abs(apart).max()))
+        self.a_over_e_percent = max(self.a_over_e_percent, float(np.abs(of_height).max()))
+        squares = float(np.square(apart, dtype=float).sum())
+        self.rms = _merged(self.rms, self._samples, squares, apart.size)
+        self.a_over_e_rms_percent = _merged(
+            self.a_over_e_rms_percent, self._templates, float(of_height @ of_height), len(apart)
+        )
+        self._samples += apart.size
+        self._templates += len(apart)
+
+    def told(self) -> dict[str, float]:
+        """The numbers by name."""
+        return {name: v for name, v in asdict(self).items() if not name.startswith("_")}
+
+
+def _merged(rms: float, n: int, squares: float, more: int) -> float:
+    return float(np.sqrt((n * rms**2 + squares) / (n + more)))

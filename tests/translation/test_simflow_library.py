@@ -1,0 +1,388 @@
+"""Realistic libraries: layout, rings, components, and A/E of Geant4 events by reboost."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from lgdo import Array, Scalar, Struct
+from torch import nn
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.simulation.pulse_shape_library import write_library
+from cpunet.jobs.translation.simflow_checks import chosen_libraries, known_detector
+from cpunet.jobs.translation.simflow_files import expand_library, merge_libraries, read_library
+from cpunet.jobs.translation.simflow_library import enclosed, translate_for_simflow
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes import load_recipe
+from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.events import simulate_events
+from cpunet.simulation.field_lookup import drift_maps, in_active_volume
+from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.run_folder import write_run
+from cpunet.translation.library_mode import TemplateTranslator
+from cpunet.translation.peak_currents import PEAK, currents_about_peak, heights
+from cpunet.translation.ring_padding import continued, with_rings
+from cpunet.translation.translator import REN
+
+R, Z = np.arange(6.0), np.arange(8.0)
+SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, sampled every 16 ns, with two poles, slow parts and decays."""
+    recipe = load_recipe("fast", ["generator.poles_ns=[45,30]", "generator.decay_us=60"])
+    generator = ResponseGenerator(recipe.matching.generator, 16.0)
+    generator.response.slow_weights.data[2] = 0.03
+    generator.response.decay_weights.data[0] = 0.05
+    folder = tmp_path_factory.mktemp("chain")
+    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+    model = nn.ModuleDict({"ren": generator})
+    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
+    return folder
+
+
+def charge(n_samples: int = 2400) -> np.ndarray:
+    """Edges (r, z, samples) that come later outwards; none outside a quarter circle."""
+    r, z = np.meshgrid(R, Z, indexing="ij")
+    time = np.arange(n_samples)
+    middle, width = 500 + 60 * np.hypot(r, z), 12 + r + 0.5 * z
+    made = 1 / (1 + np.exp(-(time - middle[..., None]) / width[..., None]))
+    made[np.hypot(r, z) > 7.2] = np.nan
+    return made
+
+
+def write(path: Path, waveforms: np.ndarray, name: str = "V01", **more: object) -> Path:
+    library = {
+        "r": Array(R / 1000, attrs={"units": "m"}),
+        "z": Array(Z / 1000, attrs={"units": "m"}),
+        "dt": Scalar(1.0, attrs={"units": "ns"}),
+        "t0": Scalar(0.0, attrs={"units": "ns"}),
+        "waveform_000_deg": Array(waveforms, attrs={"units": ""}),
+        "waveform_045_deg": Array(waveforms, attrs={"units": ""}),
+    } | more
+    lh5.write(Struct(library), name, str(path), wo_mode="of")
+    return path
+
+
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("ideal") / "ideal.lh5", charge())
+
+
+def test_currents_about_their_maximum() -> None:
+    templates = charge()[0, :3].astype(np.float32)
+    found, times = currents_about_peak(templates)
+    for template, current, time in zip(templates, found, times, strict=True):
+        expected = np.diff(template.astype(float), prepend=0)
+        for _ in range(3):
+            expected = np.convolve(expected, np.ones(48) / 48)
+        assert abs(time - expected.argmax()) <= 0.5
+        at = time + np.arange(-300, 301)
+        np.testing.assert_allclose(
+            current[PEAK - 300 : PEAK + 301],
+            np.interp(at, np.arange(len(expected)), expected),
+            atol=2e-3 * expected.max(),
+        )
+        assert current.argmax() == PEAK
+    # moved by a fraction of a sample, the current is the same
+    later = np.pad(templates, ((0, 0), (1, 0)))[:, :-1]
+    shifted = currents_about_peak(0.25 * templates + 0.75 * later)
+    assert shifted[1][0] - times[0] == pytest.approx(0.75, abs=0.02)
+    np.testing.assert_allclose(shifted[0][0], found[0], atol=3e-4 * found[0].max())
+    nothing, when = currents_about_peak(np.full((2, 300), [[0], [np.nan]], np.float32))
+    assert np.isnan(nothing).all()
+    assert np.isnan(when).all()
+
+
+def test_rings_go_on_from_the_crystal() -> None:
+    r, z = np.meshgrid(np.arange(9.0), np.arange(10.0), indexing="ij")
+    plane = 100 + 7 * r - 3 * z
+    there = np.hypot(r, z - 5) < 5
+    known = np.where(there, plane, np.nan)
+    on = continued(known, 3)
+    reached = np.isfinite(on)
+    # three rings beyond, on the slope, and all within as it was
+    np.testing.assert_allclose(on[reached], plane[reached])
+    assert reached.sum() > there.sum()
+    filled = with_rings(known[..., None].astype(np.float32).copy(), 3)[..., 0]
+    np.testing.assert_array_equal(filled[there], known[there])
+    np.testing.assert_array_equal(np.isfinite(filled), reached)
+    assert enclosed(there)[2, 5]
+    assert not enclosed(there)[8, 0]
+
+
+def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Path) -> None:
+    told = translate_for_simflow(chain, ideal, tmp_path / "psl.lh5")
+    library = lh5.read("V01", str(tmp_path / "psl.lh5"))
+    assert set(library) == {
+        "r",
+        "z",
+        "dt",
+        "t0",
+        *(f"{what}_{a}_deg" for what in ("waveform", "drift_time") for a in ("000", "045")),
+    }
+    assert library["r"].attrs["units"] == "mm"
+    np.testing.assert_allclose(library["r"].nda, np.arange(len(R) + 3), atol=1e-9)
+    np.testing.assert_allclose(library["z"].nda, np.arange(-3, len(Z) + 3), atol=1e-9)
+    assert (library["dt"].value, library["t0"].value) == (1.0, -1000.0)
+    currents, times = library["waveform_000_deg"].nda, library["drift_time_000_deg"].nda
+    assert currents.shape == (9, 14, 4001)
+    assert currents.dtype == np.float32
+    there = np.isfinite(times)
+    np.testing.assert_array_equal(there, np.isfinite(currents).all(axis=2))
+    assert (currents[there].argmax(axis=1) == 1000).all()
+    # no cell that reaches into the crystal lacks a corner
+    inner = np.isfinite(charge()[..., 0])
+    i, j = np.nonzero(inner)
+    for di in (0, 1):
+        for dj in (2, 3, 4):
+            assert there[i + di, j + dj].all()
+    # the delay of the electronics, some 100 ns, is taken off; what it is depends on the edge
+    assert times[0, 3] == pytest.approx(500, abs=10)
+    amplitudes = heights(currents[:6, 3:11][inner])
+    assert amplitudes.min() < 1 < amplitudes.max()
+    numbers = told["V01"]
+    assert (numbers["templates"], numbers["translated"]) == (96, 2 * int(inner.sum()))
+    assert json.loads(h5py.File(tmp_path / "psl.lh5")["V01"].attrs["cpunet"])["rings"] == 3
+
+
+def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
+    # as SolidStateDetectors.jl writes it: two nodes about the axis, and a step beyond the end
+    nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
+    source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
+    translate_for_simflow(chain, source, tmp_path / "psl.lh5", rings=0)
+    library = read_library(tmp_path / "psl.lh5")
+    np.testing.assert_allclose(library.r_mm, 1000 * nodes)
+    np.testing.assert_array_equal(
+        np.isfinite(library.drift_time_ns[0]), np.isfinite(charge()[..., 0])
+    )
+    with pytest.raises(CpunetError, match="-1 rings"):
+        translate_for_simflow(chain, source, tmp_path / "x.lh5", rings=-1)
+
+
+def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: Path) -> None:
+    translate_for_simflow(chain, ideal, tmp_path / "whole.lh5")
+    told = translate_for_simflow(chain, ideal, tmp_path / "few.lh5", rank=8)["V01"]
+    whole, few = read_library(tmp_path / "whole.lh5"), read_library(tmp_path / "few.lh5", "V01")
+    assert (whole.rank, few.rank) == (None, 8)
+    np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
+    apart = few.currents(45) - whole.currents(45)
+    assert np.nanmax(np.abs(apart)) == pytest.approx(told["loss"]["largest"], rel=1e-3)
+    assert 0 < told["loss"]["largest"] < 0.02
+    assert told["loss"]["a_over_e_percent"] < 0.5
+    np.testing.assert_array_equal(few.template(2.2, 3.9), few.currents(0)[2, 7])
+    assert (tmp_path / "few.lh5").stat().st_size < (tmp_path / "whole.lh5").stat().st_size / 3
+    assert expand_library(tmp_path / "few.lh5", tmp_path / "again.lh5") == ["V01"]
+    again = read_library(tmp_path / "again.lh5")
+    np.testing.assert_array_equal(again.currents(0), few.currents(0))
+    with pytest.raises(CpunetError, match="no library of components"):
+        expand_library(tmp_path / "whole.lh5", tmp_path / "x.lh5")
+
+
+def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
+    other = write(tmp_path / "ideal.lh5", charge(), "B02")
+    for source, name in ((ideal, "v.lh5"), (other, "b.lh5")):
+        translate_for_simflow(chain, source, tmp_path / name)
+    both = [tmp_path / "v.lh5", tmp_path / "b.lh5"]
+    assert merge_libraries(both, tmp_path / "psl.lh5") == ["B02", "V01"]
+    assert sorted(lh5.ls(str(tmp_path / "psl.lh5"))) == ["B02", "V01"]
+    assert lh5.read("B02", str(tmp_path / "psl.lh5")).attrs["cpunet"]
+    with pytest.raises(CpunetError, match="a second library of V01"):
+        merge_libraries([both[0], tmp_path / "psl.lh5"], tmp_path / "x.lh5")
+    with pytest.raises(CpunetError, match="no realistic library"):
+        merge_libraries([ideal], tmp_path / "x.lh5")
+    with h5py.File(both[1], "a") as file:
+        file["B02/t0"][...] = -500.0
+    with pytest.raises(CpunetError, match=r"B02 has 4001 samples of 1 ns from -500 ns, V01"):
+        merge_libraries(both, tmp_path / "x.lh5")
+    with pytest.raises(CpunetError, match="name the detector; the file has B02, V01"):
+        read_library(tmp_path / "psl.lh5")
+    assert not (tmp_path / "x.lh5").exists()
+
+
+def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
+    waveforms[which] = np.nan
+    return waveforms
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns, production reads"),
+        ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
+        ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
+        ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
+        ({"r": Array(np.arange(4.0), attrs={"units": "mm"})}, "expected (r, z, samples)"),
+        ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
+        ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
+        (
+            {"waveform_045_deg": Array(without(charge(), np.s_[2, 1, 2000:]))},
+            "1 templates hold NaN among their samples, the first at r 2, z 1 mm",
+        ),
+        (
+            dict.fromkeys(
+                ("waveform_000_deg", "waveform_045_deg"),
+                Array(np.diff(charge(), axis=2, prepend=0)),
+            ),
+            "these are currents",
+        ),
+    ],
+)
+def test_other_libraries_are_refused_in_one_line(
+    chain: Path, tmp_path: Path, change: dict[str, Any], words: str
+) -> None:
+    source = write(tmp_path / "ideal.lh5", charge(), **change)
+    with pytest.raises(CpunetError) as error:
+        translate_for_simflow(chain, source, tmp_path / "psl.lh5")
+    assert words in str(error.value)
+    assert str(source) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ideal.lh5"]
+
+
+def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path) -> None:
+    with h5py.File(ideal) as file:
+        assert chosen_libraries(file, ideal, (), None) == ["V01"]
+        assert chosen_libraries(file, ideal, ("V01",), "B02") == ["V01"]
+        with pytest.raises(CpunetError, match="trained with a simulation of B02; give the"):
+            chosen_libraries(file, ideal, (), "B02")
+        with pytest.raises(CpunetError, match="no library of V03; the file has V01"):
+            chosen_libraries(file, ideal, ("V03",), None)
+
+
+def test_what_a_run_tells_of_its_detector(tmp_path: Path) -> None:
+    run, sim = tmp_path / "run", tmp_path / "sim.lh5"
+    run.mkdir()
+    info = {"sim": {"file": str(sim)}}
+    assert known_detector(run, info) is None
+    with h5py.File(sim, "w") as file:
+        file.create_group("geds/sim").attrs["simulation"] = "no JSON"
+    assert known_detector(run, info) is None
+    with h5py.File(sim, "a") as file:
+        file["geds/sim"].attrs["simulation"] = json.dumps({"detector": {"name": "V01"}})
+    assert known_detector(run, info) == "V01"
+    (run / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
+    assert known_detector(run, info) == "V02"
+    assert known_detector(tmp_path, {}) is None
+
+
+def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
+    source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
+    told = translate_for_simflow(chain, source, tmp_path / "psl.lh5")
+    assert told["V01"]["healed"] == 2
+    times = read_library(tmp_path / "psl.lh5").drift_time_ns[0]
+    whole = write(tmp_path / "whole.lh5", charge())
+    translate_for_simflow(chain, whole, tmp_path / "psl2.lh5")
+    known = read_library(tmp_path / "psl2.lh5").drift_time_ns[0]
+    assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
+
+
+def geant4_events(reference_data: Path, n_events: int | None) -> tuple[Any, Hits]:
+    """Geometry A, and events above 600 keV: merged hits without those in the lithium."""
+    detector = read_detector(str(reference_data / "siggen" / "geometry_A.yaml"))
+    hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz").hits
+    hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)[:n_events]], 0.05)
+    maps = drift_maps(compute_fields(detector), SETTINGS)
+    places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
+    hits = hits.where(np.array([in_active_volume(maps, *place) for place in places]))
+    return detector, hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
+
+
+def full_a_over_e(run: Path, detector: Any, hits: Hits, mode: float) -> Any:
+    """A/E of charges drifted one by one, summed, and translated as a whole."""
+    translate = TemplateTranslator(REN.load(run), 1.0)
+    fields, found = compute_fields(detector), []
+    for first in range(0, hits.n_events, 500):
+        events = simulate_events(fields, hits[first : first + 500], SETTINGS)
+        currents, _ = currents_about_peak(translate(events.waveforms)[0])
+        found.append(heights(currents) / mode)
+    return np.concatenate(found)
+
+
+def a_over_e_of_reboost(path: Path, hits: Hits, phi: Any) -> Any:
+    """The same from a library, as reboost finds it."""
+    psd, utils = (pytest.importorskip(f"reboost.hpge.{name}") for name in ("psd", "utils"))
+    ak = pytest.importorskip("awkward")
+    units = pytest.importorskip("reboost.units")
+    (name,) = lh5.ls(str(path))
+    load = getattr(utils, "load_hpge_pulse_shape_library", None)
+    load = load or utils.get_hpge_pulse_shape_library
+    template = load(str(path), name, "waveform_000_deg", out_of_bounds_val=0)
+    maps = utils.load_hpge_drift_time_maps(str(path), name, (0, 45))
+    counts, r = np.diff(hits.offsets), np.hypot(hits.x_mm, hits.y_mm)
+
+    def column(values: Any, unit: str) -> Any:
+        return units.attach_units(ak.unflatten(values, counts), unit)
+
+    z = column(hits.z_mm, "mm")
+    places = (column(r * np.cos(phi), "mm"), column(r * np.sin(phi), "mm"), z)
+    found = psd.maximum_current(
+        column(hits.edep_kev, "keV"),
+        psd.drift_time_crystal_axes(*places, maps),
+        r=column(r, "mm"),
+        z=z,
+        template=template,
+        times=None,
+    )
+    return np.asarray(found) / hits.energy_kev
+
+
+def test_a_over_e_of_geant4_events_at_the_nodes(
+    chain: Path, reference_data: Path, tmp_path: Path
+) -> None:
+    detector, hits = geant4_events(reference_data, 300)
+    write_library(detector, tmp_path / "ideal.lh5", grid_mm=2.0)
+    told = translate_for_simflow(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5")
+    (name,) = told
+    with h5py.File(tmp_path / "ideal.lh5") as file:
+        there = ~np.isnan(file[f"{name}/waveform_000_deg"][:, :, 0])
+        r_mm, z_mm = file[f"{name}/r"][()], file[f"{name}/z"][()]
+    # hits are moved to nodes: what is left is what the format itself costs
+    i, j = np.nonzero(there)
+    away = np.square(np.hypot(hits.x_mm, hits.y_mm)[:, None] - r_mm[i]) + np.square(
+        hits.z_mm[:, None] - z_mm[j]
+    )
+    nearest = away.argmin(axis=1)
+    at_nodes = replace(
+        hits, x_mm=r_mm[i][nearest], y_mm=np.zeros(len(nearest)), z_mm=z_mm[j][nearest]
+    )
+    mode = told[name]["mode_per_ns"]
+    full = full_a_over_e(chain, detector, at_nodes, mode)
+    found = a_over_e_of_reboost(tmp_path / "psl.lh5", at_nodes, 0.0)
+    apart = 100 * (found / full - 1)
+    assert np.isfinite(apart).all()
+    assert np.median(np.abs(apart)) < 0.01
+    # reboost looks every 20 ns first, and may take the lower one of two maxima
+    assert (np.abs(apart) < 0.2).mean() > 0.99
+
+
+@pytest.mark.slow  # three minutes: a library of half a millimetre
+def test_a_over_e_of_all_geant4_events(
+    chain: Path, reference_data: Path, tmp_path: Path
+) -> None:
+    detector, hits = geant4_events(reference_data, None)
+    write_library(detector, tmp_path / "ideal.lh5", grid_mm=0.5)
+    told = translate_for_simflow(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5")
+    ((_, numbers),) = told.items()
+    assert hits.n_events > 8000
+    r, phi = np.hypot(hits.x_mm, hits.y_mm), np.arctan2(hits.y_mm, hits.x_mm)
+    turned = replace(hits, x_mm=r, y_mm=np.zeros(len(r)))
+    for these, azimuth, within, median in ((turned, 0.0, 0.99, 0.01), (hits, phi, 0.8, 0.12)):
+        full = full_a_over_e(chain, detector, these, numbers["mode_per_ns"])
+        found = a_over_e_of_reboost(tmp_path / "psl.lh5", these, azimuth)
+        apart = 100 * (found / full - 1)
+        assert np.isfinite(apart).all()
+        assert np.median(np.abs(apart)) < median
+        assert (np.abs(apart) < 0.2).mean() > within
