@@ -30,8 +30,9 @@ from cpunet.translation.translator import RejectionWarning
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-# Seconds of simulation each, or files that it would take: their imports are tried only.
-TOO_LONG = {"simulation.md", "explorer.md", "legend.md"}
+# Seconds of simulation or training each, or files that it would take: their imports are tried
+# only.
+TOO_LONG = {"simulation.md", "explorer.md", "legend.md", "python.md"}
 MADE_BY_THE_SITE = ("reference/", "../reference/")
 KEV = 2614.511
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import pickle
 import shutil
 import struct
 import sys
@@ -31,7 +32,7 @@ from cpunet.jobs.validation.compare import read_metrics
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_readers import hit_parts, read_hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import load_network, read_info, read_losses
 
@@ -127,6 +128,20 @@ def csv(path: Path) -> None:
     path.write_text("\n".join([*lines, "1,0.5,1,2,3", "1,0.2,1,2,3", "2,1.5,1,2,3"]))
 
 
+def majorana(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["raw_waveform"] = waveforms().astype(float)
+        for name in ("detector", "run_number", "id", "tp0"):
+            file[name] = np.arange(N)
+        file["energy_label"] = np.full(N, 2614.5)
+
+
+def pickled(path: Path) -> None:
+    with path.open("wb") as stream:
+        for wave in waveforms():
+            pickle.dump({"wf": wave.astype(float), "tp0": 3, "energy": 2614.5}, stream)
+
+
 def text_of(content: object) -> Callable[[Path], None]:
     return lambda path: Path(path).write_text(
         json.dumps(content) if path.suffix == ".json" else yaml.safe_dump(content)
@@ -181,7 +196,13 @@ INPUTS: dict[str, tuple[Make, Read]] = {
     "pulses.spe": (spectrum, read_pulses),
     "pulses.txt": (lambda p: np.savetxt(p, waveforms(), fmt="%d"), read_pulses),
     "run.fcio": (flashcam, lambda p: open_pulses(p).read()),
+    "majorana.h5": (
+        majorana,
+        lambda p: open_pulses(p, table="raw_waveform", dt_ns=10).read(),
+    ),
+    "pulses.pickle": (pickled, read_pulses),
     "remage.lh5": (remage, read_hits),
+    "steps.lh5": (remage, lambda p: list(hit_parts(p)())),
     "hits.npz": (hits_npz, read_hits),
     "g4simple.h5": (g4simple, read_hits),
     "hits.csv": (csv, read_hits),

@@ -22,6 +22,7 @@ ROOMS = [
     "translation",
     "analysis",
     "jobs",
+    "calls",
     "cli",
 ]
 JOBS = [

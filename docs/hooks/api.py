@@ -24,6 +24,7 @@ ORDER = [
     "translation",
     "analysis",
     "jobs",
+    "calls",
 ]
 OPTIONS = (
     "options:",
@@ -37,6 +38,28 @@ FRONT = """# Python
 
 What `import cpunet` gives is the stable interface; it follows the [deprecation policy]\
 (../../deprecation.md). Everything else is sorted by room, in the order in which data flow.
+
+::: cpunet.train
+
+::: cpunet.translate
+
+::: cpunet.validate
+
+::: cpunet.calibrate
+
+::: cpunet.Run
+
+::: cpunet.Translation
+
+::: cpunet.Report
+
+::: cpunet.CalibratedRun
+
+::: cpunet.InputFile
+
+::: cpunet.HitFile
+
+::: cpunet.CpunetError
 
 ::: cpunet.open_pulses
 

@@ -2,39 +2,72 @@
 
 The package is a row of rooms through which data flow one way:
 ``pulses`` (containers, files, preparation) → ``networks`` → ``training`` →
-``translation`` → ``analysis`` → ``jobs`` → ``cli``.  See ``docs/design.md``.
+``translation`` → ``analysis`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
 """
 
 from __future__ import annotations
 
 import warnings
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from cpunet.installation import other_package
 
 __version__ = "0.1.0"
-__all__ = ["IREN", "REN", "Pulses", "__version__", "open_pulses"]
+__all__ = [
+    "IREN",
+    "REN",
+    "CalibratedRun",
+    "CpunetError",
+    "HitFile",
+    "InputFile",
+    "Pulses",
+    "Report",
+    "Run",
+    "Translation",
+    "__version__",
+    "calibrate",
+    "open_pulses",
+    "train",
+    "translate",
+    "validate",
+]
 
 if TYPE_CHECKING:
+    from cpunet.calls.calibrations import CalibratedRun, calibrate
+    from cpunet.calls.reports import Report, validate
+    from cpunet.calls.runs import Run, train
+    from cpunet.calls.translations import Translation, translate
+    from cpunet.errors import CpunetError
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.translation.translator import IREN, REN
 
+# torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
+_HOMES = {
+    "calls.calibrations": ("CalibratedRun", "calibrate"),
+    "calls.reports": ("Report", "validate"),
+    "calls.runs": ("Run", "train"),
+    "calls.translations": ("Translation", "translate"),
+    "errors": ("CpunetError",),
+    "jobs.simulation.hit_sources": ("HitFile",),
+    "jobs.common.inputs": ("InputFile",),
+    "pulses.container": ("Pulses",),
+    "pulses.reading": ("open_pulses",),
+    "translation.translator": ("IREN", "REN"),
+}
+
 
 def __getattr__(name: str) -> Any:
-    if name in __all__ and (clash := other_package()):
-        warnings.warn(clash, stacklevel=2)
-    # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
-    if name in ("REN", "IREN"):
-        from cpunet.translation import translator
-
-        return getattr(translator, name)
-    if name == "Pulses":
-        from cpunet.pulses.container import Pulses
-
-        return Pulses
-    if name == "open_pulses":
-        from cpunet.pulses.reading import open_pulses
-
-        return open_pulses
+    for home, names in _HOMES.items():
+        if name in names:
+            if clash := other_package():
+                warnings.warn(clash, stacklevel=2)
+            return getattr(import_module(f"cpunet.{home}"), name)
     raise AttributeError(f"module 'cpunet' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -199,3 +199,16 @@ def test_an_input_is_not_overwritten(stand, command):
     done = command("calibrate", *words, "--out", stand, "--force")
     assert done.code == 2
     assert (stand / "sim.lh5").is_file()
+
+
+def test_it_can_be_looked_at_in_python(calibrated):
+    import cpunet
+
+    run = cpunet.CalibratedRun.load(calibrated)
+    assert run.physics["temperature_K"]["value"] == run.detector.temperature_K
+    assert run.settings.dt_ns == run.dt_ns
+    assert run.sim.is_file()
+    assert {"pulls", "profiles", "directions"} == set(run.figures)
+    html = run._repr_html_()
+    assert "temperature_K" in html
+    assert "cpunet run" in html

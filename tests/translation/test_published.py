@@ -20,7 +20,7 @@ from torch import Tensor
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.import_published import import_pulses, import_weights
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.translation.restricted_unpickler import ForbiddenError, TruncatedError, load
+from cpunet.restricted_unpickler import ForbiddenError, TruncatedError, load
 from cpunet.translation.translator import IREN, REN
 
 M = 4

@@ -144,6 +144,71 @@ def test_dry_run(place):
     assert not (place.folder / "all results").exists()
 
 
+def whole_chain() -> dict[str, Any]:
+    """Calibration, libraries and events of two detectors, one of them in one period."""
+    config: Any = two_detectors()
+    config["detectors"]["V01"] = {
+        "simulate": {"detector": "icpc", "events": "FEP=9"},
+        "stp": "det001",
+        "table": "ch1/raw",
+    }
+    config["periods"]["p04"] = {"data": "raw*/*.lh5"}
+    config["detectors"]["B02"]["periods"] = ["p03"]
+    config["library"] = {"grid_mm": 2, "make": ["--angles=0"], "translate": ["--currents"]}
+    config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
+    del config["train"]["set"]
+    return config
+
+
+def with_steps(place: Place) -> None:
+    (place.folder / "stp").mkdir()
+    for name in ("one", "two"):
+        (place.folder / "stp" / f"{name}.lh5").write_text("steps")
+
+
+def test_a_dry_run_of_libraries_and_events(place):
+    with_steps(place)
+    place.configure(whole_chain())
+    done = place.run("--dry-run", "--printshellcmds")
+    assert done.returncode == 0, done.stdout
+    jobs = counts(done.stdout)
+    assert jobs["ideal_library"] == 2  # of the detectors, for all periods
+    assert jobs["realistic_library"] == jobs["train"] == 3
+    assert jobs["event_pulses"] == 2 * 2
+    assert jobs["event_raw"] == jobs["event_parameters"] == 3 * 2
+    assert "calibrate" not in jobs
+    told = " ".join(done.stdout.split())
+    made = "'all results/V01/events/pulses/two.lh5'"
+    assert (
+        "cpunet simulate --detector=icpc --hits stp/two.lh5 --hits-detector det001 --out "
+        f"{made}" in told
+    )
+    assert "--output adc --length=2000 --out-table V01/raw --seed 1 --device cpu" in told
+    assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
+    assert "library make --detector=icpc --grid-mm 2 --angles=0 --out" in told
+    assert "'all results/V01/library/ideal.lh5' --currents --device cpu --out" in told
+
+
+def test_a_dry_run_with_calibrations(place):
+    with_steps(place)
+    config = whole_chain()
+    config["calibrate"] = {"fix": "tilt", "prior": ["depletion_voltage=2100±50"], "events": 500}
+    place.configure(config)
+    done = place.run("--dry-run", "--printshellcmds")
+    assert done.returncode == 0, done.stdout
+    jobs = counts(done.stdout)
+    assert "train" not in jobs
+    assert jobs["calibrate"] == jobs["ideal_library"] == 3  # physics are those of a period
+    assert jobs["event_pulses"] == 3 * 2
+    told = " ".join(done.stdout.split())
+    words = "--free=auto --fix=tilt '--prior=depletion_voltage=2100±50' --events=500"
+    assert words in told.replace("--prior='depletion", "'--prior=depletion")
+    run = "'all results/V01/p03/run/"
+    assert f"--detector={run}detector.yaml' --settings={run}settings.yaml' --hits" in told
+    assert f"library make --detector={run}detector.yaml' --grid-mm 2" in told
+    assert "--data-table=ch1/raw" in told
+
+
 def words_of(calls: list[list[str]], command: str, detector: str) -> list[str]:
     (words,) = [c for c in calls if c[0] == command and f"/{detector}/" in " ".join(c)]
     return words
@@ -229,6 +294,17 @@ DEFECTS = {
         ["p05"],
         "detectors.V01.periods: p05 is not in periods",
     ),
+    "no geometry": (
+        "library",
+        {"grid_mm": 2},
+        "detectors.V01: library takes its geometry; give simulate in place of simulations",
+    ),
+    "spacing": (
+        "library",
+        {"grid_mm": 0},
+        "library.grid_mm: 0 is less than the minimum of 0.01",
+    ),
+    "no events": ("events", {}, "events: 'hits' is a required property"),
     "energies of one": (
         "periods.p03.energies",
         "raw p03/*.lh5",
@@ -253,6 +329,35 @@ def test_a_defect_of_the_configuration_is_one_line(place, defect):
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("configuration")]
     assert words in line
     assert "Traceback" not in done.stdout
+
+
+def test_a_calibration_takes_one_file(place):
+    config = whole_chain() | {"calibrate": {}}
+    with_steps(place)
+    config["detectors"]["V01"]["simulate"]["files"] = 2
+    place.configure(config)
+    (line,) = defects(place)
+    assert "detectors.V01.simulate.files: calibrate takes one file, with its hits" in line
+    config["detectors"]["V01"]["simulate"] = {"detector": "icpc", "hits": "stp/*.lh5"}
+    place.configure(config)
+    (line,) = defects(place)
+    assert "detectors.V01.simulate.hits: 2 files, and calibrate takes one" in line
+
+
+def test_a_chain_of_dspeed_that_is_not_there(place):
+    with_steps(place)
+    config = whole_chain()
+    config["events"]["dsp"] = "none.yaml"
+    place.configure(config)
+    (line,) = defects(place)
+    assert "events.dsp: no file none.yaml; give a chain of dspeed, or leave it out" in line
+
+
+def defects(place: Place) -> list[str]:
+    done = place.run("--dry-run")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout
+    return [line for line in done.stdout.splitlines() if line.startswith("configuration")]
 
 
 def test_the_example_is_valid():

@@ -34,7 +34,23 @@ def checked(config):
                         f"configuration, detectors.{name}: no energy, the column in "
                         f"the files of periods.{period}.energies"
                     )
+        require_geometry(config, name, detector)
     return config
+
+
+def require_geometry(config, name, detector):
+    """Libraries, events and calibrations take a simulation, not only its pulses."""
+    wanted = [part for part in ("calibrate", "library", "events") if part in config]
+    if wanted and "simulate" not in detector:
+        raise WorkflowError(
+            f"configuration, detectors.{name}: {wanted[0]} takes its geometry; give simulate "
+            "in place of simulations"
+        )
+    if "calibrate" in config and detector["simulate"].get("files", 1) > 1:
+        raise WorkflowError(
+            f"configuration, detectors.{name}.simulate.files: calibrate takes one file, with "
+            "its hits; give all events in one"
+        )
 
 
 def _words(defect):
@@ -106,6 +122,24 @@ ENERGIES = {
     for d, p in PAIRS
     if "energies" in config["periods"][p]
 }
+if "calibrate" in config:
+    for name, files in SIMULATIONS.items():
+        if len(files) > 1:
+            raise WorkflowError(
+                f"configuration, detectors.{name}.simulate.hits: {len(files)} files, and "
+                "calibrate takes one; give all hits in one"
+            )
+EVENTS = {}
+if "events" in config:
+    if "dsp" in config["events"] and not Path(config["events"]["dsp"]).is_file():
+        raise WorkflowError(
+            f"configuration, events.dsp: no file {config['events']['dsp']}; give a chain of "
+            "dspeed, or leave it out"
+        )
+    EVENTS = {
+        name: by_stem(found(config["events"]["hits"], "events.hits", detector=name), "events.hits")
+        for name in DETECTORS
+    }
 for (d, p), files in ENERGIES.items():
     if len(files) != len(DATA[d, p]):
         raise WorkflowError(
@@ -121,6 +155,7 @@ wildcard_constraints:
     detector="|".join(map(re.escape, DETECTORS)),
     period="|".join(map(re.escape, config["periods"])),
     part="[^/]+",
+    events="[^/]+",
 
 
 # numba takes all cores of a node unless told

@@ -1,4 +1,57 @@
-# A training per detector and period, and what is done with it.
+# A training or a calibration per detector and period, and what is done with it.
+
+# one of both makes the run, the other has a name that nothing asks for
+CALIBRATED = "calibrate" in config
+TRAINED = f"{RESULTS}/{{detector}}/{{period}}/run"
+
+
+def calibration_options(wildcards):
+    """Words of a calibration: what is free, and how the two files are read."""
+    words, training = config["calibrate"], config["train"]
+    if training["set"]:
+        raise WorkflowError(
+            "configuration, train.set: a calibration takes a recipe without; put the values "
+            "into a file and give it as train.recipe"
+        )
+    of_data = data_reading(wildcards.detector, wildcards.period)
+    if len(DATA[wildcards.detector, wildcards.period]) > 1:
+        of_data = {}  # merged
+    return options(
+        free=words["free"],
+        fix=words["fix"] or None,
+        prior=words["prior"],
+        events=words["events"],
+        peak=training["peak"],
+        recipe=training["recipe"],
+        seed=training["seed"],
+        data_table=of_data.pop("table", None),
+        data_energy=of_data.pop("energy", None),
+        **of_data,
+    )
+
+
+rule calibrate:
+    input:
+        warmed,
+        sim=one_simulation,
+        data=one_data,
+        energies=lambda w: ENERGIES.get((w.detector, w.period), []),
+        recipe=a_file(config["train"]["recipe"]),
+    output:
+        directory(TRAINED if CALIBRATED else f"{TRAINED}-calibrated"),
+    log:
+        f"{RESULTS}/{{detector}}/{{period}}/logs/calibrate.log",
+    benchmark:
+        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/calibrate.tsv"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=120,
+    params:
+        options=lambda w: calibration_options(w) if CALIBRATED else "",
+    shell:
+        "cpunet calibrate --sim {input.sim:q} --data {input.data:q} {params.options}"
+        " --out {output:q} --force > {log:q} 2>&1"
 
 
 rule train:
@@ -9,7 +62,7 @@ rule train:
         energies=lambda w: ENERGIES.get((w.detector, w.period), []),
         recipe=a_file(config["train"]["recipe"]),
     output:
-        directory(f"{RESULTS}/{{detector}}/{{period}}/run"),
+        directory(f"{TRAINED}-trained" if CALIBRATED else TRAINED),
     log:
         f"{RESULTS}/{{detector}}/{{period}}/logs/train.log",
     benchmark:
@@ -32,7 +85,7 @@ def translation_reading(wildcards):
 
 rule translate:
     input:
-        run=rules.train.output,
+        run=TRAINED,
         pulses=lambda w: SIMULATIONS[w.detector][w.part],
     output:
         f"{RESULTS}/{{detector}}/{{period}}/translated/{{part}}.lh5",
@@ -58,7 +111,7 @@ rule translate:
 
 rule validate:
     input:
-        run=rules.train.output,
+        run=TRAINED,
         sim=one_simulation,
         data=one_data,
         energies=lambda w: ENERGIES.get((w.detector, w.period), []),

@@ -1,6 +1,24 @@
 # Compiled code and fields, made once: parallel first jobs would all compile at the same time.
 
 
+DSP = config.get("events", {}).get("dsp", str(Path(workflow.basedir) / "config" / "dsp.yaml"))
+DSP_SCRIPT = shlex.quote(str(Path(workflow.basedir) / "scripts" / "dsp.py"))
+
+
+def dsp_of_a_demo(_wildcards):
+    """Commands that take the pulses of the demonstration to parameters, after it."""
+    if "events" not in config:
+        return ""
+    words = " ".join(shlex.quote(str(word)) for word in config["events"]["translate"])
+    demo = '"$folder/demo'
+    return (
+        f'; cpunet translate {demo}/run" {demo}/stand/sim.lh5" --output adc {words}'
+        f' --out-table demo/raw --out "$folder/raw.lh5"; python {DSP_SCRIPT}'
+        f' "$folder/raw.lh5" "$folder/dsp.lh5" --config {shlex.quote(DSP)}'
+        f' --table demo/raw --run {demo}/run"'
+    )
+
+
 rule warm:
     output:
         touch(f"{RESULTS}/warm.done"),
@@ -16,9 +34,12 @@ rule warm:
         # whatever is compiled takes part in a small demonstration
         demo="--events FEP=400,SEP=60,DEP=60 --set training.steps=1"
         " --set training.start_factors=[1.0] --set scores.bootstraps=20",
+        # and dspeed's chain, if events are to go through it
+        events=dsp_of_a_demo,
     shell:
         "(folder=$(mktemp -d); trap 'rm -rf \"$folder\"' EXIT;"
-        ' cpunet demo {params.demo} --device cpu --out "$folder/demo") > {log:q} 2>&1'
+        ' cpunet demo {params.demo} --device cpu --out "$folder/demo"{params.events})'
+        " > {log:q} 2>&1"
 
 
 def warmed(wildcards):

@@ -140,6 +140,17 @@ def describe_responses(
     return told
 
 
+def chain_of(run: Path) -> Chain:
+    """The readout chain that a training has learned, with its noise.
+
+    Raises
+    ------
+    CpunetError
+        If the run holds no response in closed form.
+    """
+    return _read_run(run).chain
+
+
 def stand_electronics(stand: Path) -> Electronics:
     """The true electronics of a test stand, from its ``stand.json``.
 

@@ -17,7 +17,8 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_readers import Transform, read_hits
+from cpunet.simulation.hit_readers import Transform, hit_parts
+from cpunet.simulation.hit_readers.steps import require_some
 from cpunet.simulation.hits import Hits
 
 BLOCK_EVENTS = 2000
@@ -103,21 +104,30 @@ class HitFile:
             As `read_hits`; also if no event is in a window, or nearly no hit in the
             crystal.
         """
-        hits = read_hits(
+        parts = hit_parts(
             self.path,
             detector=self.table,
             transform=self.transform,
             length_unit=self.length_unit,
             energy_unit=self.energy_unit,
-        ).hits
-        if self.windows:
-            hits = hits[_in_windows(hits.energy_kev, self.windows)]
-            if not hits.n_events:
-                names = ", ".join(window.name for window in self.windows)
-                raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
-        blocks = (hits[i : i + BLOCK_EVENTS] for i in range(0, hits.n_events, BLOCK_EVENTS))
-        warning = "" if self.placed else self._outside(hits, detector)
-        return OpenHits(hits.n_events, blocks, warning)
+        )
+
+        def chosen() -> Iterator[Hits]:
+            for hits in parts():
+                within = _in_windows(hits.energy_kev, self.windows) if self.windows else None
+                yield hits if within is None else hits[within]
+
+        n_events, astray = 0, _Astray(detector)
+        for hits in chosen():
+            n_events += hits.n_events
+            if not self.placed:
+                astray.add(hits)
+        if not n_events and self.windows:
+            names = ", ".join(window.name for window in self.windows)
+            raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
+        require_some(self.path, n_events)
+        warning = "" if self.placed else astray.told(self.path)
+        return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
 
     def provenance(self) -> dict[str, Any]:
         """What the output tells of its hits."""
@@ -129,19 +139,35 @@ class HitFile:
             "windows_kev": _by_name(self.windows),
         }
 
-    def _outside(self, hits: Hits, detector: Detector) -> str:
-        """What there is to say of hits outside the crystal; refused if nearly all are."""
-        inside = detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
-        n, total = int((~inside).sum()), len(inside)
+
+@dataclass
+class _Astray:
+    """Hits that lie outside the crystal, counted part by part."""
+
+    detector: Detector
+    outside: int = 0
+    total: int = 0
+    spans: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def add(self, hits: Hits) -> None:
+        """Count the hits of a part."""
+        inside = self.detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
+        self.outside += int((~inside).sum())
+        self.total += len(inside)
+        for axis, values in zip("xyz", (hits.x_mm, hits.y_mm, hits.z_mm), strict=True):
+            if len(values):
+                low, high = self.spans.get(axis, (np.inf, -np.inf))
+                self.spans[axis] = min(low, values.min()), max(high, values.max())
+
+    def told(self, path: Path) -> str:
+        """What there is to say of them; refused if nearly all are outside."""
+        n, total, detector = self.outside, self.total, self.detector
         if n <= _STRAY * total:
             return ""
-        spans = (
-            f"{axis} {values.min():.4g} to {values.max():.4g}"
-            for axis, values in zip("xyz", (hits.x_mm, hits.y_mm, hits.z_mm), strict=True)
-        )
+        spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in self.spans.items())
         share = f"all {total}" if n == total else f"{n} of {total} ({n / total:.1%})"
         text = (
-            f"{self.path}: {share} hits lie outside {detector.name} "
+            f"{path}: {share} hits lie outside {detector.name} "
             f"(radius {detector.crystal_radius:g}, z 0 to {detector.crystal_length:g} mm); "
             f"they span {', '.join(spans)} mm; "
         )
@@ -151,6 +177,19 @@ class HitFile:
                 "--hits-detector"
             )
         return f"{text}their energy is lost; check --origin, --flip-z and --hits-detector"
+
+
+def _regrouped(parts: Iterator[Hits], size: int) -> Iterator[Hits]:
+    """The same events in blocks of `size`, wherever the parts end; the last one is shorter."""
+    left: Hits | None = None
+    for part in parts:
+        hits = part if left is None else Hits.concatenate([left, part])
+        whole = hits.n_events // size * size
+        for start in range(0, whole, size):
+            yield hits[start : start + size]
+        left = hits[whole:] if whole < hits.n_events else None
+    if left is not None:
+        yield left
 
 
 @dataclass(frozen=True)

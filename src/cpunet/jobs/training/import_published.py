@@ -18,18 +18,17 @@ from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.source import MOST_SAMPLES
+from cpunet.pulses.reading.pickles import PickledPulse, as_pulse, entries
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
+from cpunet.restricted_unpickler import TruncatedError
 from cpunet.training.run_folder import RUN, versions, write_run
 from cpunet.translation.published import read_discriminator, read_generator
-from cpunet.translation.restricted_unpickler import TruncatedError, load_all
 
 QUIET = Monitor()
 BLOCK = 1024
 TABLE = "geds/raw"
 # What a report says of the training; the pulses are not part of what was published.
-_MOST_NUMBER = 2**62
 UNKNOWN = {"file": "not published with the weights", "used": "an unknown number of"}
 
 
@@ -181,8 +180,8 @@ def import_pulses(
     )
     with writer, monitor.stage("Pulses") as advance:
         for block in _blocks(_entries(source, ended), counts):
-            length = length or len(block[0]["wf"])
-            same = [pulse for pulse in block if len(pulse["wf"]) == length]
+            length = length or len(block[0].samples)
+            same = [pulse for pulse in block if len(pulse.samples) == length]
             counts["other_length"] += len(block) - len(same)
             if same:
                 writer.append(*_columns(same, dt_ns))
@@ -205,22 +204,18 @@ def import_pulses(
 def _entries(source: Path, ended: list[str]) -> Iterator[Any]:
     """Entries of all lists and single ones; where the file breaks off, `ended` says why."""
     try:
-        for value in load_all(source):
-            if isinstance(value, (list, tuple)):
-                yield from value
-            else:
-                yield value
+        yield from entries(source)
     except TruncatedError as error:
         ended.append(" ".join(str(error).split()))
 
 
-def _blocks(entries: Iterator[Any], counts: Counter[str]) -> Iterator[list[dict[str, Any]]]:
+def _blocks(found: Iterator[Any], counts: Counter[str]) -> Iterator[list[PickledPulse]]:
     """Pulses, many at a time; what is none is counted by reason."""
-    block: list[dict[str, Any]] = []
-    for entry in entries:
+    block: list[PickledPulse] = []
+    for entry in found:
         number = counts["read"]
         counts["read"] += 1
-        pulse, reason = _pulse(entry, number)
+        pulse, reason = as_pulse(entry, number)
         if pulse is None:
             counts[reason] += 1
             continue
@@ -232,44 +227,13 @@ def _blocks(entries: Iterator[Any], counts: Counter[str]) -> Iterator[list[dict[
         yield block
 
 
-def _pulse(entry: Any, number: int) -> tuple[dict[str, Any] | None, str]:
-    if not isinstance(entry, dict) or "wf" not in entry:
-        return None, "no_pulse"
-    try:
-        samples = _samples(entry["wf"])
-        pulse = {
-            "wf": samples,
-            "tp0": float(entry.get("tp0", np.nan)),
-            "energy": float(entry.get("energy", np.nan)),
-            "event": int(entry.get("event", number)),
-        }
-    except (TypeError, ValueError, OverflowError):
-        return None, "no_numbers"
-    if abs(int(entry.get("event", number))) > _MOST_NUMBER:
-        return None, "no_numbers"
-    if samples.ndim != 1 or not 0 < len(samples) <= MOST_SAMPLES:
-        return None, "no_trace"
-    return pulse, ""
-
-
-def _samples(trace: Any) -> npt.NDArray[np.float32]:
-    """A trace as an array; of nested lists, which may refer to each other, there is none."""
-    if isinstance(trace, list | tuple):
-        if len(trace) > MOST_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
-            return np.empty((0, 0), np.float32)
-    elif not isinstance(trace, np.ndarray):
-        raise TypeError
-    with np.errstate(over="ignore"):  # what is beyond single precision is counted later
-        return np.asarray(trace, np.float32)
-
-
 def _columns(
-    block: list[dict[str, Any]], dt_ns: float
+    block: list[PickledPulse], dt_ns: float
 ) -> tuple[Pulses, dict[str, tuple[npt.ArrayLike, str]]]:
     pulses = Pulses.of(
-        np.stack([pulse["wf"] for pulse in block]),
+        np.stack([pulse.samples for pulse in block]),
         dt_ns=dt_ns,
-        energy_kev=np.array([pulse["energy"] for pulse in block]),
-        event_number=np.array([pulse["event"] for pulse in block]),
+        energy_kev=np.array([pulse.numbers["energy"] for pulse in block]),
+        event_number=np.array([pulse.event for pulse in block]),
     )
-    return pulses, {"tp0": (np.array([pulse["tp0"] for pulse in block]), "")}
+    return pulses, {"tp0": (np.array([pulse.numbers["tp0"] for pulse in block]), "")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -109,9 +109,7 @@ class FileTranslation:
             if resume and not force and out.exists():
                 return finished(out, made) | {"skipped": True}
             refuse_existing(out, force=force)
-            pulses = source.open()
-            self._require_sampling(source, pulses)
-            require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
+            pulses = self.opened(source)
             others = other_columns(pulses, self.options, monitor.note)
             attrs = {TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)}
             writer = writer_of(pulses, out, self.form, self.options, attrs, force=force)
@@ -122,6 +120,26 @@ class FileTranslation:
                 told = counts.told(adc=self.options.adc is not None)
                 stamp(writer, made | {"counts": told, "cpunet": cpunet.__version__})
             return told
+
+    def opened(self, source: InputFile) -> PulseSource:
+        """Open a file of pulses that this run can translate.
+
+        Raises
+        ------
+        CpunetError
+            If it cannot be read, is sampled otherwise or is of the other side.
+        """
+        pulses = source.open()
+        self._require_sampling(source, pulses)
+        require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
+        return pulses
+
+    def blocks(
+        self, pulses: Iterable[Pulses], noise_key: str | None = None
+    ) -> Iterator[Formed]:
+        """Translate pulses that come in blocks; the noise depends on their order alone."""
+        for number, block in enumerate(regrouped(pulses, NOISE_ROWS)):
+            yield self._formed(block, number, noise_key)
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
@@ -167,16 +185,16 @@ class FileTranslation:
         give_back_large_arrays()
         counts, start = Counts(), 0
         times = self.options.realisations
-        for number, block in enumerate(regrouped(_read(pulses, advance), NOISE_ROWS)):
-            formed = self._formed(block, number, noise_key)
+        for formed in self.blocks(_read(pulses, advance), noise_key):
             columns: dict[str, Any] = {"rejection": (formed.codes, "")}
             if formed.remains_kev is not None:
                 columns["remains_kev"] = (formed.remains_kev, "keV")
+            given = len(formed.codes) // (times or 1)
             if times is not None:
-                columns["realisation"] = (np.tile(np.arange(times), len(block)), "")
-            writer.append(formed.pulses, columns, others.read(start, len(block), times or 1))
+                columns["realisation"] = (np.tile(np.arange(times), given), "")
+            writer.append(formed.pulses, columns, others.read(start, given, times or 1))
             counts.add(formed)
-            start += len(block)
+            start += given
         if pulses.n_pulses not in (None, start):
             raise CpunetError(
                 f"{pulses.path}: {start} pulses read of {pulses.n_pulses}; it changed while "

@@ -13,7 +13,7 @@ from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.evaluation import Evaluation, evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
 from cpunet.jobs.validation.figures import Drawing, drawings
 from cpunet.jobs.validation.views import report_views
@@ -72,21 +72,48 @@ def validate_run(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
+    found, _ = validated(
+        run, sim, data, out, truth=truth, rivals=rivals, seed=seed, ae_range_kev=ae_range_kev,
+        device=device, force=force, monitor=monitor,
+    )  # fmt: skip
+    return found.metrics
+
+
+def validated(
+    run: Path,
+    sim: InputFile,
+    data: InputFile,
+    out: Path | None,
+    *,
+    truth: Path | None = None,
+    rivals: bool = True,
+    seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
+    device: str = "auto",
+    force: bool = False,
+    monitor: Monitor = QUIET,
+) -> tuple[Evaluation, dict[str, Drawing]]:
+    """As `validate_run`, with all that was found, and its figures by name.
+
+    Parameters
+    ----------
+    out
+        Report folder; None for none.
+    run, sim, data, truth, rivals, seed, ae_range_kev, device, force, monitor
+        As for `validate_run`.
+    """
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
+    score = partial(
+        evaluate, run, sim, data, truth=truth, rivals=rivals, seed=seed, device=device,
+        monitor=monitor, ae_range_kev=ae_range_kev,
+    )  # fmt: skip
+    if out is None:
+        found = score()
+        return found, drawings(found)
     read = (run, *sim.files, *data.files, truth)
     with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
-        found = evaluate(
-            run,
-            sim,
-            data,
-            truth=truth,
-            rivals=rivals,
-            seed=seed,
-            device=device,
-            monitor=monitor,
-            ae_range_kev=ae_range_kev,
-        )
+        found = score()
         to_draw = drawings(found)
         made = made_of(run, sim, data, truth, rivals, seed)
         write_drawings(folder / STORE, to_draw, made)
@@ -94,7 +121,7 @@ def validate_run(
             notes = _notes(found.info, truth)
             figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
-    return found.metrics
+    return found, to_draw
 
 
 def _of_remains(info: Mapping[str, Any]) -> list[str]:

@@ -17,6 +17,7 @@ from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
 from cpunet.pulses.reading.hdf5 import columns_of
 from cpunet.pulses.reading.hdf5_tables import WaveformColumn, choose_waveforms
 from cpunet.pulses.reading.lh5_rows import read_rows
+from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
 _PARTS = ("cumulative_length", "flattened_data")  # of vectors
@@ -25,6 +26,8 @@ _PARTS = ("cumulative_length", "flattened_data")  # of vectors
 def open_hdf5(options: ReadOptions) -> PulseSource:
     """Open the chosen waveforms of an HDF5 file, LH5 or not (see `open_pulses`)."""
     with opened(options.path) as file:
+        if is_majorana(file):
+            return MajoranaSource(options)
         chosen = choose_waveforms(options.path, file, options.table)
     return Lh5Source(options, chosen) if chosen.is_lh5 else Hdf5Source(options, chosen)
 

@@ -19,7 +19,8 @@ def open_pulses(
     """Open a file of pulses; its format is found by its content.
 
     Read are LH5 (waveform tables, also encoded ones) and other HDF5, FlashCam
-    ``.fcio``, NumPy ``.npz`` and ``.npy``, and siggen's ``.spe`` and text.
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe`` and text, the Majorana
+    Demonstrator's release for machine learning, and CPU-Net's pickled pulses.
 
     Parameters
     ----------
@@ -28,7 +29,8 @@ def open_pulses(
     table
         Where the waveforms are: a table or waveform column of an LH5 file, a
         group or dataset of an HDF5 file, an array of an ``.npz``, a channel
-        of an ``.fcio``.  Needed only where there are several.
+        of an ``.fcio``, a detector of the Majorana release.  Needed only where
+        there are several.
     energy
         Column of the energies, or ``FILE:path/to/column`` for a column of another
         HDF5 file of the same events, such as LEGEND's hit tier.
@@ -64,6 +66,10 @@ def open_pulses(
             from cpunet.pulses.reading.arrays import ArraySource
 
             return ArraySource(options)
+        case "pickle":
+            from cpunet.pulses.reading.pickles import PickleSource
+
+            return PickleSource(options)
         case "spe":
             from cpunet.pulses.reading.siggen import SpectrumSource
 
@@ -77,6 +83,8 @@ def open_pulses(
 def tables_of(path: str | Path) -> list[str]:
     """Tables of waveforms in an LH5 or other HDF5 file; none in files of other formats.
 
+    Of the Majorana release they are the detectors.
+
     Raises
     ------
     CpunetError
@@ -86,6 +94,9 @@ def tables_of(path: str | Path) -> list[str]:
         return []
     from cpunet.pulses.reading.hdf5 import opened
     from cpunet.pulses.reading.hdf5_tables import waveform_tables
+    from cpunet.pulses.reading.majorana import detectors, is_majorana
 
     with opened(Path(path)) as file:
+        if is_majorana(file):
+            return detectors(file)
         return waveform_tables(file)

@@ -9,7 +9,7 @@ from typing import Literal
 from cpunet.errors import CpunetError
 from cpunet.regular_files import require_file
 
-Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "text"]
+Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "pickle", "text"]
 
 _NAMES: dict[Format, str] = {
     "hdf5": "HDF5",
@@ -17,6 +17,7 @@ _NAMES: dict[Format, str] = {
     "spe": "spectrum",
     "npz": "NumPy",
     "npy": "NumPy",
+    "pickle": "pickle",
     "text": "text",
 }
 _SUFFIXES: dict[str, Format] = {
@@ -28,9 +29,12 @@ _SUFFIXES: dict[str, Format] = {
     ".spe": "spe",
     ".npz": "npz",
     ".npy": "npy",
+    ".pickle": "pickle",
+    ".pkl": "pickle",
 }
 _HEAD_BYTES = 520
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+_PICKLE, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
 _TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
 
 
@@ -46,9 +50,10 @@ def recognise(path: Path) -> Format:
     head = _head(path)
     found = _by_content(head, path)
     claimed = _SUFFIXES.get(path.suffix.lower())
-    # Plain text passes for anything, so it must not be named as something else.
+    # Plain text passes for anything, so it must not be named as something else; a pickle of
+    # the oldest kind is text.
     if found == "text" and claimed is not None:
-        found = None
+        found = "pickle" if claimed == "pickle" else None
     if found is not None:
         return found
     if claimed is not None:
@@ -58,7 +63,7 @@ def recognise(path: Path) -> Format:
         )
     raise CpunetError(
         f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
-        "or siggen's .spe or text"
+        "pickled pulses, or siggen's .spe or text"
     )
 
 
@@ -91,6 +96,8 @@ def _by_content(head: bytes, path: Path) -> Format | None:
     # Fortran's record marks around the 24 bytes of a Radware header.
     if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
         return "spe"
+    if head[0] == _PICKLE and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
+        return "pickle"
     if set(head) <= _TEXT_BYTES:
         return "text"
     return None

@@ -47,11 +47,12 @@ def resolve_sampling(
     *,
     dt_ns: float | None,
     n_pulses: int | None = None,
+    hint: str = "",
 ) -> Sampling:
     """Take the period from `column` (called `name`) or from the user's `dt_ns`.
 
     A column without units is in ns if its name ends in ``_ns``; else it says
-    nothing and `dt_ns` is needed.
+    nothing and `dt_ns` is needed; the `hint` says what is known of it.
 
     Raises
     ------
@@ -62,7 +63,9 @@ def resolve_sampling(
     if column is None or ns_per_unit is None:
         if dt_ns is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
-            raise CpunetError(f"{path}: the sampling period {why}; give --dt-ns")
+            raise CpunetError(
+                f"{path}: the sampling period {why}; give --dt-ns{hint and f' ({hint})'}"
+            )
         return Sampling(path, dt_ns)
     if len(column) != 1:
         require_length(path, name, column, n_pulses)

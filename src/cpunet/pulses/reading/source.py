@@ -59,6 +59,8 @@ class Layout:
         Name of the column with the sampling period.
     period
         The sampling period, if the file tells.
+    period_hint
+        What is known of it otherwise, for whoever has to say it.
     """
 
     format: str
@@ -68,6 +70,7 @@ class Layout:
     columns: Mapping[str, Column] = field(default_factory=dict)
     period_name: str = "dt"
     period: Column | None = None
+    period_hint: str = ""
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ class PulseSource(ABC):
             layout.period,
             dt_ns=options.dt_ns,
             n_pulses=layout.n_pulses,
+            hint=layout.period_hint,
         )
         self.dt_ns = self._sampling.dt_ns
         self._energies = resolve_energies(

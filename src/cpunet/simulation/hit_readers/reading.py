@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -13,8 +14,16 @@ from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
 from cpunet.simulation.hit_readers.npz import read_npz
-from cpunet.simulation.hit_readers.remage import read_remage
-from cpunet.simulation.hit_readers.steps import ReadHits, Steps, Transform, Units, to_hits
+from cpunet.simulation.hit_readers.remage import parts_of, read_remage
+from cpunet.simulation.hit_readers.steps import (
+    ReadHits,
+    Steps,
+    Transform,
+    Units,
+    require_some,
+    to_hits,
+)
+from cpunet.simulation.hits import Hits
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
@@ -58,7 +67,60 @@ def read_hits(
     """
     file = Path(path)
     units = Units(length_unit, energy_unit)
-    return to_hits(file, _steps(file, detector, units), transform)
+    found = to_hits(file, _steps(file, detector, units), transform)
+    require_some(file, found.hits.n_events)
+    return found
+
+
+def hit_parts(
+    path: Path | str,
+    *,
+    detector: str | None = None,
+    transform: Transform = _AS_IN_THE_FILE,
+    length_unit: str | None = None,
+    energy_unit: str | None = None,
+) -> Callable[[], Iterator[Hits]]:
+    """As `read_hits`, part by part where the file allows, so that memory does not grow with it.
+
+    Tables of remage are read in parts, unless rows of one event lie apart; all else is read
+    once, and kept.
+
+    Returns
+    -------
+    callable
+        Gives the parts from the first on, each time it is called.
+    """
+    file = Path(path)
+    units = Units(length_unit, energy_unit)
+    parts = parts_of(file, detector) if _is_remage(file) else None
+    if parts is None or len(parts) < 2:
+        whole = read_hits(
+            file,
+            detector=detector,
+            transform=transform,
+            length_unit=length_unit,
+            energy_unit=energy_unit,
+        ).hits
+        return lambda: iter([whole])
+
+    def read() -> Iterator[Hits]:
+        for rows in parts:
+            yield to_hits(file, read_remage(file, detector, units, rows), transform).hits
+
+    return read
+
+
+def _is_remage(path: Path) -> bool:
+    try:
+        with require_file(path).open("rb") as stream:
+            if not stream.read(8).startswith(_HDF5_MAGIC):
+                return False
+    except OSError:
+        return False  # which the reader tells
+    with opened(path) as file:
+        return isinstance(file.get("stp"), h5py.Group) and not isinstance(
+            file.get(NTUPLE), h5py.Group
+        )
 
 
 def _steps(path: Path, detector: str | None, units: Units) -> Steps:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,15 @@ from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 _AXES = ("xloc", "yloc", "zloc")
 
 
-def read_remage(path: Path, detector: str | None, units: Units) -> Steps:
+ROWS = 5_000  # of a part: some ten MB of steps
+
+
+def read_remage(
+    path: Path, detector: str | None, units: Units, rows: slice = slice(0, sys.maxsize)
+) -> Steps:
     """Read the steps of one ``stp`` table, relative to the detector's origin if it is known."""
     name = _detector(path, detector)
-    table = _read(path, f"stp/{name}")
+    table = _read(path, f"stp/{name}", rows)
     edep, counts = _flat(path, table, "edep")
     edep = edep * units.to_kev(path, f"stp/{name}/edep", _unit(table, "edep"))
     columns = []
@@ -33,6 +39,31 @@ def read_remage(path: Path, detector: str | None, units: Units) -> Steps:
     numbers = whole_numbers(path, f"stp/{name}/evtid", _real(path, "evtid", table["evtid"]))
     position = np.stack(columns, axis=1) - _origin(path, name, units)
     return Steps(np.repeat(numbers, counts), position, edep)
+
+
+def parts_of(path: Path, detector: str | None, size: int = ROWS) -> list[slice] | None:
+    """Rows of a table in parts of `size` or a little more, so that no event is in two of them.
+
+    Returns
+    -------
+    list of slice or None
+        None if rows of one event lie apart, as in files joined from several threads.
+    """
+    name = _detector(path, detector)
+    with opened(path) as file:
+        item = file.get(f"stp/{name}/evtid")
+        if not isinstance(item, h5py.Dataset) or item.ndim != 1:
+            return None  # which the reader tells
+        require_all_stored(path, item)
+        numbers = np.asarray(item[()])
+    starts = np.flatnonzero(np.diff(numbers, prepend=np.nan if len(numbers) else 0) != 0)
+    if len(np.unique(numbers)) != len(starts):
+        return None
+    cuts = [0]
+    while cuts[-1] < len(numbers):
+        after = np.searchsorted(starts, cuts[-1] + size)
+        cuts.append(int(starts[after]) if after < len(starts) else len(numbers))
+    return [slice(a, b) for a, b in pairwise(cuts)]
 
 
 def _detector(path: Path, detector: str | None) -> str:
@@ -71,7 +102,7 @@ def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
     return origin
 
 
-def _read(path: Path, name: str) -> dict[str, Any]:
+def _read(path: Path, name: str, rows: slice) -> dict[str, Any]:
     """Required columns of a table, as LH5 objects."""
     table = {}
     with opened(path) as file:
@@ -82,7 +113,7 @@ def _read(path: Path, name: str) -> dict[str, Any]:
                     f"{path}: {name} has no column {column}; choose a germanium detector"
                 )
             require_all_stored(path, item)
-            table[column] = read_rows(item, 0, sys.maxsize)
+            table[column] = read_rows(item, rows.start, rows.stop - rows.start)
     return table
 
 

@@ -77,8 +77,7 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
     Raises
     ------
     CpunetError
-        If a step has no finite position or energy or a negative energy, or if no step
-        deposits energy.
+        If a step has no finite position or energy, or a negative energy.
     """
     # written so that NaN fails
     placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
@@ -91,8 +90,6 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
             "remove the event or simulate again"
         )
     kept = steps.edep_kev > 0
-    if not kept.any():
-        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
     numbers, first, label = np.unique(steps.event[kept], return_index=True, return_inverse=True)
     in_file = np.argsort(first)
     rank = np.empty_like(in_file)
@@ -107,6 +104,12 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
         numbers[in_file],
     )
     return ReadHits(hits, int((~kept).sum()))
+
+
+def require_some(path: Path, n_events: int) -> None:
+    """Raise a `CpunetError` if there is no event with a deposit."""
+    if not n_events:
+        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
 
 
 def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:

@@ -1,0 +1,188 @@
+"""`cpunet.calibrate`, and a calibrated run to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from cpunet.analysis.calibration_figures import (
+    directions_figure,
+    profiles_figure,
+    pulls_figure,
+)
+from cpunet.calls import html
+from cpunet.calls.given import File, as_input, as_recipe
+from cpunet.calls.progress import shown
+from cpunet.calls.runs import Run
+from cpunet.errors import CpunetError
+from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
+from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.jobs.simulation.simulation_settings import load_settings
+from cpunet.recipes.schema import Recipe
+from cpunet.regular_files import read_text
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.run_folder import read_info
+from cpunet.yaml_files import MOST_BYTES, plain_json
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibratedRun(Run):
+    """A run whose simulation was fitted together with the readout.
+
+    Parameters
+    ----------
+    content
+        Of ``calibration.json``.
+    """
+
+    content: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> CalibratedRun:
+        """Open the folder of a calibration.
+
+        Raises
+        ------
+        CpunetError
+            If it is none.
+        """
+        folder = Path(folder)
+        info = read_info(folder)
+        try:
+            content = plain_json(read_text(folder / CALIBRATION, MOST_BYTES))
+        except (OSError, ValueError) as error:
+            raise CpunetError(
+                f"{folder}: no calibrated run ({CALIBRATION} cannot be read); open it with "
+                "cpunet.Run.load, or calibrate"
+            ) from error
+        return cls(folder, info, tuple(content.get("notes", ())), content)
+
+    @property
+    def physics(self) -> dict[str, dict[str, Any]]:
+        """By parameter: ``value``, ``error``, ``simulated``, ``prior`` and others."""
+        return dict(self.content["parameters"])
+
+    @property
+    def sim(self) -> Path:
+        """All events simulated again with these physics."""
+        return self.folder / SIM
+
+    @cached_property
+    def detector(self) -> Detector:
+        """The calibrated detector."""
+        return read_detector(str(self.folder / DETECTOR))
+
+    @cached_property
+    def settings(self) -> SimulationSettings:
+        """The calibrated settings of the simulation."""
+        return load_settings(self.folder / SETTINGS)
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """``pulls``, and if something was free, ``profiles`` and ``directions``."""
+        found = {"pulls": pulls_figure(self.content)}
+        if self.content["profiles"]:
+            found["profiles"] = profiles_figure(self.content)
+        if self.content["directions"]:
+            found["directions"] = directions_figure(self.content["directions"])
+        return found
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [name, f"{one['value']:.5g} ± {one['error']:.2g}", f"{one['simulated']:.5g}"]
+            for name, one in self.physics.items()
+        ]
+        head = ["physics", "calibrated", "as simulated"]
+        return (
+            html.table(head, rows) + html.lines(self.content["notes"]) + super()._repr_html_()
+        )
+
+
+def calibrate(
+    sim: File | HitFile,
+    data: File,
+    out: str | Path,
+    *,
+    detector: str | Path | Detector | None = None,
+    settings: SimulationSettings | None = None,
+    free: Sequence[str] | None = None,
+    fixed: Sequence[str] = (),
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    peak: str = "FEP",
+    recipe: str | Path | Recipe = "fast",
+    events: int = 3000,
+    seed: int = 0,
+    force: bool = False,
+    progress: bool | Monitor = True,
+) -> CalibratedRun:
+    """Fit detector and readout together, and train on the simulation that follows.
+
+    Parameters
+    ----------
+    sim
+        Pulses of ``cpunet simulate`` or ``cpunet stand``, with their hits; or
+        `cpunet.HitFile`, hits that are simulated first, with the `detector` they lie in.
+    data
+        Measured pulses.
+    out
+        Folder of the run.
+    detector, settings
+        To simulate with; those of `sim` by default.
+    free
+        Parameters, as ``["temperature", "impurity"]``; None for those that the data tell.
+    fixed
+        Parameters that stay as simulated.
+    priors
+        Value and error by name, as ``{"depletion_voltage": (2100, 50)}``.
+    peak
+        Energies to calibrate on.
+    recipe
+        ``"fast"`` or ``"best"``, a YAML file, or a recipe itself.
+    events
+        Simulated events, at most, that are drifted again and again.
+    seed
+        Of everything random.
+    force
+        Replace what this program wrote there.
+    progress
+        Bars in a notebook or on a terminal; or a monitor of your own.
+
+    Returns
+    -------
+    CalibratedRun
+        The run, with the physics that were found.
+
+    Raises
+    ------
+    CpunetError
+        If something that is given cannot be used, or the data are of another detector.
+    """
+    monitor = shown(progress)
+    known = detector if isinstance(detector, Detector | None) else read_detector(str(detector))
+    start = Start(
+        sim=None if isinstance(sim, HitFile) else as_input(sim, "sim"),
+        hits=replace(sim, path=Path(sim.path)) if isinstance(sim, HitFile) else None,
+        detector=known,
+        settings=settings,
+    )
+    given = [f"{name}={float(v)!r}±{float(e)!r}" for name, (v, e) in (priors or {}).items()]
+    job = Calibration(
+        start,
+        as_input(data, "data"),
+        as_recipe(recipe, None),
+        Freedom.of("auto" if free is None else ",".join(free), ",".join(fixed), given),
+        peak=peak,
+        events=events,
+        seed=seed,
+    )
+    content = job.run(Path(out), force=force, monitor=monitor)
+    return CalibratedRun(Path(out), read_info(Path(out)), tuple(monitor.notes), content)

@@ -1,0 +1,59 @@
+"""What is given to a call: files by name or with how they are read, recipes, runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
+
+File: TypeAlias = str | Path | InputFile
+
+
+def as_input(file: File, name: str) -> InputFile:
+    """A file of pulses and how it is read.
+
+    Raises
+    ------
+    CpunetError
+        If it is neither a path nor an `InputFile`.
+    """
+    if isinstance(file, InputFile):
+        return replace(file, path=Path(file.path))  # in a notebook it may be text
+    if isinstance(file, str | Path):
+        return InputFile(Path(file))
+    raise CpunetError(
+        f"{name} is of type {type(file).__name__}; give a path, or cpunet.InputFile(path, …); "
+        "arrays are written with cpunet.pulses.writing.write_pulses first"
+    )
+
+
+def as_recipe(recipe: str | Path | Recipe, settings: Mapping[str, Any] | None) -> Recipe:
+    """A recipe by name, file or as it is, with single values of it overridden.
+
+    Examples
+    --------
+    >>> as_recipe("paper", {"training.batch_size": 16}).training.batch_size
+    16
+
+    Raises
+    ------
+    CpunetError
+        If there is no such recipe or value.
+    """
+    if not isinstance(recipe, Recipe):
+        # JSON is YAML
+        words = [f"{key}={json.dumps(value)}" for key, value in (settings or {}).items()]
+        return load_recipe(str(recipe), words)
+    if settings:
+        raise CpunetError(
+            "settings override values of a recipe that is given by name; this one is whole "
+            "already, so change it and leave settings out"
+        )
+    return recipe

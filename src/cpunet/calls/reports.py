@@ -1,0 +1,237 @@
+"""`cpunet.validate`, and a report to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hist
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpunet.analysis.comparisons import data_axis
+from cpunet.analysis.report import METRICS
+from cpunet.calls import html
+from cpunet.calls.given import File, as_input
+from cpunet.calls.progress import shown
+from cpunet.calls.runs import Run, folder_of
+from cpunet.calls.translations import MAX_BINS, named, named_axis
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.figure_store import STORE, read_drawings
+from cpunet.jobs.validation.figures import Drawing
+from cpunet.jobs.validation.scoring import ByMethod
+from cpunet.jobs.validation.validate import validated
+from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.regular_files import read_text
+from cpunet.yaml_files import MOST_BYTES, plain_json
+
+_SHOWN = ("data", "raw", "ren", "truth")  # methods in a notebook's table
+_HISTOGRAMS = "histograms"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Report:
+    """How well a run translates: what `cpunet.validate` gives.
+
+    Parameters
+    ----------
+    metrics
+        The content of ``metrics.json``.
+    values
+        Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
+    folder
+        Of the report; None if none was written.
+    notes
+        What was told meanwhile.
+    drawn
+        What the figures are drawn of, by name.
+    """
+
+    metrics: Mapping[str, Any]
+    values: Mapping[str, ByMethod]
+    folder: Path | None
+    notes: tuple[str, ...]
+    drawn: Mapping[str, Drawing]
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Report:
+        """Open a report's folder; `values` are those that its histograms are drawn of.
+
+        Raises
+        ------
+        CpunetError
+            If it is none, or cannot be read.
+        """
+        file = Path(folder) / METRICS
+        try:
+            metrics = plain_json(read_text(file, MOST_BYTES))
+        except (OSError, ValueError) as error:
+            raise CpunetError(
+                f"{file}: cannot be read ({error}); give the folder of a report, or make one "
+                "with cpunet.validate"
+            ) from error
+        if not isinstance(metrics, dict) or "peaks" not in metrics:
+            raise CpunetError(f"{file}: holds no scores; make the report again")
+        drawn, _ = read_drawings(Path(folder) / STORE)
+        values: dict[str, ByMethod] = {}
+        for one in drawn.values():
+            if one.kind == _HISTOGRAMS:
+                of_peak = values.setdefault(one.values["peak"], {})
+                for method, of_method in one.values["values"].items():
+                    of_peak.setdefault(method, {})[one.values["parameter"]] = of_method
+        return cls(metrics, values, Path(folder), (), drawn)
+
+    @property
+    def scores(self) -> list[dict[str, Any]]:
+        """One row for each peak, parameter and method, as `pandas.DataFrame` takes them.
+
+        ``iou`` is the overlap with data in percent, ``ceiling`` what data score against data.
+        """
+        rows = []
+        for peak, of_peak in self.metrics["peaks"].items():
+            for parameter, compared in of_peak["parameters"].items():
+                ceiling = compared["iou"].get("ceiling")
+                for method, iou in compared["iou"].items():
+                    if method == "ceiling":
+                        continue
+                    row = {"peak": peak, "parameter": parameter, "method": method}
+                    row |= {"iou": iou, "iou_std": compared["iou_std"].get(method)}
+                    row |= {"ceiling": ceiling, "ks": compared["ks"].get(method)}
+                    rows.append(row | {"wasserstein": compared["wasserstein"].get(method)})
+        return rows
+
+    @property
+    def verdicts(self) -> list[str]:
+        """What is said of the translation, peak by peak, in words."""
+        return list(self.metrics["verdicts"]["summary"])
+
+    @property
+    def figures(self) -> Mapping[str, Figure]:
+        """Figures by name, each drawn when it is asked for."""
+        return WhenAsked({name: partial(_draw, one) for name, one in self.drawn.items()})
+
+    def hist(
+        self, peak: str, parameter: str = "current_amplitude", max_bins: int = MAX_BINS
+    ) -> hist.Hist[Any]:
+        """Distributions of a parameter by method, in the bins in which they are scored.
+
+        Returns
+        -------
+        hist.Hist
+            Axes ``method`` (categories) and the parameter.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such peak or parameter.
+        """
+        of_peak = named(self.values, peak, "scored peak")
+        data = named(of_peak["data"], parameter, "parameter")
+        there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
+        methods = hist.axis.StrCategory(list(there), name="method")
+        axis = named_axis(data_axis(data, max_bins), parameter)
+        made: hist.Hist[Any] = hist.Hist(methods, axis)
+        for method, values in there.items():
+            made.fill(method, values[np.isfinite(values)])
+        return made
+
+    def __repr__(self) -> str:
+        peaks = ", ".join(self.metrics["peaks"])
+        where = "" if self.folder is None else f" {self.folder}"
+        return f"<Report{where}: {peaks}>"
+
+    def _repr_html_(self) -> str:
+        methods = [m for m in _SHOWN[1:] if any(row["method"] == m for row in self.scores)]
+        by_place: dict[tuple[str, str], dict[str, Any]] = {}
+        for row in self.scores:
+            place = by_place.setdefault((row["peak"], row["parameter"]), {})
+            place |= {row["method"]: row["iou"], "ceiling": row["ceiling"]}
+        head = ["peak", "overlap with data (%)", *methods, "ceiling"]
+        rows = [
+            [peak, parameter.replace("_", " "), *(_number(iou.get(m)) for m in head[2:])]
+            for (peak, parameter), iou in by_place.items()
+        ]
+        where = {"page": None if self.folder is None else self.folder / "report.html"}
+        parts = [html.heading("cpunet report"), html.table(head, rows)]
+        parts += [html.lines(self.verdicts), html.facts(where)]
+        return "".join(parts)
+
+
+def validate(
+    run: Run | str | Path,
+    sim: File,
+    data: File,
+    out: str | Path | None = None,
+    *,
+    truth: str | Path | None = None,
+    rivals: bool = True,
+    seed: int = 0,
+    ae_range_kev: tuple[float, float] | None = None,
+    device: str = "auto",
+    force: bool = False,
+    progress: bool | Monitor = True,
+) -> Report:
+    """Score a run on simulated and measured pulses, peak by peak.
+
+    Parameters
+    ----------
+    run
+        A trained run or its folder.
+    sim, data
+        Simulated and measured pulses: a path, or `cpunet.InputFile` to say how it is read.
+    out
+        Folder for ``report.html`` and figures; None to write nothing.
+    truth
+        Noise-free responses of the simulated pulses, if they are known (``truth.npz``).
+    rivals
+        Fit what one would use instead, too.
+    seed
+        Of noise and bootstraps.
+    ae_range_kev
+        More energies to read on both sides, for A/E against energy: such as (900, 2350).
+    device
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    force
+        Replace what this program wrote there.
+    progress
+        Bars in a notebook or on a terminal; or a monitor of your own.
+
+    Returns
+    -------
+    Report
+        Scores, values, histograms and figures.
+
+    Raises
+    ------
+    CpunetError
+        If something that is given cannot be used, or no peak can be scored.
+    """
+    monitor = shown(progress)
+    found, drawn = validated(
+        folder_of(run),
+        as_input(sim, "sim"),
+        as_input(data, "data"),
+        None if out is None else Path(out),
+        truth=None if truth is None else Path(truth),
+        rivals=rivals,
+        seed=seed,
+        ae_range_kev=ae_range_kev,
+        device=device,
+        force=force,
+        monitor=monitor,
+    )
+    values = {peak: of_peak for peak, of_peak in found.values.items() if of_peak}
+    where = None if out is None else Path(out)
+    return Report(found.metrics, values, where, tuple(monitor.notes), drawn)
+
+
+def _draw(drawing: Drawing) -> Figure:
+    return drawing.draw()
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f}"

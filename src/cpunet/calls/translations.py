@@ -1,0 +1,296 @@
+"""`cpunet.translate`, and translated pulses to look at."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import hist
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from cpunet.analysis.comparisons import data_axis
+from cpunet.analysis.style import COLOURS, styled
+from cpunet.calls import html
+from cpunet.calls.given import File, as_input
+from cpunet.calls.progress import shown
+from cpunet.calls.runs import Run, folder_of
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.translation.translate import FileTranslation
+from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Codes, Rejection
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, all_parameters
+from cpunet.recipes.schema import Recipe
+from cpunet.translation.learned_remains import NONE
+from cpunet.translation.output_form import Formed
+
+MAX_BINS = 49
+DRAWN = 50  # pulses in a figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Translation:
+    """Translated pulses, row by row those that were given.
+
+    Parameters
+    ----------
+    run
+        Folder of the run that translated them.
+    counts
+        ``read``, ``translated``, ``rejections`` by reason, in ADC ``saturated``.
+    recipe
+        Of the run.
+    adc
+        Whether these are raw traces in ADC counts; else normalised windows.
+    path
+        The file they were written to; None if they are in memory only.
+    notes
+        What was told meanwhile.
+    kept
+        The pulses and the codes of their rejections if they are in memory.
+    """
+
+    run: Path
+    counts: Mapping[str, Any]
+    recipe: Recipe
+    adc: bool = False
+    path: Path | None = None
+    notes: tuple[str, ...] = ()
+    kept: tuple[Pulses, Codes] | None = None
+
+    @cached_property
+    def pulses(self) -> Pulses:
+        """All pulses; of a file, read when first asked for."""
+        return self.kept[0] if self.kept else open_pulses(self._file()).read()
+
+    @cached_property
+    def codes(self) -> Codes:
+        """A `cpunet.pulses.preparation.Rejection` for each row; 0 is a translated pulse."""
+        if self.kept:
+            return self.kept[1]
+        column = open_pulses(self._file()).columns["rejection"]
+        return np.asarray(column.read(0, len(column)), np.uint8)
+
+    @property
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """Which rows hold a pulse, shape (n,)."""
+        return np.asarray(self.codes == Rejection.ACCEPTED)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """How many rows hold none, by reason."""
+        return dict(self.counts["rejections"])
+
+    @cached_property
+    def parameters(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Pulse-shape parameters by name, shape (n,); see `SHAPE_PARAMETERS`.
+
+        Raises
+        ------
+        CpunetError
+            Of raw traces, which have to be prepared first.
+        """
+        if self.adc:
+            raise CpunetError(
+                f"{self.path or self.run}: raw traces in ADC have no parameters yet; run "
+                "dspeed on them, or translate to windows"
+            )
+        return all_parameters(self.pulses, self.recipe.preparation, self.recipe.scores)
+
+    def hist(
+        self, parameter: str = "current_amplitude", max_bins: int = MAX_BINS
+    ) -> hist.Hist[Any]:
+        """Distribution of a parameter as a `hist.Hist`.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such parameter.
+        """
+        values = named(self.parameters, parameter, "parameter")
+        axis = named_axis(data_axis(values, max_bins), parameter)
+        made: hist.Hist[Any] = hist.Hist(axis)
+        return made.fill(values[np.isfinite(values)])
+
+    @styled
+    def figure(self, n: int = DRAWN) -> Figure:
+        """The first translated pulses, drawn over each other."""
+        rows = np.flatnonzero(self.valid)[:n]
+        figure = Figure(figsize=(6.4, 3.2))
+        axes = figure.subplots()
+        pulses = self.pulses
+        time_us = np.arange(pulses.length) * pulses.dt_ns * 1e-3
+        lines = pulses.waveforms[rows].T
+        axes.plot(time_us, lines, color=COLOURS["ren"], lw=0.6, alpha=0.5)
+        axes.set_xlabel("Time [µs]")
+        axes.set_ylabel("ADC counts" if self.adc else "Pulse height")
+        axes.set_title(f"{len(rows)} of {self.counts['translated']} translated pulses")
+        return figure
+
+    def _file(self) -> Path:
+        if self.path is None:
+            raise CpunetError(
+                "these pulses are neither in memory nor in a file; translate them again"
+            )
+        return self.path
+
+    def __repr__(self) -> str:
+        where = "in memory" if self.path is None else str(self.path)
+        done = f"{self.counts['translated']} of {self.counts['read']} pulses"
+        return f"<Translation {where}: {done}>"
+
+    def _repr_html_(self) -> str:
+        told: dict[str, object] = {
+            "run": self.run,
+            "file": self.path,
+            "translated": f"{self.counts['translated']} of {self.counts['read']} pulses",
+            "as": "raw traces in ADC" if self.adc else "normalised windows",
+            "saturated": self.counts.get("saturated"),
+        }
+        told |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
+        small = self.kept is not None  # a file may be large
+        drawn = html.picture(self.figure()) if small and self.counts["translated"] else ""
+        return html.heading("cpunet translation") + html.facts(told) + drawn
+
+
+def translate(
+    run: Run | str | Path,
+    pulses: File | Pulses,
+    out: str | Path | None = None,
+    *,
+    inverse: bool = False,
+    noise: bool = True,
+    seed: int = 0,
+    adc: Adc | bool = False,
+    remains: str = NONE,
+    realisations: int | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    force: bool = False,
+    progress: bool | Monitor = True,
+) -> Translation:
+    """Make simulated pulses look measured, or with `inverse` the other way round.
+
+    Parameters
+    ----------
+    run
+        A trained run or its folder.
+    pulses
+        A file, streamed if there is an `out`; or pulses in memory.
+    out
+        LH5 file to write, with all columns of the source; None to stay in memory.
+    inverse
+        Measured → simulation-like.
+    noise, seed
+        Add noise, drawn with this seed.  Memory and file have the same noise.
+    adc
+        Raw traces in ADC counts, as a digitiser writes them: True, or `Adc` with its settings.
+    remains
+        Of earlier pulses: ``"learned"``, ``"none"``, or a rate in kHz.
+    realisations
+        Draw the noise so many times for each pulse.
+    device
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    resume
+        Leave a file as it is that was made in just this way.
+    force
+        Replace what this program wrote there.
+    progress
+        Bars in a notebook or on a terminal; or a monitor of your own.
+
+    Returns
+    -------
+    Translation
+        The translated pulses.
+
+    Raises
+    ------
+    CpunetError
+        If something that is given cannot be used, or no pulse can be translated.
+    """
+    wanted = (Adc() if adc else None) if isinstance(adc, bool) else adc
+    options = TranslateOptions(
+        inverse, noise, seed, realisations=realisations, adc=wanted, remains=remains
+    )
+    monitor = shown(progress)
+    job = FileTranslation(folder_of(run), options, device)
+    for note in job.notes:
+        monitor.note(note)
+    made = Translation(job.run, {}, job.translator.recipe, adc=wanted is not None)
+    if isinstance(pulses, Pulses):
+        if out is not None:
+            raise CpunetError(
+                f"{out}: pulses in memory stay there; leave out the file, or write them with "
+                "cpunet.pulses.writing.write_pulses and give that file"
+            )
+        return _in_memory(job, made, pulses, monitor)
+    source = as_input(pulses, "pulses")
+    if out is None:
+        return _in_memory(job, made, source, monitor)
+    counts = job(source, Path(out), resume=resume, force=force, monitor=monitor)
+    return _filled(made, counts, path=Path(out), notes=tuple(monitor.notes))
+
+
+def _in_memory(
+    job: FileTranslation, made: Translation, given: Pulses | InputFile, monitor: Monitor
+) -> Translation:
+    pulses = given if isinstance(given, Pulses) else job.opened(given).read()
+    if not len(pulses):
+        raise CpunetError("there are no pulses to translate; give some")
+    formed: list[Formed] = []
+    with monitor.stage("Translating", len(pulses)) as advance:
+        for block in job.blocks([pulses]):
+            formed.append(block)
+            advance(len(block.codes) // (job.options.realisations or 1))
+    codes = np.concatenate([block.codes for block in formed])
+    accepted = int((codes == Rejection.ACCEPTED).sum())
+    reasons = Counter(Rejection(int(code)).label for code in codes if code)
+    if not accepted:
+        told = ", ".join(f"{n} {reason}" for reason, n in reasons.items())
+        raise CpunetError(
+            f"none of {len(pulses)} pulses can be translated ({told}); are these "
+            f"{job.translator.takes} pulses, with energies in keV?"
+        )
+    counts: dict[str, Any] = {
+        "read": len(codes),
+        "translated": accepted,
+        "rejections": dict(reasons),
+    }
+    if made.adc:
+        counts["saturated"] = int(sum(block.saturated.sum() for block in formed))
+    whole = Pulses.concatenate([block.pulses for block in formed])
+    notes = tuple(getattr(monitor, "notes", ()))
+    return _filled(made, counts, kept=(whole, codes), notes=notes)
+
+
+def _filled(made: Translation, counts: Mapping[str, Any], **more: Any) -> Translation:
+    return Translation(made.run, counts, made.recipe, adc=made.adc, **more)
+
+
+def named_axis(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:
+    """The same bins, with the parameter's name and label."""
+    edges = axis.edges
+    label = SHAPE_PARAMETERS[parameter].axis_label
+    return hist.axis.Regular(axis.size, edges[0], edges[-1], name=parameter, label=label)
+
+
+def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
+    """A value by name.
+
+    Raises
+    ------
+    CpunetError
+        If there is none, with those there are.
+    """
+    if name not in values:
+        raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")
+    return values[name]

@@ -1,0 +1,205 @@
+"""Pulses as the authors of CPU-Net published them: a file of pickled dictionaries.
+
+The layout is that of the README of their repository (kevinhbhimani/CPU-Net on GitHub) for the
+record 10.5281/zenodo.15311838: files such as ``fep_wf_ornl.pickle`` and ``fep_wf_sim.pickle``,
+in which one pickle follows the other, each a dictionary ``{wf, tp0, energy}`` of samples, index
+of the rise and energy in keV; their ``dataset.py`` also knows ``event`` and ``dc_label``.
+Nothing of a pickle is executed, see `cpunet.restricted_unpickler`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.reading.source import (
+    MOST_SAMPLES,
+    Layout,
+    PulseSource,
+    ReadOptions,
+    Traces,
+)
+from cpunet.restricted_unpickler import TruncatedError, load_all
+
+_MOST_NUMBER = 2**62
+_PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
+_NUMBERS = ("tp0", "energy", "dc_label")  # beside the samples
+_CONVERT = "convert it with `cpunet import pulses`, which leaves such out and counts them"
+_WHY = {
+    "no_pulse": "no dictionary with wf",
+    "no_numbers": "holds something other than numbers",
+    "no_trace": "its wf is no trace",
+}
+
+
+@dataclass(frozen=True)
+class PickledPulse:
+    """One entry: samples, and the numbers beside them by name, ``event`` among them."""
+
+    samples: npt.NDArray[np.float32]
+    numbers: dict[str, float]
+    event: int
+
+
+def entries(path: Path) -> Iterator[Any]:
+    """All objects pickled one after the other in a file, and those in lists.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or asks for more than arrays and plain containers.
+    TruncatedError
+        If it breaks off or is damaged, after what comes before.
+    """
+    for value in load_all(path):
+        if isinstance(value, list | tuple):
+            yield from value
+        else:
+            yield value
+
+
+def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
+    """An entry as a pulse; or None and the reason why it is none.
+
+    Parameters
+    ----------
+    entry
+        Whatever was pickled.
+    number
+        Its place in the file, the event number of an entry without one.
+    """
+    if not isinstance(entry, dict) or "wf" not in entry:
+        return None, "no_pulse"
+    try:
+        samples = _samples(entry["wf"])
+        event = int(entry.get("event", number))
+        numbers = dict.fromkeys(("tp0", "energy"), float("nan"))
+        for name, value in entry.items():
+            if name in numbers or name == "dc_label":
+                numbers[name] = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return None, "no_numbers"
+    if abs(event) > _MOST_NUMBER:
+        return None, "no_numbers"
+    if samples.ndim != 1 or not 0 < len(samples) <= MOST_SAMPLES:
+        return None, "no_trace"
+    return PickledPulse(samples, numbers, event), ""
+
+
+def _samples(trace: Any) -> npt.NDArray[np.float32]:
+    """A trace as an array; of nested lists, which may refer to each other, there is none."""
+    if isinstance(trace, list | tuple):
+        if len(trace) > MOST_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
+            return np.empty((0, 0), np.float32)
+    elif not isinstance(trace, np.ndarray):
+        raise TypeError
+    with np.errstate(over="ignore"):  # what is beyond single precision is counted later
+        return np.asarray(trace, np.float32)
+
+
+@dataclass
+class _Seen:
+    """Numbers of the pulses met so far, some bytes each: columns are read by rows."""
+
+    path: Path
+    numbers: list[dict[str, float]] = field(default_factory=list)
+    complete: bool = False
+
+    def pulses(self) -> Iterator[PickledPulse]:
+        """All pulses of the file in order, remembering their numbers."""
+        length, place = 0, -1
+        try:
+            for place, entry in enumerate(entries(self.path)):
+                pulse, reason = as_pulse(entry, place)
+                if pulse is None:
+                    raise CpunetError(
+                        f"{self.path}: entry {place} is no pulse ({_WHY[reason]}); {_CONVERT}"
+                    )
+                length = length or len(pulse.samples)
+                if len(pulse.samples) != length:
+                    raise CpunetError(
+                        f"{self.path}: entry {place}: {len(pulse.samples)} samples, before it "
+                        f"{length}; {_CONVERT}"
+                    )
+                if place == len(self.numbers):
+                    self.numbers.append(pulse.numbers)
+                yield pulse
+        except TruncatedError as error:
+            said = " ".join(str(error).split())
+            raise CpunetError(
+                f"{self.path}: breaks off after {place + 1} entries ({said}); download it "
+                "again, or rescue what is there with `cpunet import pulses`"
+            ) from error
+        self.complete = True
+
+    def until(self, stop: float) -> list[dict[str, float]]:
+        """Numbers of so many pulses from the first on."""
+        if len(self.numbers) < stop and not self.complete:
+            for met, _ in enumerate(self.pulses(), start=1):
+                if met >= stop:
+                    break
+        return self.numbers
+
+
+@dataclass(frozen=True)
+class _PickledColumn:
+    """A number of each pulse; of a part of the file that was not met yet, it is read."""
+
+    seen: _Seen
+    name: str
+    units: str = ""
+    constant: bool = False
+
+    def __len__(self) -> int:
+        return len(self.seen.until(np.inf))
+
+    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
+        """Values of the events from `start` to before `stop`."""
+        rows = self.seen.until(stop)[start:stop]
+        return np.array([row.get(self.name, np.nan) for row in rows], float)
+
+
+class PickleSource(PulseSource):
+    """Pickled dictionaries, one after the other (streamed) or in lists (held one at a time)."""
+
+    def __init__(self, options: ReadOptions) -> None:
+        if options.table is not None:
+            raise CpunetError(
+                f"{options.path}: a file of pickled pulses has no tables; leave out --table"
+            )
+        self._seen = _Seen(options.path)
+        first = next(self._seen.pulses(), None)
+        known = {} if first is None else first.numbers
+        layout = Layout(
+            format="pickled pulses",
+            table="",
+            n_pulses=0 if first is None else None,
+            length=0 if first is None else len(first.samples),
+            columns={
+                name: _PickledColumn(self._seen, name, "keV" if name == "energy" else "")
+                for name in known
+            },
+            period_hint=_PERIOD_HINT,
+        )
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        waiting: list[PickledPulse] = []
+        for pulse in self._seen.pulses():
+            waiting.append(pulse)
+            if len(waiting) == size:
+                yield _joined(waiting)
+                waiting = []
+        if waiting:
+            yield _joined(waiting)
+
+
+def _joined(pulses: list[PickledPulse]) -> Traces:
+    numbers = np.array([pulse.event for pulse in pulses], np.int64)
+    return Traces(np.stack([pulse.samples for pulse in pulses]), numbers)

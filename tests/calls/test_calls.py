@@ -1,0 +1,321 @@
+"""`cpunet.train`, `translate`, `validate` and `calibrate`, and what they give."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cpunet
+from cpunet.calls.given import as_recipe
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+
+KEV = 2614.511
+SHORT = {
+    "training.steps": 1,
+    "training.components": 4,
+    "training.squares": 2,
+    "training.start_factors": [1],
+    "training.ringing_mhz": [],
+    "training.noise_sets": 1,
+    "scores.bootstraps": 20,
+}
+N = 260
+
+
+def edges(rng: np.random.Generator) -> np.ndarray:
+    width = rng.uniform(1.0, 6.0, (N, 1))
+    return 1 / (1 + np.exp(-(np.arange(1200) - 550 - rng.uniform(0, 1, (N, 1))) / width))
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """Simulated pulses, one of which has no energy, and measured ones."""
+    folder, rng = tmp_path_factory.mktemp("calls"), np.random.default_rng(1)
+    sim, kev = edges(rng), np.full(N, KEV)
+    kev[3] = np.nan
+    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
+    decayed = edges(rng) * np.exp(-np.clip(np.arange(1200) - 550, 0, None) / 4000)
+    raw = np.round(1000 + 10 * KEV * decayed + rng.normal(0, 20, decayed.shape))
+    pulses = Pulses.of(raw, dt_ns=16, energy_kev=np.full(N, KEV))
+    write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(home) -> cpunet.Run:
+    sides = home / "sim.lh5", str(home / "raw.lh5")
+    return cpunet.train(*sides, home / "run", settings=SHORT, seed=2, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def report(home, run, all_undrawn) -> cpunet.Report:
+    sides = home / "sim.lh5", cpunet.InputFile(str(home / "raw.lh5"))
+    return run.validate(*sides, home / "report", rivals=False, device="cpu")
+
+
+def test_importing_is_light_and_all_is_there():
+    heavy = "('torch', 'matplotlib', 'numba', 'scipy', 'h5py', 'hist')"
+    code = f"import cpunet, sys; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+    for name in cpunet.__all__:
+        assert getattr(cpunet, name) is not None
+    assert set(cpunet.__all__) <= set(dir(cpunet))
+    with pytest.raises(AttributeError, match="no attribute 'tran'"):
+        _ = cpunet.tran
+
+
+def test_a_run(home, run):
+    assert run.folder == home / "run"
+    assert (run.info["seed"], run.dt_ns) == (2, 16)
+    assert run.chi_square_per_moment > 0
+    assert run.losses["chi_square"].shape == run.losses["iteration"].shape
+    assert run.parameters["decay_us"] > 0
+    assert any(note.startswith("fit: ") or "poor fit" in note for note in run.notes)
+    again = cpunet.Run.load(str(run.folder))
+    assert again.info == run.info
+    assert repr(run).startswith(f"<Run {run.folder}: fast, FEP, chi-square per moment ")
+    html = run._repr_html_()
+    assert "data:image/png;base64," in html
+    assert "chi-square per moment" in html
+    assert run.loss_figure().axes
+    assert run.response_figure().axes
+    assert run.ren.translate(np.zeros((0, 1200)), noise=False).shape == (0, 800)
+
+
+def test_a_run_of_a_network(tmp_path):
+    from cpunet.training.cyclegan import CycleGan
+    from cpunet.training.run_folder import write_run
+
+    tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
+    recipe = load_recipe("paper", tiny)
+    info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+    write_run(tmp_path, CycleGan(recipe), recipe, info | {"seconds": 1, "device": "cpu"})
+    run = cpunet.Run.load(tmp_path)
+    assert repr(run) == f"<Run {tmp_path}: paper, FEP>"
+    assert "<img" not in run._repr_html_()
+    with pytest.raises(cpunet.CpunetError, match="which has no response in closed form"):
+        run.response_figure()
+    with pytest.raises(cpunet.CpunetError, match="has kept no losses; train it again"):
+        run.loss_figure()
+
+
+def test_memory_and_file_have_the_same_pulses(home, run, tmp_path):
+    kept = run.translate(home / "sim.lh5", seed=4)
+    stored = cpunet.translate(run.folder, home / "sim.lh5", tmp_path / "t.lh5", seed=4)
+    given = cpunet.translate(run, cpunet.open_pulses(home / "sim.lh5").read(), seed=4)
+    for other in (stored, given):
+        same = kept.pulses.waveforms, other.pulses.waveforms
+        assert np.array_equal(*same, equal_nan=True)
+        assert kept.codes.tolist() == other.codes.tolist()
+        assert kept.counts == other.counts
+    assert kept.rejections == {"energy_unknown": 1}
+    assert not kept.valid[3]
+    assert kept.valid.sum() == N - 1
+    assert stored.path == tmp_path / "t.lh5"
+    assert "energy unknown" in stored._repr_html_()
+    assert "data:image/png" not in stored._repr_html_()  # a file may be large
+    assert "data:image/png" in kept._repr_html_()
+    assert repr(kept) == f"<Translation in memory: {N - 1} of {N} pulses>"
+
+
+def test_histogram_of_translated_pulses(home, run):
+    made = run.translate(home / "sim.lh5", noise=False)
+    histogram = made.hist("drift_time")
+    assert histogram.axes[0].name == "drift_time"
+    assert histogram.axes[0].label.endswith("[ns]")
+    finite = np.isfinite(made.parameters["drift_time"])
+    assert histogram.sum(flow=True) == finite.sum() == N  # without noise none needs an energy
+    with pytest.raises(cpunet.CpunetError, match="no parameter 'drift'; there are current"):
+        made.hist("drift")
+
+
+def test_raw_traces(home, run):
+    made = run.translate(home / "sim.lh5", adc=True)
+    assert made.adc
+    known = made.pulses.waveforms[made.valid]
+    assert (known == np.round(known)).all()
+    assert "saturated" in made.counts
+    with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
+        made.hist()
+    twice = run.translate(home / "sim.lh5", realisations=2)
+    assert len(twice.pulses) == twice.counts["read"] == 2 * N
+    back = run.translate(home / "raw.lh5", inverse=True, noise=False)
+    assert back.counts["translated"] > N // 2
+
+
+def test_a_report(home, report):
+    assert report.folder == home / "report"
+    assert (report.folder / "report.html").is_file()
+    assert "FEP" in report.values
+    data = report.values["FEP"]["data"]["current_amplitude"]
+    histogram = report.hist("FEP")
+    assert list(histogram.axes["method"]) == [
+        m for m, v in report.values["FEP"].items() if "current_amplitude" in v
+    ]
+    assert histogram[{"method": "data"}].sum(flow=True) == np.isfinite(data).sum()
+    row = next(r for r in report.scores if r["method"] == "ren")
+    compared = report.metrics["peaks"]["FEP"]["parameters"][row["parameter"]]
+    assert row["iou"] == compared["iou"]["ren"]
+    assert row["ceiling"] == compared["iou"]["ceiling"]
+    assert report.verdicts == report.metrics["verdicts"]["summary"]
+    html = report._repr_html_()
+    assert "current amplitude" in html
+    assert "report.html" in html
+    assert repr(report) == f"<Report {report.folder}: FEP, SEP, DEP>"
+    assert report.figures["FEP mean pulse"].axes
+    with pytest.raises(cpunet.CpunetError, match="no scored peak 'SEP'; there are FEP"):
+        report.hist("SEP")
+
+
+def test_a_report_again(report):
+    again = cpunet.Report.load(report.folder)
+    before, after = (one.hist("FEP", "drift_time") for one in (report, again))
+    drawn = {"data", "raw", "ren"}
+    for method in drawn:
+        same = before[{"method": method}].values(), after[{"method": method}].values()
+        assert np.array_equal(*same)
+    assert set(again.figures) == set(report.figures)
+
+
+def test_nothing_is_written_without_a_folder(home, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sides = home / "sim.lh5", home / "raw.lh5"
+    made = cpunet.validate(run, *sides, rivals=False, device="cpu")
+    assert made.folder is None
+    assert not list(tmp_path.iterdir())
+    assert "FEP" in made.values
+
+
+def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):
+    given = {}
+
+    def calibrated(self, out, **how):
+        given["job"], given["how"] = self, how
+        return {"parameters": {}, "notes": [], "profiles": {}, "directions": []}
+
+    monkeypatch.setattr("cpunet.calls.calibrations.Calibration.run", calibrated)
+    monkeypatch.setattr("cpunet.calls.calibrations.read_info", lambda _: run.info)
+    made = cpunet.calibrate(
+        cpunet.HitFile(str(home / "hits.lh5")),
+        home / "raw.lh5",
+        tmp_path / "cal",
+        detector="ppc",
+        free=["temperature", "impurity"],
+        fixed=["impurity"],
+        priors={"depletion_voltage": (np.float64(2100), 5e-05)},
+        events=500,
+        force=True,
+    )
+    job = given["job"]
+    assert job.start.hits.path == home / "hits.lh5"
+    assert job.start.detector.name
+    assert [nuisance.name for nuisance in job.freedom.free] == ["temperature_K"]
+    assert job.freedom.priors == {"depletion_voltage": (2100.0, 5e-05)}
+    assert (job.events, given["how"]["force"]) == (500, True)
+    assert made.physics == {}
+    assert made.sim == tmp_path / "cal" / "sim.lh5"
+
+
+WRONG = {
+    "an array": (
+        lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
+        "sim is of type ndarray; give a path, or cpunet.InputFile",
+    ),
+    "no such file": (
+        lambda home, _: cpunet.train(home / "none.lh5", home / "raw.lh5", home / "new"),
+        "none.lh5: no such file",
+    ),
+    "no such setting": (
+        lambda home, _: cpunet.train(
+            home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.step": 1}
+        ),
+        "the recipe has no training.step",
+    ),
+    "there already": (
+        lambda home, _: cpunet.train(home / "sim.lh5", home / "raw.lh5", home / "run"),
+        "run: exists",
+    ),
+    "other side": (
+        lambda home, run: run.translate(home / "raw.lh5"),
+        "given as simulated pulses, but these look measured",
+    ),
+    "no run": (
+        lambda home, _: cpunet.translate(home, home / "sim.lh5"),
+        "no finished run",
+    ),
+    "pulses to a file": (
+        lambda home, run: run.translate(Pulses.of(np.zeros((1, 9)), dt_ns=16), home / "t.lh5"),
+        "pulses in memory stay there; leave out the file",
+    ),
+    "other sampling": (
+        lambda _, run: run.translate(Pulses.of(np.zeros((1, 900)), dt_ns=10)),
+        "sampled every 10 ns, the run was trained on 16 ns; resample",
+    ),
+    "no pulse": (
+        lambda _, run: run.translate(Pulses.of(np.zeros((0, 900)), dt_ns=16)),
+        "there are no pulses to translate",
+    ),
+    "none good": (
+        lambda _, run: run.translate(Pulses.of(np.zeros((3, 900)), dt_ns=16)),
+        r"none of 3 pulses can be translated \(3 ",
+    ),
+    "no report": (
+        lambda home, _: cpunet.Report.load(home / "run"),
+        "give the folder of a report",
+    ),
+    "no calibration": (
+        lambda home, _: cpunet.CalibratedRun.load(home / "run"),
+        "no calibrated run",
+    ),
+    "no hits": (
+        lambda home, _: cpunet.calibrate(home / "sim.lh5", home / "raw.lh5", home / "new"),
+        "sim.lh5: ",
+    ),
+    "prior of nothing": (
+        lambda home, _: cpunet.calibrate(
+            home / "sim.lh5", home / "raw.lh5", home / "new", priors={"mood": (1, 2)}
+        ),
+        "mood",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_one_line(home, run, case):
+    call, words = WRONG[case]
+    with pytest.raises(cpunet.CpunetError, match=words) as error:
+        call(home, run)
+    assert "\n" not in str(error.value)
+    assert not (home / "new").exists()
+
+
+def test_a_recipe_and_settings_are_not_both_given():
+    recipe = load_recipe("fast")
+    assert as_recipe(recipe, None) is recipe
+    with pytest.raises(cpunet.CpunetError, match="leave settings out"):
+        as_recipe(recipe, {"training.steps": 1})
+
+
+@pytest.mark.slow
+def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
+    from cpunet.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+    words = ["cpunet", "stand", "--preset", "legend200", "--seed", "1", "--out", "stand"]
+    monkeypatch.setattr(sys, "argv", [*words, "--events", "FEP=400,SEP=80,DEP=80"])
+    with pytest.raises(SystemExit):
+        main()
+    page = (Path(__file__).resolve().parents[2] / "docs" / "python.md").read_text()
+    names: dict[str, object] = {}
+    for code in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
+        exec(compile(code, "python.md", "exec"), names)
+    assert Path("report/report.html").is_file()
+    assert names["calibrated"].physics is not None
