@@ -10,11 +10,14 @@ import pytest
 from safetensors.torch import load_file
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.inputs import InputFile
+from cpunet.jobs.inputs import InputFile, load_simulated
+from cpunet.jobs.monitor import Monitor
 from cpunet.jobs.train import train_run
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.translation.translator import REN
 
 FAST = load_recipe(
     "fast",
@@ -31,6 +34,10 @@ TINY = load_recipe(
     "small",
     [
         "generator.width=2",
+        "chain=null",
+        "training.noise=none",
+        "training.losses.baseline_len=200",
+        "training.losses.tail_len=400",
         "discriminator.embedding_rows=20",
         "discriminator.embedding_dim=2",
         "discriminator.hidden=2",
@@ -42,6 +49,8 @@ TINY = load_recipe(
         "training.statistics_batches=1",
     ],
 )
+
+QUIET = Monitor()
 
 
 def write(path: Path, seed: int, pole: float | None, dt_ns: float = 16.0) -> InputFile:
@@ -115,11 +124,48 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
     with pytest.raises(CpunetError, match="from which no readout chain can start"):
         train_run(files["sim"], files["one"], tmp_path / "a", FAST, init=network)
+    wider = load_recipe("paper", ["generator.width=4"])
     with pytest.raises(CpunetError, match="weights of another network"):
-        train_run(files["sim"], files["one"], tmp_path / "b", TINY, init=chain)
+        train_run(files["sim"], files["one"], tmp_path / "b", wider, init=network)
     with pytest.raises(CpunetError, match="no finished run"):
         train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path / "none")
     fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
         train_run(*fast_sampled, tmp_path / "d", FAST, init=chain)
     assert not any((tmp_path / name).exists() for name in "abcd")
+
+
+def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> None:
+    errors = []
+    for name, iterations in (("short", 1), ("long", 60)):
+        pairs = TINY.training.pairs.model_copy(update={"iterations": iterations})
+        training = TINY.training.model_copy(update={"pairs": pairs})
+        recipe = TINY.model_copy(update={"training": training})
+        train_run(files["sim"], files["one"], tmp_path / name, recipe, init=chain, device="cpu")
+        sim = load_simulated(files["sim"], recipe, parse_selection("FEP", recipe.peaks), QUIET)
+        windows = sim.prepared.pulses.waveforms[:50]
+        wanted = REN.load(chain).apply(windows, noise=False)
+        found = REN.load(tmp_path / name).apply(windows, noise=False)
+        errors.append(float(np.abs(found - wanted).mean()))
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
+    shorter = load_recipe(
+        "paper",
+        [
+            "generator.width=2",
+            "preparation.samples_after=384",
+            "training.losses.tail_len=334",
+        ],
+    )
+    with pytest.raises(CpunetError, match=r"know windows of 800 of 400 \+ 400 samples") as told:
+        train_run(files["sim"], files["one"], tmp_path / "a", shorter, init=network)
+    assert "this recipe has 784 of 400 + 384" in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_matched_run_of_another_sampling_makes_no_pairs(chain, tmp_path) -> None:
+    sides = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
+    with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
+        train_run(*sides, tmp_path / "d", TINY, init=chain)

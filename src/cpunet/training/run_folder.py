@@ -113,10 +113,21 @@ def read_recipe(run: Path) -> Recipe:
 
 def _completed(settings: Any) -> Any:
     """Settings with what recipes of earlier versions did not have yet."""
-    generator = settings.get("generator") if isinstance(settings, dict) else None
-    if not isinstance(generator, dict) or "fast_decays_us" not in generator:
-        return settings
-    return settings | {"generator": {"free_decays": False} | generator}
+    for part, (known_by, added) in _LATER.items():
+        own = settings.get(part) if isinstance(settings, dict) else None
+        if isinstance(own, dict) and known_by in own:
+            settings = settings | {part: added | own}
+    return settings
+
+
+# by the part of a recipe: a setting by which its kind is known, and what came later
+_LATER: dict[str, tuple[str, dict[str, Any]]] = {
+    "generator": ("fast_decays_us", {"free_decays": False}),
+    "training": (
+        "discriminator_interval",
+        {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}},
+    ),
+}
 
 
 def read_losses(run: Path) -> list[Record]:
