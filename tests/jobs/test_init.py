@@ -137,9 +137,10 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
 
 def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> None:
     errors = []
-    for name, iterations in (("short", 1), ("long", 60)):
+    for name, iterations in (("short", 1), ("long", 120)):
         pairs = TINY.training.pairs.model_copy(update={"iterations": iterations})
-        training = TINY.training.model_copy(update={"pairs": pairs})
+        changed = {"pairs": pairs, "batch_size": 16, "statistics_batches": 4}
+        training = TINY.training.model_copy(update=changed)
         recipe = TINY.model_copy(update={"training": training})
         train_run(files["sim"], files["one"], tmp_path / name, recipe, init=chain, device="cpu")
         sim = load_simulated(files["sim"], recipe, parse_selection("FEP", recipe.peaks), QUIET)
@@ -147,7 +148,7 @@ def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> No
         wanted = REN.load(chain).apply(windows, noise=False)
         found = REN.load(tmp_path / name).apply(windows, noise=False)
         errors.append(float(np.abs(found - wanted).mean()))
-    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
