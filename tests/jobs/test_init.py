@@ -50,21 +50,43 @@ TINY = load_recipe(
     ],
 )
 
+CHAINED = load_recipe(
+    "small",
+    [
+        "generator.width=2",
+        "discriminator.embedding_rows=20",
+        "discriminator.embedding_dim=2",
+        "discriminator.hidden=2",
+        "discriminator.samples_per_step=16",
+        "training.iterations=2",
+        "training.batch_size=4",
+        "training.statistics_batches=1",
+        "training.pairs.iterations=1",
+        "chain.training.components=4",
+        "chain.training.squares=2",
+        "chain.training.start_factors=[1]",
+        "chain.training.ringing_mhz=[]",
+        "chain.generator.slow_ns=[]",
+        "chain.generator.fast_decays_us=[]",
+    ],
+)
 QUIET = Monitor()
 
 
-def write(path: Path, seed: int, pole: float | None, dt_ns: float = 16.0) -> InputFile:
+def write(
+    path: Path, seed: int, pole: float | None, dt_ns: float = 16.0, n: int = 240
+) -> InputFile:
     """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
     rng = np.random.default_rng(seed)
     time = np.arange(1100.0)
-    width = rng.uniform(1.0, 6.0, (240, 1))
-    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (240, 1))) / width))
+    width = rng.uniform(1.0, 6.0, (n, 1))
+    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
     if pole is not None:
         kernel = np.exp(-np.arange(90) / pole)
         smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())[:, :1100]
         decayed = smooth * np.exp(-np.clip(time - 450, 0, None) / 4000)
         pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
-    kev = np.full(240, 2614.5)
+    kev = np.full(n, 2614.5)
     write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
     return InputFile(path)
 
@@ -170,3 +192,32 @@ def test_a_matched_run_of_another_sampling_makes_no_pairs(chain, tmp_path) -> No
     sides = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
         train_run(*sides, tmp_path / "d", TINY, init=chain)
+
+
+def test_behind_a_chain_a_run_tells_its_fit_and_may_be_a_start(files, chain, tmp_path) -> None:
+    begun = train_run(
+        files["sim"], files["one"], tmp_path / "begun", CHAINED, init=chain, device="cpu"
+    )
+    assert begun["fit"]["parameters"]
+    assert REN.load(tmp_path / "begun").needs_energies
+    again = train_run(
+        files["sim"],
+        files["one"],
+        tmp_path / "again",
+        CHAINED,
+        init=tmp_path / "begun",
+        device="cpu",
+    )
+    assert again["fit"]["steps"] <= begun["fit"]["steps"]
+    own = load_recipe("paper", ["generator.width=2"])
+    with pytest.raises(CpunetError, match="networks know windows of 528 of 400"):
+        train_run(files["sim"], files["one"], tmp_path / "x", own, init=tmp_path / "begun")
+
+
+def test_noise_needs_baselines(tmp_path) -> None:
+    recipe = load_recipe("paper-noise", ["generator.width=2", "training.iterations=1"])
+    few = [write(tmp_path / f"{k}.lh5", k, p, n=20) for k, p in ((1, None), (2, 4.0))]
+    with pytest.raises(CpunetError, match=r"2\.lh5: no baselines to draw noise from") as told:
+        train_run(*few, tmp_path / "run", recipe, device="cpu")
+    assert "--set training.noise=none" in str(told.value)
+    assert "\n" not in str(told.value)

@@ -78,7 +78,13 @@ def network_start(
         return NetworkStart(surroundings, fill, recipe, told)
     outside = None
     if recipe.cyclegan.training.noise == "baselines":
-        noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation)
+        try:
+            noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation)
+        except CpunetError as error:
+            raise CpunetError(
+                f"{sides.data_file.path}: no baselines to draw noise from ({error}); or train "
+                "without it (--set training.noise=none)"
+            ) from error
         if note is not None:
             monitor.note(f"warning: {note}")
         outside = Outside(TraceNoise(noise), sides.sim.energy_kev, recipe.preparation)

@@ -183,7 +183,7 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
 
 
 def fill_networks(run: Path, model: nn.Module) -> None:
-    """Fill all networks of `model` that the run has weights of; REN and IREN at least.
+    """Fill those networks of a CycleGAN that the run has weights of; REN and IREN at least.
 
     Raises
     ------
@@ -193,7 +193,8 @@ def fill_networks(run: Path, model: nn.Module) -> None:
     device = str(next(model.parameters()).device)
     there = _weights_of(run, device)
     for name, network in model.named_children():
-        if name in ("ren", "iren") or any(key.startswith(f"{name}.") for key in there):
+        judge = name.startswith("discriminator_")
+        if name in ("ren", "iren") or (judge and any(k.startswith(f"{name}.") for k in there)):
             was_training = network.training
             load_network(run, name, network, device).train(was_training)
 
