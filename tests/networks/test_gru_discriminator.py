@@ -25,8 +25,7 @@ def same_weights_every_time() -> Iterator[None]:
 
 def config(**changes: Any) -> GruConfig:
     values = {"embedding_rows": 1000, "embedding_dim": 4, "hidden": 5, "samples_per_step": 1}
-    values |= {"value_range": None, "current_gain": 0.0}
-    return GruConfig.model_validate({"name": "gru", **values, **changes})
+    return GruConfig.model_validate({"name": "gru", **values, "value_range": None, **changes})
 
 
 def pulses(n: int = 4, length: int = 48) -> Tensor:
@@ -158,19 +157,3 @@ def test_probability_is_the_sigmoid_of_the_logits():
     network = GruDiscriminator(config()).eval()
     expected = 1 / (1 + torch.exp(-network(pulses())))
     assert torch.allclose(network.probability(pulses()), expected)
-
-
-def test_with_a_gain_the_current_is_read_beside_the_charge():
-    network = GruDiscriminator(config(current_gain=20.0, value_range=(-0.1, 1.2)))
-    plain = GruDiscriminator(config(value_range=(-0.1, 1.2)))
-    assert network.gru.input_size == 2 * plain.gru.input_size
-    read = network.read(pulses())
-    assert torch.equal(read[..., :4], network.embedding(network._fraction(pulses()[:, 0])))
-    # two pulses of the same charge but for a constant have the same current
-    higher = network.read(pulses() + 0.05)
-    assert torch.allclose(read[:, 1:, 4:], higher[:, 1:, 4:], atol=1e-5)
-    assert not torch.allclose(read[..., :4], higher[..., :4], atol=1e-2)
-    given = pulses().requires_grad_()
-    network(given).sum().backward()
-    assert given.grad is not None
-    assert bool((given.grad != 0).any(dim=2).all())

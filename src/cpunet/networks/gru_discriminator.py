@@ -68,10 +68,8 @@ class GruDiscriminator(nn.Module):
         self.embedding = InterpolatedEmbedding(config.embedding_rows, config.embedding_dim)
         self.value_range = config.value_range
         self.samples_per_step = config.samples_per_step
-        self.current_gain = config.current_gain
-        seen = 2 if config.current_gain else 1
         self.gru = nn.GRU(
-            seen * config.embedding_dim * config.samples_per_step,
+            config.embedding_dim * config.samples_per_step,
             config.hidden,
             batch_first=True,
             bidirectional=True,
@@ -87,9 +85,6 @@ class GruDiscriminator(nn.Module):
     def read(self, pulses: Tensor) -> Tensor:
         """What the GRU is given of pulses: shape (batch, steps, features)."""
         vectors = self.embedding(self._fraction(pulses[:, 0]))  # (batch, samples, dim)
-        if self.current_gain:
-            current = self.current_gain * nn.functional.pad(pulses[:, 0].diff(dim=1), (1, 0))
-            vectors = torch.cat([vectors, self.embedding(self._fraction(current))], dim=2)
         return vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)  # type: ignore[no-any-return]
 
     def judged(self, outputs: Tensor, final: Tensor) -> Tensor:

@@ -80,9 +80,7 @@ class GruConfig(Config):
     The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more
     make it that many times faster, on the same embedded samples.  The table of
     vectors spans ``value_range``, or each pulse's own minimum to maximum (the
-    paper's choice, blind to the pulse height) if that is null.  With a
-    ``current_gain`` above 0 it sees the steps from sample to sample, times that,
-    beside the pulse.
+    paper's choice, blind to the pulse height) if that is null.
     """
 
     name: Literal["gru"]
@@ -91,7 +89,6 @@ class GruConfig(Config):
     hidden: Width
     samples_per_step: Samples
     value_range: tuple[float, float] | None
-    current_gain: NonNegative
 
     @model_validator(mode="after")
     def _range_is_not_empty(self) -> GruConfig:

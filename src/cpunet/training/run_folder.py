@@ -123,7 +123,6 @@ def _completed(settings: Any) -> Any:
 # by the part of a recipe: a setting by which its kind is known, and what came later
 _LATER: dict[str, tuple[str, dict[str, Any]]] = {
     "generator": ("fast_decays_us", {"free_decays": False}),
-    "discriminator": ("samples_per_step", {"current_gain": 0.0}),
     "training": (
         "discriminator_interval",
         {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}},

@@ -115,7 +115,6 @@ def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
         embedding_dim=table.shape[1],
         hidden=hidden.shape[1],
         samples_per_step=1,
-        current_gain=0.0,
         value_range=None,
     )
     network = GruDiscriminator(config)
