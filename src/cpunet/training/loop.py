@@ -122,13 +122,8 @@ def train(
             Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team)
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
-        if init is not None:
-            init(model)
-        elif behind is None:
-            sim_side, data_side = (deck.pulses for deck in decks)
-            match_skips(model, sim_side, data_side, recipe.preparation.samples_before)
         if keeping.start is None:
-            learn_pairs(model, decks[0], recipe, surroundings, behind)
+            _begin(model, decks, recipe, surroundings, behind, init)
         team.follow(model.state_dict().values())
         share_norms(model, team)
         step = Step(model, config, team=team, outside=surroundings.outside, chain=behind)
@@ -145,14 +140,27 @@ def train(
                 "the seed, and begin again"
             ) from error
         training.take_averages()
-        for network, deck, run in zip(
-            (model.ren, model.iren),
-            decks,
-            (None, None) if behind is None else (behind.records, behind.iren),
-            strict=True,
-        ):
+        runs = (None, None) if behind is None else (behind.records, behind.iren)
+        for network, deck, run in zip((model.ren, model.iren), decks, runs, strict=True):
             refresh_batch_statistics(network, deck, config.statistics_batches, run)
     return model.eval()
+
+
+def _begin(
+    model: CycleGan,
+    decks: list[Deck],
+    recipe: Recipe,
+    surroundings: Surroundings,
+    behind: ChainStep | None,
+    init: Callable[[CycleGan], None] | None,
+) -> None:
+    """Give the generators the start there is: weights, the closed form, pairs."""
+    if init is not None:
+        init(model)
+    elif behind is None:
+        sim, data = (deck.pulses for deck in decks)
+        match_skips(model, sim, data, recipe.preparation.samples_before)
+    learn_pairs(model, decks[0], recipe, surroundings, behind)
 
 
 class _DivergenceError(Exception):
