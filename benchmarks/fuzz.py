@@ -42,7 +42,8 @@ TINY = [
     "generator.width=2", "discriminator.embedding_rows=20", "discriminator.embedding_dim=2",
     "discriminator.hidden=2", "discriminator.samples_per_step=80", "training.iterations=2",
     "training.decay_start=1", "training.batch_size=4", "training.statistics_batches=1",
-    "training.log_interval=1", "scores.bootstraps=5",
+    "training.log_interval=1", "scores.bootstraps=5", "chain=null", "training.noise=none",
+    "training.losses.baseline_len=200", "training.losses.tail_len=400",
 ]  # fmt: skip
 PEAKS = (2614.511, 2103.511, 1592.511)
 

@@ -89,7 +89,7 @@ def main() -> None:
     with torch.inference_mode():
         noisy = rate(lambda: with_noise(True), len(pulses))
         clean = rate(lambda: with_noise(False), len(pulses))
-        recipe = load_recipe("small")
+        recipe = load_recipe("paper", ["generator.width=8"])
         unet = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
         network, generator = NetworkBackend(unet), torch.Generator(given.device)
         small = rate(partial(network, pulses[:512], None, True, generator), 512)
@@ -99,7 +99,7 @@ def main() -> None:
     for name, value in (
         ("readout chain, with noise", noisy),
         ("readout chain, without", clean),
-        ("U-Net of recipe small", small),
+        ("U-Net of width 8", small),
         ("U-Net of recipe paper, eager", plain),
         ("U-Net of recipe paper", fast_unet),
     ):

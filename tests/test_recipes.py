@@ -12,14 +12,14 @@ from cpunet.recipes import load_recipe, recipe_from, recipe_names
 
 
 def test_the_recipes_that_come_with_the_package():
-    assert {"best", "fast", "paper", "small"} == set(recipe_names())
+    assert {"best", "fast", "paper", "paper-noise", "small"} == set(recipe_names())
     for name in recipe_names():
         recipe = load_recipe(name)
         assert recipe.name == name
         assert recipe.preparation.length == 800
 
 
-@pytest.mark.parametrize("name", ["paper", "small"])
+@pytest.mark.parametrize("name", ["paper", "paper-noise", "small"])
 def test_recipes_that_train_a_cyclegan(name):
     recipe = load_recipe(name)
     generator, discriminator, training = recipe.cyclegan
@@ -130,7 +130,7 @@ def message(name: str, *overrides: str) -> str:
 def test_a_recipe_that_is_not_there():
     text = message("papre")
     assert "'papre'" in text
-    assert "fast, paper, small" in text
+    assert "fast, paper, paper-noise, small" in text
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,10 @@ PER_PEAK = 24
 # The narrowest networks and the shortest training there are.
 TINY = [
     "generator.width=2",
+    "chain=null",
+    "training.noise=none",
+    "training.losses.baseline_len=200",
+    "training.losses.tail_len=400",
     "discriminator.embedding_rows=20",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",

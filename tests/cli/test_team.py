@@ -139,12 +139,18 @@ def test_an_error_is_one_line(words, pair, tmp_path, more, line):
     assert not (tmp_path / "out" / "run").exists()
 
 
-def test_a_matching_recipe_needs_no_team(stand, pair, tmp_path):
-    refused = pair(tmp_path / "told", "train", *stand.inputs, "--out", tmp_path / "run")
+@pytest.mark.parametrize(
+    ("recipe", "told"),
+    [
+        ("fast", "takes a minute in one process;"),
+        ("small", "takes minutes in one process, its chain being matched first;"),
+    ],
+)
+def test_a_matching_recipe_needs_no_team(stand, pair, tmp_path, recipe, told):
+    words = ["train", *stand.inputs, "--recipe", recipe, "--out", tmp_path / "run"]
+    refused = pair(tmp_path / "told", *words)
     assert refused.codes == [2, 2]
-    assert refused.errors == [
-        "error: recipe fast: takes a minute in one process; start it without torchrun"
-    ]
+    assert refused.errors == [f"error: recipe {recipe}: {told} start it without torchrun"]
 
 
 @pytest.mark.slow

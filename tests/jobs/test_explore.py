@@ -265,12 +265,12 @@ def test_a_pulse_finds_itself_and_those_without_an_edge_are_counted():
 
 
 def test_a_network_can_be_explored(tmp_path):
-    recipe = load_recipe("small", ["generator.width=2"])
+    recipe = load_recipe("paper", ["generator.width=2"])
     torch.manual_seed(0)
     network = PositionalUNet(recipe.generator, recipe.preparation.length)
     folder = tmp_path / "network"
     folder.mkdir()
-    write_run(folder, nn.ModuleDict({"ren": network}), recipe, INFO | {"recipe": "small"})
+    write_run(folder, nn.ModuleDict({"ren": network}), recipe, INFO | {"recipe": "paper"})
     summary = explore_runs([folder], DETECTOR, tmp_path / "page.html", points=20)
     assert summary["shown"] > 10
 

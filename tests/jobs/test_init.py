@@ -10,11 +10,14 @@ import pytest
 from safetensors.torch import load_file
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.translation.translator import REN
 
 FAST = load_recipe(
     "fast",
@@ -31,6 +34,10 @@ TINY = load_recipe(
     "small",
     [
         "generator.width=2",
+        "chain=null",
+        "training.noise=none",
+        "training.losses.baseline_len=200",
+        "training.losses.tail_len=400",
         "discriminator.embedding_rows=20",
         "discriminator.embedding_dim=2",
         "discriminator.hidden=2",
@@ -43,19 +50,43 @@ TINY = load_recipe(
     ],
 )
 
+CHAINED = load_recipe(
+    "small",
+    [
+        "generator.width=2",
+        "discriminator.embedding_rows=20",
+        "discriminator.embedding_dim=2",
+        "discriminator.hidden=2",
+        "discriminator.samples_per_step=16",
+        "training.iterations=2",
+        "training.batch_size=4",
+        "training.statistics_batches=1",
+        "training.pairs.iterations=1",
+        "chain.training.components=4",
+        "chain.training.squares=2",
+        "chain.training.start_factors=[1]",
+        "chain.training.ringing_mhz=[]",
+        "chain.generator.slow_ns=[]",
+        "chain.generator.fast_decays_us=[]",
+    ],
+)
+QUIET = Monitor()
 
-def write(path: Path, seed: int, pole: float | None, dt_ns: float = 16.0) -> InputFile:
+
+def write(
+    path: Path, seed: int, pole: float | None, dt_ns: float = 16.0, n: int = 240
+) -> InputFile:
     """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
     rng = np.random.default_rng(seed)
     time = np.arange(1100.0)
-    width = rng.uniform(1.0, 6.0, (240, 1))
-    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (240, 1))) / width))
+    width = rng.uniform(1.0, 6.0, (n, 1))
+    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
     if pole is not None:
         kernel = np.exp(-np.arange(90) / pole)
         smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())[:, :1100]
         decayed = smooth * np.exp(-np.clip(time - 450, 0, None) / 4000)
         pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
-    kev = np.full(240, 2614.5)
+    kev = np.full(n, 2614.5)
     write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
     return InputFile(path)
 
@@ -115,11 +146,78 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
     with pytest.raises(CpunetError, match="from which no readout chain can start"):
         train_run(files["sim"], files["one"], tmp_path / "a", FAST, init=network)
+    wider = load_recipe("paper", ["generator.width=4"])
     with pytest.raises(CpunetError, match="weights of another network"):
-        train_run(files["sim"], files["one"], tmp_path / "b", TINY, init=chain)
+        train_run(files["sim"], files["one"], tmp_path / "b", wider, init=network)
     with pytest.raises(CpunetError, match="no finished run"):
         train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path / "none")
     fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
         train_run(*fast_sampled, tmp_path / "d", FAST, init=chain)
     assert not any((tmp_path / name).exists() for name in "abcd")
+
+
+def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> None:
+    errors = []
+    for name, iterations in (("short", 1), ("long", 120)):
+        pairs = TINY.training.pairs.model_copy(update={"iterations": iterations})
+        changed = {"pairs": pairs, "batch_size": 16, "statistics_batches": 4}
+        training = TINY.training.model_copy(update=changed)
+        recipe = TINY.model_copy(update={"training": training})
+        train_run(files["sim"], files["one"], tmp_path / name, recipe, init=chain, device="cpu")
+        sim = load_simulated(files["sim"], recipe, parse_selection("FEP", recipe.peaks), QUIET)
+        windows = sim.prepared.pulses.waveforms[:50]
+        wanted = REN.load(chain).apply(windows, noise=False)
+        found = REN.load(tmp_path / name).apply(windows, noise=False)
+        errors.append(float(np.abs(found - wanted).mean()))
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
+    shorter = load_recipe(
+        "paper",
+        [
+            "generator.width=2",
+            "preparation.samples_after=384",
+            "training.losses.tail_len=334",
+        ],
+    )
+    with pytest.raises(CpunetError, match=r"know windows of 800 of 400 \+ 400 samples") as told:
+        train_run(files["sim"], files["one"], tmp_path / "a", shorter, init=network)
+    assert "this recipe has 784 of 400 + 384" in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_matched_run_of_another_sampling_makes_no_pairs(chain, tmp_path) -> None:
+    sides = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
+    with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
+        train_run(*sides, tmp_path / "d", TINY, init=chain)
+
+
+def test_behind_a_chain_a_run_tells_its_fit_and_may_be_a_start(files, chain, tmp_path) -> None:
+    begun = train_run(
+        files["sim"], files["one"], tmp_path / "begun", CHAINED, init=chain, device="cpu"
+    )
+    assert begun["fit"]["parameters"]
+    assert REN.load(tmp_path / "begun").needs_energies
+    again = train_run(
+        files["sim"],
+        files["one"],
+        tmp_path / "again",
+        CHAINED,
+        init=tmp_path / "begun",
+        device="cpu",
+    )
+    assert again["fit"]["steps"] <= begun["fit"]["steps"]
+    own = load_recipe("paper", ["generator.width=2"])
+    with pytest.raises(CpunetError, match="networks know windows of 528 of 400"):
+        train_run(files["sim"], files["one"], tmp_path / "x", own, init=tmp_path / "begun")
+
+
+def test_noise_needs_baselines(tmp_path) -> None:
+    recipe = load_recipe("paper-noise", ["generator.width=2", "training.iterations=1"])
+    few = [write(tmp_path / f"{k}.lh5", k, p, n=20) for k, p in ((1, None), (2, 4.0))]
+    with pytest.raises(CpunetError, match=r"2\.lh5: no baselines to draw noise from") as told:
+        train_run(*few, tmp_path / "run", recipe, device="cpu")
+    assert "--set training.noise=none" in str(told.value)
+    assert "\n" not in str(told.value)

@@ -40,15 +40,29 @@ def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_pat
             if not scores["paired"]["ren"][kind] < scores["paired"]["raw"][kind]
         ]
     assert worse == []
-    iou = metrics["peaks"]["SEP"]["parameters"]["current_amplitude"]["iou"]
-    assert iou["ren"] >= iou["ceiling"] / 3
+    for peak, shares in (("SEP", (0.9, 0.9, 0.9)), ("DEP", (0.6, 0.9, 0.9))):
+        scores = metrics["peaks"][peak]
+        for (name, comparison), share in zip(scores["parameters"].items(), shares, strict=True):
+            iou = comparison["iou"]
+            assert iou["ren"] >= share * iou["ceiling"], (peak, name)
+        assert scores["paired"]["ren"]["edge_rmse"] < 0.002
+    assert metrics["peaks"]["SEP"]["two_sample"]["ren"]["auc"] < 0.65
 
 
 def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_path: Path):
     """Traces of a real detector, whose few events are taken from 300 keV on."""
     sim = InputFile(reference_data / "closure" / "sim.lh5")
     data = InputFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
-    recipe = load_recipe("small", ["training.iterations=20", "training.decay_start=10"])
+    # the simulation is of another detector, which no start of a fit would cure
+    recipe = load_recipe(
+        "small",
+        [
+            "training.iterations=20",
+            "training.decay_start=10",
+            "chain.training.start_factors=[1]",
+            "chain.training.ringing_mhz=[]",
+        ],
+    )
     info = train_run(sim, data, tmp_path / "run", recipe, peak="300-", device="cpu")
     assert 200 < info["data"]["used"] < 1000
     metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")

@@ -25,7 +25,8 @@ from cpunet.jobs.inspection.response import (
     stand_electronics,
     true_chain_of,
 )
-from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
 

@@ -23,6 +23,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
+from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
@@ -40,7 +41,7 @@ from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
-from cpunet.translation.to_adc import extended, to_adc
+from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
 
 DT_NS, N = 16.0, 40
@@ -110,12 +111,12 @@ def busy(tmp_path_factory):
 @pytest.fixture(scope="module")
 def network(tmp_path_factory):
     """A narrow network that was not trained."""
-    recipe = load_recipe("small", ["generator.width=2"])
+    recipe = load_recipe("paper", ["generator.width=2"])
     torch.manual_seed(0)
     model = nn.ModuleDict({"ren": PositionalUNet(recipe.cyclegan.generator, 800)})
     folder = tmp_path_factory.mktemp("networks") / "run"
     folder.mkdir()
-    write_run(folder, model, recipe, {"recipe": "small"} | INFO)
+    write_run(folder, model, recipe, {"recipe": "paper"} | INFO)
     return folder
 
 

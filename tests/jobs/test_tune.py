@@ -36,6 +36,10 @@ SPACE = (
 )
 TINY = [
     "generator.width=2",
+    "chain=null",
+    "training.noise=none",
+    "training.losses.baseline_len=200",
+    "training.losses.tail_len=400",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
     "discriminator.samples_per_step=80",

@@ -15,8 +15,9 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.translation.export import export_run
 from cpunet.networks.hybrid import EdgeResidual
+from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
-from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe

@@ -22,7 +22,8 @@ if TYPE_CHECKING:  # torch takes seconds to import
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="fast, best, small, paper, or a YAML file of your own.")
+    str,
+    typer.Option("--recipe", help="fast, best, small, paper, paper-noise, or a YAML file."),
 ]
 Peak = Annotated[
     str, typer.Option(help="Energies to train on: FEP, SEP, DEP or a range in keV, as 300-.")
@@ -40,7 +41,7 @@ Resume = Annotated[
 Init = Annotated[
     Path | None,
     typer.Option(
-        help="Run to start from, as of another detector or period: faster, fewer pulses."
+        help="Run to start from, as of another detector or period; a matched one makes pairs."
     ),
 ]
 Board = Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs too.")]

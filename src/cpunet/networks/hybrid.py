@@ -24,7 +24,18 @@ RAMP = 16  # samples over which the correction goes to zero at either end
 SLOPE_SCALE = 20.0  # steepest slopes are a few hundredths of the height per sample
 
 
-class EdgeResidual(nn.Module):
+class RecordCorrection(nn.Module):
+    """A network that changes the records of a chain."""
+
+    used: Tensor | bool
+    """Whether it changes any."""
+
+    def corrected(self, records: Tensor) -> tuple[Tensor, Tensor]:
+        """Corrected records of any height, shape (batch, samples), and what was added."""
+        raise NotImplementedError
+
+
+class EdgeResidual(RecordCorrection):
     """A U-Net of two levels whose output is added to records; zero until it is trained.
 
     Parameters
@@ -122,7 +133,7 @@ class HybridGenerator(ResponseGenerator):
         The correction.
     """
 
-    def __init__(self, chain: ResponseGenerator, residual: EdgeResidual) -> None:
+    def __init__(self, chain: ResponseGenerator, residual: RecordCorrection) -> None:
         nn.Module.__init__(self)  # not the base's: all that it would make is there
         self.response, self.remains = chain.response, chain.remains
         for name, values in chain.named_buffers(recurse=False):

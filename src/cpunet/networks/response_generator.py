@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
+from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 
-NOISE_BINS = 4097  # of a spectrum as `BaselineNoise` measures it
 
-
-class ResponseGenerator(nn.Module):
+class ResponseGenerator(KeptNoise):
     """A response and a spectrum of noise, saved together.
 
     Parameters
@@ -25,54 +21,17 @@ class ResponseGenerator(nn.Module):
         Sampling period in ns.
     """
 
-    noise_continua: Tensor
-    noise_lines: Tensor
-    noise_shares: Tensor
-    n_baselines: Tensor
     remains: DrawnRemains | None = None
     """Of earlier pulses, that records are given beside the noise."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
-        super().__init__()
+        super().__init__(dt_ns)
         self.response = ElectronicsResponse(config, dt_ns)
-        # (prepared units x keV)^2, see `BaselineNoise`; kinds that are not there have no share
-        for name in ("noise_continua", "noise_lines"):
-            self.register_buffer(name, torch.zeros(KINDS, NOISE_BINS))
-        self.register_buffer("noise_shares", torch.zeros(KINDS, dtype=torch.float64))
-        self.register_buffer("n_baselines", torch.zeros((), dtype=torch.long))
-
-    def set_noise(self, noise: BaselineNoise) -> None:
-        """Take over a measured spectrum."""
-        one = noise.density_of(2 * (NOISE_BINS - 1))[np.newaxis]
-        continua = one if noise.kinds is None else noise.kinds
-        lines = np.zeros_like(continua) if noise.lines is None else noise.lines
-        shares = np.ones(1) if noise.shares is None else noise.shares
-        for buffer, values in (
-            (self.noise_continua, continua),
-            (self.noise_lines, lines),
-            (self.noise_shares, shares),
-        ):
-            buffer.zero_()
-            buffer[: len(values)] = torch.from_numpy(values).to(buffer)
-        self.n_baselines.fill_(noise.n_baselines)
 
     @property
-    def noise(self) -> BaselineNoise:
-        """The noise, to be drawn from."""
-        there = self.noise_shares.cpu().numpy() > 0
-        continua, lines, shares = (
-            buffer.cpu().numpy()[there].astype(float)
-            for buffer in (self.noise_continua, self.noise_lines, self.noise_shares)
-        )
-        return BaselineNoise(
-            shares @ (continua + lines),
-            2 * (NOISE_BINS - 1),
-            float(self.response.dt_ns),
-            int(self.n_baselines),
-            continua,
-            lines,
-            shares,
-        )
+    def noise_dt_ns(self) -> float:
+        """Sampling period that the response has now."""
+        return float(self.response.dt_ns)
 
     @property
     def trace_noise(self) -> TraceNoise:

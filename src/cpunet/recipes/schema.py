@@ -125,6 +125,18 @@ class SearchConfig(Config):
         return self
 
 
+class ChainConfig(Config):
+    """A readout chain that is matched before a CycleGAN is trained, and stands before it.
+
+    ``generator`` and ``training`` are those of a recipe for a matched response.  The U-Nets
+    then see pulses from ``training.before`` to ``training.after`` samples about their half
+    maximum, and add what the chain leaves.
+    """
+
+    generator: ResponseConfig
+    training: MatchingConfig
+
+
 class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
@@ -153,6 +165,7 @@ class Recipe(Config):
     ]
     discriminator: Annotated[GruConfig | ConvConfig, Field(discriminator="name")] | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
+    chain: ChainConfig | None = None
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
 
@@ -202,6 +215,29 @@ class Recipe(Config):
             raise CpunetError(f"recipe {self.name}: has no residual")
         return self.generator.residual
 
+    @property
+    def network_length(self) -> int:
+        """Samples that the networks of a CycleGAN see."""
+        if self.chain is None:
+            return self.preparation.length
+        return self.chain.training.before + self.chain.training.after
+
+    @property
+    def of_chain(self) -> Recipe:
+        """The recipe by which the chain before a CycleGAN is matched.
+
+        Raises
+        ------
+        CpunetError
+            If there is none.
+        """
+        if self.chain is None:
+            raise CpunetError(f"recipe {self.name}: has no chain")
+        parts = {"generator": self.chain.generator, "training": self.chain.training}
+        return self.model_copy(
+            update=parts | {"discriminator": None, "chain": None, "search": None}
+        )
+
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:
         network = isinstance(self.generator, PunetConfig)
@@ -211,7 +247,21 @@ class Recipe(Config):
             )
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
+        if self.chain is not None and not (
+            isinstance(self.generator, PunetConfig)
+            and self.generator.residual
+            and isinstance(self.training, TrainingConfig)
+            and self.training.noise == "baselines"
+        ):
+            raise ValueError(
+                "a chain stands before a CycleGAN of residual generators with noise from "
+                "baselines"
+            )
         return self
+
+    @property
+    def _seen(self) -> str:
+        return "a prepared pulse has" if self.chain is None else "behind the chain a pulse has"
 
     @model_validator(mode="after")
     def _windows_cover(self) -> Recipe:
@@ -219,10 +269,9 @@ class Recipe(Config):
             return self
         losses = self.training.losses
         covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
-        if covered != self.preparation.length:
+        if covered != self.network_length:
             raise ValueError(
-                f"the loss windows cover {covered} samples, "
-                f"a prepared pulse has {self.preparation.length}"
+                f"the loss windows cover {covered} samples, {self._seen} {self.network_length}"
             )
         return self
 
@@ -230,17 +279,16 @@ class Recipe(Config):
     def _networks_fit(self) -> Recipe:
         if self.discriminator is None:
             return self
-        length = self.preparation.length
+        length = self.network_length
         if length % 16:
             raise ValueError(
-                f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
-                "halve it four times)"
+                f"{self._seen} {length} samples, no multiple of 16 (the generators halve it "
+                "four times)"
             )
         if isinstance(self.discriminator, GruConfig):
             step = self.discriminator.samples_per_step
             if length % step:
                 raise ValueError(
-                    f"a prepared pulse has {length} samples, no multiple of "
-                    f"samples_per_step ({step})"
+                    f"{self._seen} {length} samples, no multiple of samples_per_step ({step})"
                 )
         return self

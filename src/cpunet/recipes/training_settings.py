@@ -32,6 +32,17 @@ class LossConfig(Config):
     gradient_penalty: NonNegative
 
 
+class PairsConfig(Config):
+    """Supervised steps before the adversarial ones, see `cpunet.training.pairs`.
+
+    With a chain, or a matched run to start from, simulated pulses are translated by it, and the
+    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.
+    """
+
+    iterations: Count
+    rate: Positive
+
+
 class TrainingConfig(Config):
     """The loop: how long, how fast, how often.
 
@@ -44,6 +55,8 @@ class TrainingConfig(Config):
     them by that alone teaches nothing about the shape.  After every
     ``checkpoint_interval`` iterations all that a training needs to go on is stored.
     ``precision`` is that of the generators' passes; ``compiled`` has torch.compile fuse them.
+    With ``noise`` from ``baselines`` it is none of the generators' business: noise drawn from
+    the data's own baselines is added to whatever a judge or a score sees.
     """
 
     method: Literal["cyclegan"]
@@ -63,6 +76,8 @@ class TrainingConfig(Config):
     checkpoint_interval: Count
     precision: Literal["float32", "bf16"]
     compiled: bool
+    noise: Literal["none", "baselines"]
+    pairs: PairsConfig
     losses: LossConfig
 
 

@@ -13,11 +13,14 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.networks.conv_discriminator import ConvDiscriminator
 from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.time_major import fast_passes_pay
 from cpunet.recipes.network_settings import ConvConfig, GruConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
+from cpunet.training.chain_step import ChainStep
+from cpunet.training.compared import Compared, Judged
 from cpunet.training.fast_step import (
     fast_translations,
     judge_together,
@@ -25,6 +28,8 @@ from cpunet.training.fast_step import (
 )
 from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
+from cpunet.training.outside import Outside, tolerance
+from cpunet.training.surroundings import NONE, Surroundings
 from cpunet.training.team import ALONE, Team
 
 LOSS_NAMES = (
@@ -43,15 +48,25 @@ Discriminator = GruDiscriminator | ConvDiscriminator
 
 
 class CycleGan(nn.Module):
-    """REN (sim → data), IREN (data → sim) and a discriminator for each side."""
+    """REN (sim → data), IREN (data → sim) and a discriminator for each side.
 
-    def __init__(self, recipe: Recipe) -> None:
+    Beside them is saved, and not trained, what a translation needs: a matched chain and its
+    inverse, or the noise that is added outside the generators.
+    """
+
+    def __init__(self, recipe: Recipe, surroundings: Surroundings = NONE) -> None:
         super().__init__()
-        length, (generator, discriminator, _) = recipe.preparation.length, recipe.cyclegan
+        length, (generator, discriminator, _) = recipe.network_length, recipe.cyclegan
         self.ren = PositionalUNet(generator, length)
         self.iren = PositionalUNet(generator, length)
         self.discriminator_data = _discriminator(discriminator)
         self.discriminator_sim = _discriminator(discriminator)
+        if surroundings.chain is not None:
+            chain, inverse = surroundings.chain
+            self.chain, self.inverse = chain.requires_grad_(False), inverse
+        elif surroundings.outside is not None:
+            self.noise = KeptNoise(surroundings.outside.noise.dt_ns)
+            self.noise.set_noise(surroundings.outside.noise.noise)
 
     def generator_parameters(self) -> list[nn.Parameter]:
         """Parameters of REN and IREN."""
@@ -78,6 +93,10 @@ class Step:
         Whether to take the passes of `cpunet.training.fast_step`; as it pays if None.
     team
         Who trains, each on its own batches; see also `cpunet.training.team_norm`.
+    outside
+        What is added to translations before they are judged; nothing if None.
+    chain
+        The passes behind a matched chain, if there is one.
     """
 
     def __init__(
@@ -87,8 +106,13 @@ class Step:
         *,
         fast: bool | None = None,
         team: Team = ALONE,
+        outside: Outside | None = None,
+        chain: ChainStep | None = None,
     ) -> None:
         self.model = model
+        self.outside, self.chain = outside, chain
+        self.accuracy: dict[str, Tensor] = {}  # of the judges, if this iteration updates them
+        self._right = torch.empty(0, dtype=torch.bool)
         self.config = config
         self.team = team
         device = next(model.parameters()).device
@@ -143,44 +167,68 @@ class Step:
         decay = max(1, self.config.iterations - self.config.decay_start)
         return min(1.0, max(0.0, (self.config.iterations - iteration) / decay))
 
-    def __call__(self, iteration: int, sim: Tensor, data: Tensor) -> dict[str, Tensor]:
+    def __call__(
+        self, iteration: int, sim: Tensor, data: Tensor, rows: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
 
-        Discriminator losses are there only in iterations that update them.  In a team, losses
-        are the means of all processes'.
+        With noise outside, `rows` say which pulses the simulated ones are.  Discriminator
+        losses are there only in iterations that update them.  In a team, losses are the means
+        of all processes'.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
-        losses, fake_data, fake_sim = self._update_generators(sim, data)
+        losses, *judged = self._update_generators(sim, data, rows)
+        self.accuracy = {}
         if iteration % self.config.discriminator_interval == 0:
-            losses |= self._update_discriminators(
-                (("discriminator_data", data, fake_data), ("discriminator_sim", sim, fake_sim))
-            )
+            names = ("discriminator_data", "discriminator_sim")
+            losses |= self._update_discriminators(dict(zip(names, judged, strict=True)))
+            self.accuracy = self.team.mean(self.accuracy)
         for schedule in self.schedules:
             schedule.step()
         return self.team.mean({name: loss.detach() for name, loss in losses.items()})
 
     def generator_losses(
-        self, sim: Tensor, data: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-        """Return the six losses of the generators and the two translated batches."""
+        self, sim: Tensor, data: Tensor, rows: Tensor | None = None
+    ) -> tuple[dict[str, Tensor], Judged, Judged]:
+        """Return the six losses of the generators and what each discriminator is shown."""
         model, weights = self.model, self.weights
+        done = self._compared(sim, data, rows)
+        judged_data, judged_sim = self._judged(
+            (model.discriminator_data, self._noisy(done.judged_data.fake)),
+            (model.discriminator_sim, self._noisy(done.judged_sim.fake)),
+        )
+        losses = {
+            "identity_data": weighted_l1(*done.identity_data, weights),
+            "identity_sim": weighted_l1(*done.identity_sim, weights),
+            "cycle_forward": weighted_l1(*done.cycle_forward, weights),
+            "cycle_backward": weighted_l1(*done.cycle_backward, weights, done.tolerance),
+            "adversarial_ren": real_loss(judged_data),
+            "adversarial_iren": real_loss(judged_sim),
+        }
+        return losses, done.judged_data, done.judged_sim
+
+    def _compared(self, sim: Tensor, data: Tensor, rows: Tensor | None) -> Compared:
+        """The passes of the generators, with noise if it is theirs to have."""
+        model, outside = self.model, self.outside
+        if self.chain is not None and outside is not None and rows is not None:
+            return self.chain(sim, data, rows, outside)
         if self.fast:
             done = fast_translations(model.ren, model.iren, sim, data)
         else:
             done = plain_translations(self.ren, self.iren, sim, data)
-        judged_data, judged_sim = self._judged(
-            (model.discriminator_data, self._noisy(done.fake_data)),
-            (model.discriminator_sim, self._noisy(done.fake_sim)),
+        fake_data, noise = done.fake_data, None
+        if outside is not None and rows is not None:
+            fake_data = outside.dress_windows(done.fake_data, rows)
+            noise = tolerance(data, outside.preparation)
+        return Compared(
+            (done.same_data, data),
+            (done.same_sim, sim),
+            (done.cycled_sim, sim),
+            (done.cycled_data, data),
+            Judged(data, fake_data),
+            Judged(sim, done.fake_sim),
+            noise,
         )
-        losses = {
-            "identity_data": weighted_l1(done.same_data, data, weights),
-            "identity_sim": weighted_l1(done.same_sim, sim, weights),
-            "cycle_forward": weighted_l1(done.cycled_sim, sim, weights),
-            "cycle_backward": weighted_l1(done.cycled_data, data, weights),
-            "adversarial_ren": real_loss(judged_data),
-            "adversarial_iren": real_loss(judged_sim),
-        }
-        return losses, done.fake_data, done.fake_sim
 
     def _judged(self, *pairs: tuple[Discriminator, Tensor]) -> list[Tensor]:
         """Logits of the pulses of each discriminator."""
@@ -199,14 +247,14 @@ class Step:
         )
 
     def _update_generators(
-        self, sim: Tensor, data: Tensor
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        self, sim: Tensor, data: Tensor, rows: Tensor | None
+    ) -> tuple[dict[str, Tensor], Judged, Judged]:
         model = self.model
         discriminators = (model.discriminator_data, model.discriminator_sim)
         for network in discriminators:  # judged by fixed judges
             network.requires_grad_(False)
             network.fix_statistics()
-        losses, fake_data, fake_sim = self.generator_losses(sim, data)
+        losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
         self.team.average_gradients(model.generator_parameters())
@@ -214,7 +262,7 @@ class Step:
         self.generators.step()
         for network in discriminators:
             network.requires_grad_(True).train()
-        return losses, fake_data.detach(), fake_sim.detach()
+        return losses, judged_data, judged_sim
 
     def _noisy(self, pulses: Tensor) -> Tensor:
         """Add the instance noise of this iteration, if any."""
@@ -233,22 +281,25 @@ class Step:
         with torch.backends.cudnn.flags(enabled=weight == 0):
             (logits,) = self._judged((network, pulses)) if not weight else (network(pulses),)
         loss = real_loss(logits[: len(real)]) + fake_loss(logits[len(real) :])
+        self._right = torch.cat([logits[: len(real)] > 0, logits[len(real) :] < 0])
         if not weight:
             return loss, torch.zeros_like(loss)
         (slope,) = torch.autograd.grad(logits.sum(), pulses, create_graph=True)
         return loss, weight * slope.square().sum(dim=(1, 2)).mean()
 
-    def _update_discriminators(
-        self, sides: tuple[tuple[str, Tensor, Tensor], ...]
-    ) -> dict[str, Tensor]:
+    def _update_discriminators(self, judged: dict[str, Judged]) -> dict[str, Tensor]:
         losses = {}
-        for (name, real, fake), optimiser in zip(sides, self.discriminators, strict=True):
+        for (name, pulses), optimiser in zip(judged.items(), self.discriminators, strict=True):
             network = getattr(self.model, name)
-            loss, penalty = self._discriminator_loss(network, real, fake)
+            loss, penalty = self._discriminator_loss(
+                network, pulses.real.detach(), pulses.fake.detach()
+            )
             optimiser.zero_grad(set_to_none=True)
             (loss + penalty).backward()  # type: ignore[no-untyped-call]
             self.team.average_gradients(network.parameters())
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss
+            side = name.removeprefix("discriminator_")
+            self.accuracy[side] = self._right.float().mean()
         return losses

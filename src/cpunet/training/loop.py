@@ -16,16 +16,19 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import TrainingConfig
+from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
+from cpunet.training.pairs import learn_pairs
 from cpunet.training.sampling import Deck
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
+from cpunet.training.surroundings import NONE, Surroundings
 from cpunet.training.team import ALONE, Team
 from cpunet.training.team_norm import share_norms
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
+Entry = tuple[int, float, dict[str, Tensor], dict[str, Tensor]]
 State = dict[str, Any]  # dicts and lists of tensors, numbers and text; has "iteration"
 
 
@@ -65,6 +68,7 @@ def train(
     seed: int,
     device: str = "cpu",
     init: Callable[[CycleGan], None] | None = None,
+    surroundings: Surroundings = NONE,
     listener: Listener | None = None,
     keeping: Keeping = NOTHING_KEPT,
     team: Team = ALONE,
@@ -87,9 +91,12 @@ def train(
         ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
         Fills the networks with weights to start from, in place of the closed-form start.
+    surroundings
+        Noise outside the generators, a chain before them, a teacher; as the recipe asks for.
     listener
         Called every ``log_interval`` iterations, and before each state is kept, with the
-        records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``.
+        records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
+        and ``"accuracy"`` of the judges where they were updated.
     keeping
         Where the state goes and comes from, and whether to stop.
     team
@@ -107,19 +114,20 @@ def train(
             raise CpunetError(f"no {name} pulses to train on")
     config = recipe.cyclegan.training
     with _seeded(seed, device):
-        model = CycleGan(recipe).to(device).train()
+        model = CycleGan(recipe, surroundings).to(device).train()
+        behind = None
+        if surroundings.chain is not None:
+            behind = ChainStep(*surroundings.chain, model.ren, model.iren, recipe)
         decks = [
             Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team)
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
-        if init is not None:
-            init(model)
-        else:
-            sim_side, data_side = (deck.pulses for deck in decks)
-            match_skips(model, sim_side, data_side, recipe.preparation.samples_before)
+        if keeping.start is None:
+            _begin(model, decks, recipe, surroundings, behind, init)
         team.follow(model.state_dict().values())
         share_norms(model, team)
-        training = _Training(model, decks, config, device, team)
+        step = Step(model, config, team=team, outside=surroundings.outside, chain=behind)
+        training = _Training(step, decks, device)
         if team.size > 1:
             _reseed(seed, team.rank, 0)
         if keeping.start is not None:
@@ -132,9 +140,27 @@ def train(
                 "the seed, and begin again"
             ) from error
         training.take_averages()
-        refresh_batch_statistics(model.ren, decks[0], config.statistics_batches)
-        refresh_batch_statistics(model.iren, decks[1], config.statistics_batches)
+        runs = (None, None) if behind is None else (behind.records, behind.iren)
+        for network, deck, run in zip((model.ren, model.iren), decks, runs, strict=True):
+            refresh_batch_statistics(network, deck, config.statistics_batches, run)
     return model.eval()
+
+
+def _begin(
+    model: CycleGan,
+    decks: list[Deck],
+    recipe: Recipe,
+    surroundings: Surroundings,
+    behind: ChainStep | None,
+    init: Callable[[CycleGan], None] | None,
+) -> None:
+    """Give the generators the start there is: weights, the closed form, pairs."""
+    if init is not None:
+        init(model)
+    elif behind is None:
+        sim, data = (deck.pulses for deck in decks)
+        match_skips(model, sim, data, recipe.preparation.samples_before)
+    learn_pairs(model, decks[0], recipe, surroundings, behind)
 
 
 class _DivergenceError(Exception):
@@ -144,30 +170,26 @@ class _DivergenceError(Exception):
 class _Training:
     """All that changes from iteration to iteration."""
 
-    def __init__(
-        self,
-        model: CycleGan,
-        decks: list[Deck],
-        config: TrainingConfig,
-        device: str,
-        team: Team,
-    ) -> None:
-        self.model, self.decks, self.config, self.team = model, decks, config, team
+    def __init__(self, step: Step, decks: list[Deck], device: str) -> None:
+        self.step, self.decks = step, decks
+        self.model, self.config, self.team = step.model, step.config, step.team
         self.device = torch.device(device)
-        self.step = Step(model, config, team=team)
+        model, config = self.model, self.config
         average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
         self.generators = (model.ren, model.iren)
         self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
         self.iteration = 0  # how many are done
 
-    def advance(self) -> tuple[int, float, dict[str, Tensor]]:
-        """Do an iteration; return its number, learning rate and losses."""
+    def advance(self) -> Entry:
+        """Do an iteration; return its number, learning rate, losses and accuracies."""
         iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
-        losses = self.step(iteration, self.decks[0].deal(), self.decks[1].deal())
+        batches = [deck.deal() for deck in self.decks]
+        rows = () if self.step.outside is None else (self.decks[0].dealt,)
+        losses = self.step(iteration, *batches, *rows)
         for averaged, network in zip(self.averages, self.generators, strict=True):
             averaged.update_parameters(network)
         self.iteration += 1
-        return iteration, rate, losses
+        return iteration, rate, losses, self.step.accuracy
 
     def take_averages(self) -> None:
         """Give the generators their averaged weights."""
@@ -214,7 +236,7 @@ class _Training:
 
 def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -> None:
     config = training.config
-    pending: list[tuple[int, float, dict[str, Tensor]]] = []
+    pending: list[Entry] = []
     while training.iteration < config.iterations:
         pending.append(training.advance())
         done = training.iteration
@@ -239,12 +261,17 @@ def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -
             )
 
 
-def _record(iteration: int, rate: float, losses: dict[str, Tensor]) -> Record:
-    return {
+def _record(
+    iteration: int, rate: float, losses: dict[str, Tensor], accuracy: dict[str, Tensor]
+) -> Record:
+    told: Record = {
         "iteration": iteration,
         "rate": rate,
         "losses": {name: float(value) for name, value in losses.items()},
     }
+    if accuracy:
+        told["accuracy"] = {side: float(value) for side, value in accuracy.items()}
+    return told
 
 
 def _require_finite(records: list[Record]) -> None:

@@ -23,7 +23,9 @@ def window_weights(config: LossConfig) -> Tensor:
     return torch.cat([torch.full((length,), weight / length) for length, weight in windows])
 
 
-def weighted_l1(pulses: Tensor, others: Tensor, weights: Tensor) -> Tensor:
+def weighted_l1(
+    pulses: Tensor, others: Tensor, weights: Tensor, tolerance: Tensor | None = None
+) -> Tensor:
     """Weighted absolute difference, per pulse, then averaged over the batch.
 
     Parameters
@@ -32,8 +34,13 @@ def weighted_l1(pulses: Tensor, others: Tensor, weights: Tensor) -> Tensor:
         Shape (batch, 1, samples).
     weights
         From `window_weights`, shape (samples,).
+    tolerance
+        Of each pulse, (batch, 1, 1): what of a difference counts for nothing.
     """
-    return ((pulses - others).abs() * weights).sum(dim=-1).mean()
+    apart = (pulses - others).abs()
+    if tolerance is not None:
+        apart = (apart - tolerance).clamp_min(0)
+    return (apart * weights).sum(dim=-1).mean()
 
 
 def real_loss(logits: Tensor) -> Tensor:

@@ -113,10 +113,21 @@ def read_recipe(run: Path) -> Recipe:
 
 def _completed(settings: Any) -> Any:
     """Settings with what recipes of earlier versions did not have yet."""
-    generator = settings.get("generator") if isinstance(settings, dict) else None
-    if not isinstance(generator, dict) or "fast_decays_us" not in generator:
-        return settings
-    return settings | {"generator": {"free_decays": False} | generator}
+    for part, (known_by, added) in _LATER.items():
+        own = settings.get(part) if isinstance(settings, dict) else None
+        if isinstance(own, dict) and known_by in own:
+            settings = settings | {part: added | own}
+    return settings
+
+
+# by the part of a recipe: a setting by which its kind is known, and what came later
+_LATER: dict[str, tuple[str, dict[str, Any]]] = {
+    "generator": ("fast_decays_us", {"free_decays": False}),
+    "training": (
+        "discriminator_interval",
+        {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}},
+    ),
+}
 
 
 def read_losses(run: Path) -> list[Record]:
@@ -171,7 +182,7 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
 
 
 def fill_networks(run: Path, model: nn.Module) -> None:
-    """Fill all networks of `model` that the run has weights of; REN and IREN at least.
+    """Fill those networks of a CycleGAN that the run has weights of; REN and IREN at least.
 
     Raises
     ------
@@ -181,7 +192,8 @@ def fill_networks(run: Path, model: nn.Module) -> None:
     device = str(next(model.parameters()).device)
     there = _weights_of(run, device)
     for name, network in model.named_children():
-        if name in ("ren", "iren") or any(key.startswith(f"{name}.") for key in there):
+        judge = name.startswith("discriminator_")
+        if name in ("ren", "iren") or (judge and any(k.startswith(f"{name}.") for k in there)):
             was_training = network.training
             load_network(run, name, network, device).train(was_training)
 

@@ -39,6 +39,8 @@ class Deck:
         self._own = slice(team.rank * share, (team.rank + 1) * share)
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
+        self.dealt = torch.empty(0, dtype=torch.long)
+        """Rows of the pulses of the last share."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the cards not yet dealt and the state of the random numbers."""
@@ -59,4 +61,5 @@ class Deck:
                 self._order = torch.randperm(n, generator=self._random)
             chosen = self._order[: self.batch_size]
             self._order = self._order[self.batch_size :]
-        return self.pulses[chosen[self._own].to(self.pulses.device)]
+        self.dealt = chosen[self._own]
+        return self.pulses[self.dealt.to(self.pulses.device)]

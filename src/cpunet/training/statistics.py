@@ -9,13 +9,20 @@ generator's own input side (Wu and Johnson 2021, arXiv:2105.07576, section 3).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from cpunet.training.sampling import Deck
 
 
-def refresh_batch_statistics(network: nn.Module, deck: Deck, batches: int) -> None:
+def refresh_batch_statistics(
+    network: nn.Module,
+    deck: Deck,
+    batches: int,
+    run: Callable[[Tensor], object] | None = None,
+) -> None:
     """Replace the running statistics of all batch norms by plain averages.
 
     Parameters
@@ -26,6 +33,8 @@ def refresh_batch_statistics(network: nn.Module, deck: Deck, batches: int) -> No
         Pulses of the side that it translates; in a team, that of the batch norms.
     batches
         How many batches to average over.
+    run
+        Where the network stands behind a chain, both of windows of shape (batch, samples).
     """
     norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm1d)]
     momenta = [norm.momentum for norm in norms]
@@ -36,7 +45,8 @@ def refresh_batch_statistics(network: nn.Module, deck: Deck, batches: int) -> No
     network.train()
     with torch.no_grad():
         for _ in range(batches):
-            network(deck.deal())
+            pulses = deck.deal()
+            network(pulses) if run is None else run(pulses[:, 0])
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
     network.train(training)

@@ -9,8 +9,11 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
+from cpunet.electronics.extension import with_room
 from cpunet.electronics.finishing import finish_with_codes
 from cpunet.errors import CpunetError
+from cpunet.networks.chain_unet import InverseUNet
+from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -20,6 +23,7 @@ from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 Energies = npt.NDArray[np.float64]
+NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 
 
 class Backend(ABC):
@@ -84,6 +88,58 @@ class NetworkBackend(Backend):
         return self._frozen.translate(batch, generator=generator, mean=mean)
 
 
+class NoisyNetworkBackend(NetworkBackend):
+    """A network from window to window, and noise of baselines outside of it.
+
+    Parameters
+    ----------
+    network
+        What it makes has no electronic noise.
+    noise
+        Of the data's baselines.
+    config
+        The preparation of the data, which noisy pulses go through again.
+    """
+
+    def __init__(
+        self, network: PositionalUNet, noise: KeptNoise, config: PreparationConfig
+    ) -> None:
+        super().__init__(network)
+        self.noise, self.config = noise, config
+
+    def __call__(
+        self,
+        windows: FloatArray,
+        energy_kev: Energies | None,
+        noise: bool,
+        generator: torch.Generator | None,
+        remains_kev: Energies | None = None,
+    ) -> tuple[FloatArray, Codes]:
+        """Run the network, add noise in proportion to 1/energy, and prepare like data.
+
+        Raises
+        ------
+        CpunetError
+            If noise is wanted and an energy is not known.
+        """
+        if noise and energy_kev is None:
+            raise CpunetError(NO_ENERGY)
+        clean, codes = super().__call__(windows, None, noise, generator, remains_kev)
+        if not noise:
+            return clean, codes
+        device = self.device if generator is None else generator.device
+        seed = torch.randint(2**62, (), generator=generator, device=device)
+        dt_ns = self.noise.noise_dt_ns
+        return finish_with_codes(
+            with_room(clean, self.config, dt_ns),
+            self.config,
+            dt_ns=dt_ns,
+            noise=self.noise.noise,
+            energy_kev=energy_kev,
+            seed=int(seed),
+        )
+
+
 class ResponseBackend(Backend):
     """A readout chain, electronic noise, and the preparation of measured traces."""
 
@@ -108,9 +164,7 @@ class ResponseBackend(Backend):
         """
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         if noise and energy_kev is None:
-            raise CpunetError(
-                "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-            )
+            raise CpunetError(NO_ENERGY)
         drawn = self.chain.noise if noise else None
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
@@ -155,7 +209,9 @@ class ResponseBackend(Backend):
 class InverseBackend(Backend):
     """A linear inverse, and the preparation of simulated pulses."""
 
-    def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
+    def __init__(
+        self, inverse: LinearInverse | InverseUNet, config: PreparationConfig, dt_ns: float
+    ) -> None:
         self.network = inverse.eval()
         self.config = config
         self.dt_ns = dt_ns
@@ -171,6 +227,7 @@ class InverseBackend(Backend):
         """Undo the response and the noise; nothing is drawn."""
         del energy_kev, noise, generator, remains_kev
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
+        pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
+from cpunet.networks.hybrid import HybridGenerator, RecordCorrection
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -72,7 +72,7 @@ class ChainGraph(nn.Module):
         with torch.inference_mode():
             matrix = chain.response(torch.eye(length, device=chain.response.dt_ns.device))
         self.register_buffer("matrix", matrix.clone().cpu())
-        self.residual: EdgeResidual | None = None
+        self.residual: RecordCorrection | None = None
         if isinstance(chain, HybridGenerator) and bool(chain.residual.used):
             self.residual = copy.deepcopy(chain.residual)
 

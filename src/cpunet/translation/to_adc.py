@@ -17,10 +17,10 @@ import numpy.typing as npt
 import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
-from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.output_form import Formed, drawn_kev
@@ -245,44 +245,6 @@ class AdcForm:
             :, np.newaxis
         ]
         return levels, clean.codes
-
-
-def extended(
-    windows: FloatArray, config: PreparationConfig, dt_ns: float, length: int, n_pre: int
-) -> FloatArray:
-    """Cut or extend prepared windows: 0 before them, each one's fitted decay after them.
-
-    Parameters
-    ----------
-    windows
-        Shape (n, config.length); rows of NaN stay that.
-    config
-        How they were prepared; `decay_fit_samples` at the end of each give its decay.
-    dt_ns
-        Sampling period in ns.
-    length, n_pre
-        Samples of the result, and those before the aligned one.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32, shape (n, length).
-    """
-    time = np.arange(length) - n_pre + config.samples_before  # as samples of the window
-    inside = (time >= 0) & (time < config.length)
-    result = np.zeros((len(windows), length), np.float32)
-    result[:, inside] = windows[:, time[inside]]
-    late = time >= config.length
-    if late.any():
-        measured = prepare(Pulses.of(windows, dt_ns=dt_ns), config, "measured")
-        per_sample = np.zeros(len(windows))
-        per_sample[measured.index] = measured.tail_slope * dt_ns * 1e-6
-        # the level of the last samples belongs to their middle
-        since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
-        end = windows[:, -config.tail_samples :].mean(axis=1)
-        result[:, late] = end[:, np.newaxis] * np.exp(per_sample[:, np.newaxis] * since)
-    result[np.isnan(windows).any(axis=1)] = np.nan
-    return result
 
 
 def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:

@@ -20,7 +20,9 @@ import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
+from cpunet.networks.chain_unet import InverseUNet, UNetCorrection
 from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
+from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -34,6 +36,7 @@ from cpunet.translation.backends import (
     Energies,
     InverseBackend,
     NetworkBackend,
+    NoisyNetworkBackend,
     ResponseBackend,
 )
 from cpunet.translation.learned_remains import remains_of
@@ -41,6 +44,8 @@ from cpunet.translation.learned_remains import remains_of
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
 RESIDUAL = "residual"  # its weights lie beside those of the chain
+# and beside those of a CycleGAN, what its translations need
+CHAIN, INVERSE, NOISE = "chain", "inverse", "noise"
 BATCH = 512  # pulses at a time: bounds the memory, hardly touches the speed
 
 
@@ -105,11 +110,17 @@ class Translator:
 
     @classmethod
     def _backend(cls, run: Path, recipe: Recipe, dt_ns: float, device: str) -> Backend:
-        generator, length = recipe.generator, recipe.preparation.length
+        generator, length = recipe.generator, recipe.network_length
         if isinstance(generator, PunetConfig):
             network = PositionalUNet(generator, length)
             load_network(run, cls.part, network, device)
-            return NetworkBackend(network)
+            if recipe.chain is not None:
+                return cls._behind_chain(run, network, recipe, dt_ns, device)
+            if cls.part == IREN.part or recipe.cyclegan.training.noise == "none":
+                return NetworkBackend(network)
+            noise = KeptNoise(dt_ns)
+            load_network(run, NOISE, noise, device)
+            return NoisyNetworkBackend(network, noise, recipe.preparation)
         if cls.part == REN.part:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
@@ -122,6 +133,23 @@ class Translator:
         inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
         load_network(run, cls.part, inverse, device)
         return InverseBackend(inverse, recipe.preparation, dt_ns)
+
+    @classmethod
+    def _behind_chain(
+        cls, run: Path, unet: PositionalUNet, recipe: Recipe, dt_ns: float, device: str
+    ) -> Backend:
+        config, matching = recipe.of_chain.matching
+        before, after, preparation = matching.before, matching.after, recipe.preparation
+        if cls.part == REN.part:
+            chain = ResponseGenerator(config, dt_ns)
+            load_network(run, CHAIN, chain, device)
+            chain.remains = remains_of(read_info(run))
+            added = UNetCorrection(unet, before, after, preparation.tail_level).to(device)
+            return ResponseBackend(HybridGenerator(chain, added), preparation)
+        inverse = LinearInverse(Sizes.of(preparation.length, matching))
+        load_network(run, INVERSE, inverse, device)
+        whole = InverseUNet(inverse, unet, before, after)
+        return InverseBackend(whole, preparation, dt_ns)
 
     def translate(
         self,
@@ -236,7 +264,7 @@ class Translator:
     @property
     def needs_energies(self) -> bool:
         """Whether the noise goes by the energies."""
-        return isinstance(self.backend, ResponseBackend)
+        return isinstance(self.backend, ResponseBackend | NoisyNetworkBackend)
 
     def apply(
         self,

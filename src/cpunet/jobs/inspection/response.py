@@ -28,8 +28,9 @@ from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.response_errors import propagated
+from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response import ElectronicsResponse
-from cpunet.networks.response_generator import NOISE_BINS, ResponseGenerator
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig

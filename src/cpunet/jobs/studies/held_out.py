@@ -19,17 +19,17 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.matching import Sides, match
-from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
-from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.chain_step import ChainStep
+from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import Keeping, State, train
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import Deck
 from cpunet.training.statistics import refresh_batch_statistics
-from cpunet.translation.backends import NetworkBackend
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
@@ -141,23 +141,31 @@ class HeldOut:
         if isinstance(recipe.training, MatchingConfig):
             model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, Monitor())
         else:
+            begun = network_start(self.fit, recipe, seed, None, Monitor())
+            recipe = begun.recipe
             model = train(
                 self.fit.sim.waveforms,
                 self.fit.data.waveforms,
                 recipe,
                 seed=seed,
                 device=device,
-                keeping=Keeping(self._watch(recipe, device, report)),
+                surroundings=begun.surroundings,
+                keeping=Keeping(self._watch(begun, device, report)),
             )
+        return self._loaded(model, recipe, seed, device)
+
+    def _loaded(self, model: nn.Module, recipe: Recipe, seed: int, device: str) -> REN:
         info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}
         with TemporaryDirectory(prefix="cpunet-tune-") as folder:
             told = {"seconds": 0, "device": device, "seed": seed}
             write_run(Path(folder), model, recipe, info | told)
             return REN.load(folder, device)
 
-    def _watch(self, recipe: Recipe, device: str, report: Report) -> Callable[[State], None]:
+    def _watch(
+        self, begun: NetworkStart, device: str, report: Report
+    ) -> Callable[[State], None]:
         """Score the generator that would be kept, each time its training gets so far."""
-        config, generator = recipe.cyclegan.training, recipe.cyclegan.generator
+        config = begun.recipe.cyclegan.training
         told = 0
 
         def watch(state: State) -> None:
@@ -167,26 +175,27 @@ class HeldOut:
                 return
             told = part
             with _random_state_kept(device):
-                ren = self._averaged(state, recipe, generator, device)
-                report(state["iteration"], self.score(ren))
+                report(state["iteration"], self.score(self._averaged(state, begun, device)))
 
         return watch
 
-    def _averaged(
-        self, state: State, recipe: Recipe, generator: PunetConfig, device: str
-    ) -> REN:
-        network = PositionalUNet(generator, recipe.preparation.length)
+    def _averaged(self, state: State, begun: NetworkStart, device: str) -> REN:
+        recipe, prefix = begun.recipe, "module."
+        config = recipe.cyclegan.training
+        model = CycleGan(recipe, begun.surroundings).to(device)
+        model.load_state_dict(state["model"])
         averages = state["averages"][0].items()
-        prefix = "module."
-        network.load_state_dict(
+        model.ren.load_state_dict(
             {k.removeprefix(prefix): v for k, v in averages if k.startswith(prefix)}
         )
-        network = network.to(device)
-        config = recipe.cyclegan.training
         pulses = torch.from_numpy(self.fit.sim.waveforms)[:, None].to(device)
         deck = Deck(pulses, config.batch_size, seed=self.seed)
-        refresh_batch_statistics(network, deck, config.statistics_batches)
-        return REN(NetworkBackend(network), recipe, self.sim.dt_ns)
+        chain = begun.surroundings.chain
+        run = None
+        if chain is not None:
+            run = ChainStep(*chain, model.ren, model.iren, recipe).records
+        refresh_batch_statistics(model.ren, deck, config.statistics_batches, run)
+        return self._loaded(model, recipe, self.seed, device)
 
 
 def _random_state_kept(device: str) -> AbstractContextManager[None]:

@@ -59,14 +59,16 @@ def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
     CpunetError
         If the run has none.
     """
-    recipe = read_recipe(run)
+    recipe, part = read_recipe(run), "ren"
+    if recipe.chain is not None:
+        recipe, part = recipe.of_chain, "chain"
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
             f"{run}: a network ({recipe.name}), from which no readout chain can start; give a "
             "run of fast or best"
         )
     generator = ResponseGenerator(recipe.generator, dt_ns)
-    load_network(run, "ren", generator)
+    load_network(run, part, generator)
     return generator.response
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +30,17 @@ from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
 from cpunet.jobs.training.matching import Sides, known_response, match
+from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.jobs.training.train_team import team_for
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.judges import judges_noted
 from cpunet.training.loop import Keeping, Listener, Record, train
 from cpunet.training.run_folder import (
     RUN,
     append_losses,
-    fill_networks,
     read_info,
     read_losses,
     versions,
@@ -93,7 +93,8 @@ def train_run(
     device
         ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
     init
-        Folder of a run of the same kind to start from, as of another detector or period.
+        Folder of a run to start from, as of another detector or period: of the same kind, or
+        a matched one, which makes pairs for networks to learn first.
     resume
         Go on with the unfinished training, if there is one; all else must be as it was.
     force
@@ -140,7 +141,7 @@ def train_run(
                 if isinstance(recipe.training, MatchingConfig):
                     model, info, recipe = job.match(tensorboard)
                 elif team.leads:
-                    model, info = job.train(resume, tensorboard, stop)
+                    model, info, recipe = job.train(resume, tensorboard, stop)
                 else:
                     job.help_train(stop)
                     return {}
@@ -232,12 +233,13 @@ class TrainingJob:
 
     def train(
         self, resume: bool, tensorboard: bool, stop: Callable[[], bool]
-    ) -> tuple[nn.Module, dict[str, Any]]:
-        """Train a CycleGAN, or go on; return it and the content of ``run.json``."""
+    ) -> tuple[nn.Module, dict[str, Any], Recipe]:
+        """Train a CycleGAN, or go on; return it, the content of ``run.json``, its recipe."""
         fingerprint = self._fingerprint()
         require_same_everywhere(self.team, fingerprint)
         run = UnfinishedRun(self.folder, fingerprint, self._environment(), self.monitor.note)
         start = share_state(self.team, run.begin(resume=resume))
+        begun = self._network_start()
         left = self.recipe.training.iterations - (start["iteration"] if start else 0)
         with (
             _losses_shown(self.folder, wanted=tensorboard) as show,
@@ -249,25 +251,37 @@ class TrainingJob:
                 show(records)
                 advance(len(records))
 
-            model = self._trained(Keeping(run.save, start, stop), listen)
+            model = self._trained(begun, Keeping(run.save, start, stop), listen)
         run.finish()
+        for line in judges_noted(read_losses(self.folder)):
+            self.monitor.note(f"warning: {line}")
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-        return model, self._info(run.started, run.seconds) | resumed
+        info = self._info(run.started, run.seconds) | resumed | begun.told
+        return model, info, begun.recipe
 
     def help_train(self, stop: Callable[[], bool]) -> None:
         """Train with the process that leads, which keeps all."""
         require_same_everywhere(self.team, self._fingerprint())
         start = share_state(self.team, None)
-        self._trained(Keeping(lambda _state: None, start, stop), None)
+        self._trained(self._network_start(), Keeping(lambda _state: None, start, stop), None)
 
-    def _trained(self, keeping: Keeping, listener: Listener | None) -> nn.Module:
+    def _network_start(self) -> NetworkStart:
+        sides = Sides(
+            self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
+        )
+        return network_start(sides, self.recipe, self.seed, self.init, self.monitor)
+
+    def _trained(
+        self, begun: NetworkStart, keeping: Keeping, listener: Listener | None
+    ) -> nn.Module:
         return train(
             self.sim.prepared.pulses.waveforms,
             self.data.prepared.pulses.waveforms,
-            self.recipe,
+            begun.recipe,
             seed=self.seed,
             device=self.device,
-            init=None if self.init is None else partial(fill_networks, self.init),
+            init=begun.fill,
+            surroundings=begun.surroundings,
             listener=listener,
             keeping=keeping,
             team=self.team,

@@ -51,6 +51,11 @@ def _require_shareable(recipe: Recipe, team: Team) -> None:
         raise CpunetError(
             f"recipe {recipe.name}: takes a minute in one process; start it without torchrun"
         )
+    if recipe.chain is not None:
+        raise CpunetError(
+            f"recipe {recipe.name}: takes minutes in one process, its chain being matched "
+            "first; start it without torchrun"
+        )
     team.share_of(recipe.training.batch_size)
 
 

@@ -20,7 +20,12 @@ from cpunet.outputs import refuse_existing
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info
-from cpunet.translation.backends import NetworkBackend, ResponseBackend
+from cpunet.translation.backends import (
+    Backend,
+    NetworkBackend,
+    NoisyNetworkBackend,
+    ResponseBackend,
+)
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
 from cpunet.translation.translator import IREN, REN, Translator
 from cpunet.yaml_files import MOST_BYTES, plain_json
@@ -89,16 +94,23 @@ def export_run(
     translator = kind.load(run)
     info = read_info(run)
     scores = None if report is None else _scores(report)
-    has_noise = isinstance(translator.backend, ResponseBackend)
+    noise = _kept_noise(translator.backend)
     with monitor.stage("Exporting"), written_aside(out) as aside:
         difference = export(graph_of(translator), aside, form)
-    if isinstance(translator.backend, ResponseBackend):
+    if noise is not None:
         with written_aside(noise_file) as aside:
-            _write_noise(aside, translator.backend.chain.noise)
-    done = Exported(out, card, noise_file if has_noise else None, difference)
+            _write_noise(aside, noise)
+    done = Exported(out, card, None if noise is None else noise_file, difference)
     with written_aside(card) as aside:
         aside.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
     return done
+
+
+def _kept_noise(backend: Backend) -> BaselineNoise | None:
+    """What a translator adds beside its graph, if anything."""
+    if isinstance(backend, ResponseBackend):
+        return backend.chain.noise
+    return backend.noise.noise if isinstance(backend, NoisyNetworkBackend) else None
 
 
 def _write_noise(path: Path, noise: BaselineNoise) -> None:
@@ -227,21 +239,25 @@ def _interface(translator: Translator) -> list[str]:
         )
     else:
         lines.append(
-            f"* out: `pulses`, float32 (batch, {n}), within 0 … 1; afterwards scaled and "
-            "aligned as simulated pulses.\n"
+            f"* out: `pulses`, float32 (batch, {translator.recipe.network_length}), within "
+            "0 … 1; afterwards scaled and aligned as simulated pulses.\n"
         )
     return lines
 
 
 def _noise(translator: Translator, done: Exported) -> list[str]:
+    lines = []
     if isinstance(translator.backend, NetworkBackend):
-        return [
+        lines = [
             "The graph draws nothing. `epsilon` of independent N(0, 1) numbers gives a draw, "
             "of zeros the latent mean. Electronic noise is not added.\n"
         ]
+    elif done.noise is None:
+        lines = ["None is added: the inverse removes it.\n"]
     if done.noise is None:
-        return ["None is added: the inverse removes it.\n"]
+        return lines
     return [
+        *lines,
         f"The graph adds none. `{done.noise.name}` holds the electronic noise: spectra of "
         "`continua` and `lines`, shape (kinds, bins), at the frequencies of a real FFT of "
         "`samples` samples of `dt_ns`, as the mean square of a bin divided by `samples`, in "
@@ -249,7 +265,7 @@ def _noise(translator: Translator, done: Exported) -> list[str]:
         "by its share, draw Gaussian noise of the continuum and sines of random phase for the "
         "lines, divide by the energy in keV. Prepare the record, add the noise to all of it "
         "(in the same units), then prepare again, so that alignment and scale suffer from "
-        "noise as those of data do.\n"
+        "noise as those of data do.\n",
     ]
 
 

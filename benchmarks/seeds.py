@@ -1,0 +1,104 @@
+"""Many seeds of a recipe on one stand, a file of scores each: may be stopped and gone on with.
+
+Run with ``python benchmarks/seeds.py STAND FOLDER --recipe small --seeds 20``; a stand is a
+folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and perhaps truth.npz.  Seeds whose
+file is in FOLDER are not trained again.  With ``--sim`` the simulated pulses are those of
+another stand.  A seed has failed if a score is below 0.9 of the median's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpunet.files import written_aside
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.recipes import load_recipe
+
+FAILED = 0.9
+PEAKS = ("SEP", "DEP")
+
+
+def one_seed(
+    sim: Path, stand: Path, recipe: str, overrides: list[str], seed: int
+) -> dict[str, Any]:
+    """Scores over their ceilings, AUC and edge of one training, and what it cost."""
+    files = InputFile(sim / "sim.lh5"), InputFile(stand / "data.lh5")
+    truth = stand / "truth.npz"
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        before = time.process_time()
+        info = train_run(*files, run, load_recipe(recipe, overrides), seed=seed)
+        cpu = time.process_time() - before
+        metrics = evaluate(
+            run,
+            *files,
+            truth=truth if truth.exists() and sim == stand else None,
+            rivals=False,
+            seed=seed,
+            device="auto",
+            monitor=Monitor(),
+        ).metrics
+    found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
+    for peak in PEAKS:
+        scores = metrics["peaks"][peak]
+        for name, compared in scores["parameters"].items():
+            iou = compared["iou"]
+            found[f"{peak} {name}"] = iou["ren"]
+            found[f"{peak} {name} / ceiling"] = iou["ren"] / iou["ceiling"]
+        found[f"{peak} AUC"] = scores["two_sample"]["ren"]["auc"]
+        if "paired" in scores:
+            found[f"{peak} edge RMSE"] = scores["paired"]["ren"]["edge_rmse"]
+    return found
+
+
+def summary(runs: list[dict[str, Any]]) -> str:
+    """Median, spread and failures of each number."""
+    lines = [f"{'':<36}{'median':>10}{'lowest':>10}{'highest':>10}{'failed':>8}"]
+    for name in runs[0]:
+        if name == "seed":
+            continue
+        values = np.array([run.get(name, np.nan) for run in runs], float)
+        middle = np.median(values)
+        score = not name.endswith(("seconds", "cpu", "AUC", "RMSE"))
+        failed = str(int((~(values >= FAILED * middle)).sum())) if score else ""
+        lines.append(
+            f"{name:<36}{middle:>10.4g}{values.min():>10.4g}{values.max():>10.4g}{failed:>8}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("stand", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--sim", type=Path)
+    parser.add_argument("--recipe", default="small")
+    parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--seeds", type=int, default=20)
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    files = [given.folder / f"seed-{seed}.json" for seed in range(given.seeds)]
+    for seed, file in enumerate(files):
+        if file.exists():
+            continue
+        sim = given.sim or given.stand
+        found = one_seed(sim, given.stand, given.recipe, given.overrides, seed)
+        with written_aside(file) as aside:
+            aside.write_text(json.dumps(found, indent=1) + "\n")
+        print(f"seed {seed}: {found['seconds']:.0f} s", flush=True)
+    print(f"{given.recipe} on {given.stand.name}, {given.seeds} seeds")
+    print(summary([json.loads(file.read_text()) for file in files]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""A readout chain and a Positional U-Net beside it, and the inverse of both.
+
+The chain does what filters can; the U-Net sees each pulse about its half maximum, where its
+positional maps mean something, and says by how many samples each sample comes earlier or later.
+That times the slope is added: where nothing moves nothing is, so that baseline, top and tail
+stay the chain's.  A U-Net that starts at zero starts with the chain's translation.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from cpunet.networks.hybrid import RecordCorrection, half_sample
+from cpunet.networks.linear_inverse import LinearInverse, stretch
+from cpunet.networks.positional_unet import PositionalUNet
+
+RAMP = 24  # samples over which a correction goes to zero at either end
+TAIL = 100  # samples at the end of a stretch whose mean gives a record's height
+LEAST_HEIGHT = 1e-3
+
+
+class UNetCorrection(RecordCorrection):
+    """What a residual U-Net adds to records about their half maximum.
+
+    Parameters
+    ----------
+    unet
+        Residual, of `before` + `after` samples.
+    before, after
+        Samples of the stretch on either side of the half maximum.
+    tail_level
+        Of prepared pulses: the height at which the U-Net sees the end of its stretch.
+    """
+
+    taper: Tensor
+    used = True
+
+    def __init__(
+        self, unet: PositionalUNet, before: int, after: int, tail_level: float
+    ) -> None:
+        super().__init__()
+        self.unet = unet
+        self.before, self.after, self.tail_level = before, after, tail_level
+        samples = torch.arange(before + after)
+        edge = torch.minimum(samples + 0.5, before + after - 0.5 - samples)
+        taper = torch.sin(0.5 * torch.pi * (edge / RAMP).clamp(max=1)) ** 2
+        self.register_buffer("taper", taper, persistent=False)
+
+    def forward(self, records: Tensor) -> Tensor:
+        """Correct noise-free records of any height, shape (batch, samples)."""
+        return self.corrected(records)[0]
+
+    def corrected(self, records: Tensor) -> tuple[Tensor, Tensor]:
+        """Corrected records, and what was added in units of prepared pulses."""
+        with torch.no_grad():
+            highest, at = records.max(dim=1, keepdim=True)
+            sample = half_sample(records, highest, at)
+            inside = stretch(records, sample, -self.before, self.after)
+            height = inside[:, -TAIL:].mean(dim=1, keepdim=True) / self.tail_level
+            height = height.clamp_min(LEAST_HEIGHT)
+        # through the records themselves a cycle's gradient comes back
+        inside = stretch(records, sample, -self.before, self.after) / height
+        added = self.added(inside)
+        index = sample[:, None] + torch.arange(-self.before, self.after, device=records.device)
+        index = index.clamp(0, records.shape[1] - 1)
+        return records.scatter_add(1, index, added * height), added
+
+    def added(self, inside: Tensor) -> Tensor:
+        """What is added to stretches of prepared height, shape (batch, before + after)."""
+        # in evaluation the latent mean: the same record every time
+        out = self.unet(inside[:, None], mean=not self.training)[:, 0]
+        slope = torch.diff(inside, dim=1, prepend=inside[:, :1])
+        change: Tensor = (out - inside) * slope * self.taper
+        return change
+
+
+class InverseUNet(nn.Module):
+    """Measured windows → pulses as simulated, without noise: linear inverse and U-Net.
+
+    Parameters
+    ----------
+    inverse
+        Of the chain.
+    unet
+        Residual, of `before` + `after` samples.
+    before, after
+        Samples on either side of the half maximum of the measured pulse.
+    """
+
+    def __init__(
+        self, inverse: LinearInverse, unet: PositionalUNet, before: int, after: int
+    ) -> None:
+        super().__init__()
+        self.inverse, self.unet = inverse, unet
+        self.before, self.after = before, after
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Pulses about the half maximum of each window, shape (batch, before + after)."""
+        pulses, _ = self.located(windows)
+        return pulses
+
+    def located(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and the sample of each window from which its stretch begins."""
+        sample = self.inverse.half_sample(windows)
+        begun = stretch(self.inverse(windows), sample, -self.before, self.after)
+        out = self.unet(begun[:, None], mean=not self.training)[:, 0]
+        return out, sample - self.before

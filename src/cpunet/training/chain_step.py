@@ -1,0 +1,120 @@
+"""The passes of a training step behind a matched chain.
+
+The chain and its inverse are fixed; the U-Nets add what these leave.  Cycles know by how much
+each pulse was moved, so that a pulse is compared with itself sample by sample.  Judges see
+both sides aligned at their half maximum, where noise does not move a pulse by tens of samples.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from cpunet.networks.chain_unet import TAIL, InverseUNet, UNetCorrection
+from cpunet.networks.hybrid import half_sample
+from cpunet.networks.linear_inverse import LinearInverse, stretch
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes.schema import Recipe
+from cpunet.training.compared import Compared, Judged
+from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training.outside import LEAST_SCALE, Outside, of_height, tolerance
+
+LATEST = 60  # samples after the expected half maximum from which it is searched backward
+
+
+class ChainStep:
+    """All that a step compares, behind a chain.
+
+    Parameters
+    ----------
+    chain, inverse
+        Matched, and its inverse.
+    ren, iren
+        Residual U-Nets.
+    recipe
+        With a chain.
+    """
+
+    def __init__(
+        self,
+        chain: ResponseGenerator,
+        inverse: LinearInverse,
+        ren: PositionalUNet,
+        iren: PositionalUNet,
+        recipe: Recipe,
+    ) -> None:
+        self.preparation, self.matching = recipe.preparation, recipe.of_chain.matching.training
+        before, after = self.matching.before, self.matching.after
+        self.chain, self.inverse = chain, inverse
+        device = next(ren.parameters()).device
+        level = self.preparation.tail_level
+        self.correction = UNetCorrection(ren, before, after, level).to(device)
+        self.iren = InverseUNet(inverse, iren, before, after)
+
+    def __call__(self, sim: Tensor, data: Tensor, rows: Tensor, outside: Outside) -> Compared:
+        """Translate a batch of each side, shapes (batch, 1, samples), and back."""
+        fake, start = outside.dress(self.records(sim[:, 0]), rows)
+        cycled_sim, began = self.iren.located(fake[:, 0])
+        wanted_sim = self._moved(sim[:, 0], start + began)
+        fake_sim, first = self.iren.located(data[:, 0])
+        data_near = stretch(data[:, 0], first, 0, self.length)
+        sim_near = self._moved(sim[:, 0], self._near(sim[:, 0]) + ROOM_BEFORE)
+        return Compared(
+            identity_data=(data_near + self.correction.added(data_near), data_near),
+            identity_sim=(self.iren.unet(sim_near[:, None])[:, 0], sim_near),
+            cycle_forward=(cycled_sim, wanted_sim),
+            cycle_backward=(self._back(fake_sim, data_near), data_near),
+            judged_data=Judged(self.data_view(data), self.data_view(fake)),
+            judged_sim=Judged(self.sim_view(sim_near), self.sim_view(fake_sim)),
+            tolerance=tolerance(data, self.preparation)[:, 0],
+        )
+
+    @property
+    def length(self) -> int:
+        """Samples that the U-Nets see."""
+        return self.matching.before + self.matching.after
+
+    def records(self, sim: Tensor) -> Tensor:
+        """Noise-free records of simulated windows, shape (batch, samples)."""
+        records: Tensor = self.correction(self._by_chain(sim))
+        return records
+
+    def pairs(self, sim: Tensor, rows: Tensor, outside: Outside) -> tuple[Tensor, Tensor]:
+        """What IREN makes of translated pulses, and what it should."""
+        fake, start = outside.dress(self._by_chain(sim[:, 0]), rows)
+        pulses, began = self.iren.located(fake[:, 0])
+        return pulses, self._moved(sim[:, 0], start + began)
+
+    def data_view(self, windows: Tensor) -> Tensor:
+        """Measured or translated windows, (batch, 1, samples), as the judge sees them."""
+        level = float(self.inverse.half_height)
+        last, tail = self.preparation.samples_before + 1, self.preparation.tail_level
+        return at_half_maximum(windows[:, 0], level, last, self.matching, tail)[0][:, None]
+
+    def sim_view(self, near: Tensor) -> Tensor:
+        """Charge about its half maximum, (batch, samples), as the judge sees it."""
+        last = self.matching.before + LATEST
+        return at_half_maximum(near, 0.5, last, self.matching, 1.0)[0][:, None]
+
+    @torch.no_grad()
+    def _by_chain(self, sim: Tensor) -> Tensor:
+        return of_height(self.chain.response(sim), self.preparation.tail_level)
+
+    def _moved(self, sim: Tensor, sample: Tensor) -> Tensor:
+        """Simulated pulses from a sample of their records on."""
+        return stretch(sim, sample - ROOM_BEFORE, 0, self.length)
+
+    def _near(self, sim: Tensor) -> Tensor:
+        highest, at = sim.max(dim=1, keepdim=True)
+        return half_sample(sim, highest, at) - self.matching.before
+
+    def _back(self, pulses: Tensor, data_near: Tensor) -> Tensor:
+        """What the chain and REN make of charge, beside the measured pulse it came from."""
+        records: Tensor = self.correction(
+            of_height(self.chain.response(pulses), self.preparation.tail_level)
+        )
+        near = records[:, ROOM_BEFORE : ROOM_BEFORE + self.length]
+        level = near[:, -TAIL:].mean(dim=1, keepdim=True).clamp_min(LEAST_SCALE)
+        return near * (data_near[:, -TAIL:].mean(dim=1, keepdim=True) / level)

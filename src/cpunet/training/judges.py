@@ -1,0 +1,42 @@
+"""Whether a judge has won or lost: then it teaches a generator nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cpunet.training.loop import Record
+
+LAST = 0.25  # of the updates, over which accuracies are averaged
+FEWEST = 20  # updates
+WON, LOST = 0.95, 0.52
+
+
+def judges_noted(records: Sequence[Record]) -> list[str]:
+    """A line for each judge that has won or lost in the last part of a training.
+
+    Parameters
+    ----------
+    records
+        Of the whole training, with the judges' accuracies where they were updated.
+    """
+    told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
+    last = told[-max(1, round(LAST * len(told))) :]
+    if len(last) < FEWEST:
+        return []
+    lines = []
+    for side in last[0]:
+        mean = float(np.mean([accuracy[side] for accuracy in last]))
+        if mean > WON:
+            lines.append(
+                f"the judge of {side} has won: it is right {100 * mean:.0f} % of the time, so "
+                "translations are still told at sight; train longer or lower "
+                "training.rate_discriminators"
+            )
+        elif mean < LOST:
+            lines.append(
+                f"the judge of {side} has lost: it is right {100 * mean:.0f} % of the time, so "
+                "it finds nothing to teach; see the scores whether there is nothing left"
+            )
+    return lines

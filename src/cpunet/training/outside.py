@@ -1,0 +1,124 @@
+"""What lies outside the generators: noise, and the preparation that noisy pulses go through.
+
+A generator makes a pulse without noise.  What a judge sees of it is what a score will: noise
+drawn from the data's own baselines is added, and the noisy record is prepared as measured
+traces are, so that alignment, baseline and scale suffer from noise as those of the data do.
+Where the window is cut is found without gradients; baseline and scale have theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.extension import ROOM_BEFORE, with_room
+from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.response import ROOM_AFTER as RESPONSE_ROOM
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
+from cpunet.recipes.schema import PreparationConfig
+
+LEAST_SCALE = 1e-3
+PLATEAU = 100  # samples after the window whose mean gives the height of a record
+TOLERATED = 3.0  # standard deviations of a pulse's own baseline that no cycle is asked for
+
+
+class Dressed(NamedTuple):
+    """Noisy pulses, prepared.
+
+    Parameters
+    ----------
+    windows
+        Shape (batch, 1, samples).
+    start
+        Sample of its record at which each window begins, shape (batch,).
+    """
+
+    windows: Tensor
+    start: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Outside:
+    """Noise and preparation for the translations of a set of simulated pulses.
+
+    Parameters
+    ----------
+    noise
+        Of the data's baselines.
+    energy_kev
+        Of the simulated pulses, shape (n,): noise goes as its inverse.
+    preparation
+        Of the data.
+    """
+
+    noise: TraceNoise
+    energy_kev: npt.NDArray[np.float64]
+    preparation: PreparationConfig
+
+    def dress(self, records: Tensor, rows: Tensor) -> Dressed:
+        """Add noise to records of prepared height, and prepare them.
+
+        Parameters
+        ----------
+        records
+            Without noise, with room about the window, shape (batch, samples).
+        rows
+            Which of the simulated pulses they are.
+        """
+        # torch's random numbers are part of a checkpoint
+        rng = np.random.default_rng(int(torch.randint(2**62, ())))
+        energies = self.energy_kev[rows.cpu().numpy()]
+        drawn = self.noise.draw(energies, records.shape[1], rng)
+        noisy = records + torch.from_numpy(drawn).to(records)
+        return as_measured(noisy, self.preparation, self.noise.dt_ns)
+
+    def dress_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
+        """The same for windows as a network makes them, shape (batch, 1, samples)."""
+        room = with_room(
+            windows[:, 0].detach().cpu().numpy(), self.preparation, self.noise.dt_ns
+        )
+        records = torch.from_numpy(room).to(windows)
+        inside = torch.arange(windows.shape[2], device=windows.device) + ROOM_BEFORE
+        records = records.index_copy(1, inside, windows[:, 0])
+        return self.dress(records, rows).windows
+
+
+def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dressed:
+    """Prepare records as measured traces, with gradients for all but the alignment.
+
+    A record that cannot be prepared, as a network may make it at first, is cut where it lies.
+    """
+    raw = Pulses.of(records.detach().cpu().numpy(), dt_ns=dt_ns)
+    prepared = prepare(
+        raw, config.model_copy(update={"saturation_run": raw.length}), "measured"
+    )
+    align = np.full(len(records), ROOM_BEFORE + config.samples_before)
+    align[prepared.index] = prepared.align_sample
+    start = torch.from_numpy(align - config.samples_before).to(records.device)
+    windows = stretch(records, start, 0, config.length)
+    windows = windows - windows[:, : config.baseline_samples].mean(dim=1, keepdim=True)
+    level = windows[:, -config.tail_samples :].mean(dim=1, keepdim=True)
+    scale = (level / config.tail_level).clamp_min(LEAST_SCALE)
+    return Dressed((windows / scale)[:, None], start)
+
+
+def tolerance(data: Tensor, config: PreparationConfig) -> Tensor:
+    """How much of each measured pulse is noise, shape (batch, 1, 1).
+
+    A cycle that begins at a measured pulse cannot end with its noise, which no generator is to
+    make: what is within this of the pulse is as good as the pulse.
+    """
+    return TOLERATED * data[..., : config.baseline_samples].std(dim=-1, keepdim=True)
+
+
+def of_height(records: Tensor, tail_level: float) -> Tensor:
+    """Scale records of windows so that their first samples after the window have a level."""
+    plateau = records[:, -RESPONSE_ROOM : PLATEAU - RESPONSE_ROOM].mean(dim=1, keepdim=True)
+    return records * (tail_level / plateau.clamp_min(LEAST_SCALE))

@@ -1,0 +1,95 @@
+"""Supervised steps: networks learn what a matched chain makes of simulated pulses.
+
+A matched chain makes as many pairs as wanted: charge, and what is measured of it without noise
+and with.  REN learns the former, IREN the way back from the latter.  A REN that stands behind
+the chain has nothing to learn from it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import LambdaLR
+
+from cpunet.errors import CpunetError
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes.schema import Recipe
+from cpunet.training.chain_step import ChainStep
+from cpunet.training.cyclegan import CycleGan
+from cpunet.training.losses import weighted_l1, window_weights
+from cpunet.training.outside import Outside, as_measured, of_height
+from cpunet.training.sampling import Deck
+from cpunet.training.surroundings import Surroundings
+
+
+def learn_pairs(
+    model: CycleGan,
+    deck: Deck,
+    recipe: Recipe,
+    surroundings: Surroundings,
+    behind: ChainStep | None,
+) -> None:
+    """Train the generators on pairs, if there is anything that makes some.
+
+    Parameters
+    ----------
+    model
+        Its generators learn; all else is left as it is.
+    deck
+        Of simulated pulses.
+    recipe
+        Its ``training.pairs`` say how long and how fast.
+    surroundings
+        Noise, and a teacher if there is one.
+    behind
+        The passes behind a chain, if there is one.
+
+    Raises
+    ------
+    CpunetError
+        If a loss is no number.
+    """
+    outside, teacher = surroundings.outside, surroundings.teacher
+    if (behind is None or outside is None) and teacher is None:
+        return
+    config = recipe.cyclegan.training
+    weights = window_weights(config.losses).to(deck.pulses.device)
+    learning = model.generator_parameters() if behind is None else [*model.iren.parameters()]
+    optimiser = AdamW(learning, lr=config.pairs.rate, weight_decay=config.weight_decay)
+    schedule = LambdaLR(optimiser, lambda done: 1 - done / config.pairs.iterations)
+    for iteration in range(config.pairs.iterations):
+        sim = deck.deal()
+        if behind is not None and outside is not None:
+            loss = weighted_l1(*behind.pairs(sim, deck.dealt, outside), weights)
+        else:
+            assert teacher is not None
+            loss = _of_teacher(model, sim, deck.dealt, *teacher, weights)
+        if not bool(torch.isfinite(loss)):
+            raise CpunetError(
+                f"pairs: a loss is {float(loss)} in iteration {iteration}; lower "
+                "training.pairs.rate"
+            )
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(learning, config.max_grad_norm)
+        optimiser.step()
+        schedule.step()
+
+
+def _of_teacher(
+    model: CycleGan,
+    sim: Tensor,
+    rows: Tensor,
+    teacher: ResponseGenerator,
+    outside: Outside,
+    weights: Tensor,
+) -> Tensor:
+    """Loss of both generators on pairs of a batch."""
+    config = outside.preparation
+    with torch.no_grad():
+        records = of_height(teacher(sim[:, 0]), config.tail_level)
+        clean = as_measured(records, config, outside.noise.dt_ns).windows
+        noisy = outside.dress(records, rows).windows
+    to_data = weighted_l1(model.ren(sim), clean, weights)
+    return to_data + weighted_l1(model.iren(noisy), sim, weights)

@@ -1,0 +1,39 @@
+"""What a CycleGAN is given beside its pulses: noise, a matched chain, a teacher."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.training.outside import Outside
+
+
+class MatchedChain(NamedTuple):
+    """A readout chain with its noise, and its inverse."""
+
+    generator: ResponseGenerator
+    inverse: LinearInverse
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Beside the pulses.
+
+    Parameters
+    ----------
+    outside
+        Noise for the translations of the simulated pulses.
+    chain
+        That the generators stand behind.
+    teacher
+        A matched chain that makes pairs for generators without one, with its noise.
+    """
+
+    outside: Outside | None = None
+    chain: MatchedChain | None = None
+    teacher: tuple[ResponseGenerator, Outside] | None = None
+
+
+NONE = Surroundings()

@@ -1,0 +1,84 @@
+"""A network with noise outside: energies scale it, and it is prepared as data are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.errors import CpunetError
+from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.recipes import load_recipe
+from cpunet.training.cyclegan import CycleGan
+from cpunet.training.outside import Outside
+from cpunet.training.run_folder import write_run
+from cpunet.training.surroundings import Surroundings
+from cpunet.translation.translator import IREN, REN
+
+RECIPE = load_recipe("paper-noise", ["generator.width=2", "generator.residual=true"])
+DT_NS, RMS_KEV = 16.0, 6.0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A residual network that was not trained: it leaves a pulse as it is, but for a level."""
+    noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), 2 * (NOISE_BINS - 1), DT_NS, 100)
+    outside = Outside(TraceNoise(noise), np.ones(1), RECIPE.preparation)
+    torch.manual_seed(0)
+    model = CycleGan(RECIPE, Surroundings(outside))
+    decay = np.exp(-np.clip(np.arange(800) - 400, 0, None) / 1800)
+    model.ren.skip.set(torch.from_numpy(decay).float(), 0)
+    folder = tmp_path_factory.mktemp("run")
+    info = {"recipe": "paper-noise", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
+    write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sim() -> FloatArray:
+    width = np.linspace(1.5, 5, 60)[:, np.newaxis]
+    pulses = 1 / (1 + np.exp(-(np.arange(225) - 80) / width))
+    raw = Pulses.of(pulses, dt_ns=DT_NS)
+    return prepare(raw, RECIPE.preparation, "simulated").pulses.waveforms
+
+
+def test_noise_goes_as_one_over_the_energy(run, sim):
+    ren = REN.load(run)
+    for kev in (1000.0, 3000.0):
+        found = ren.translate(sim, energy_kev=kev, seed=1)
+        assert float(found[:, :200].std()) == pytest.approx(RMS_KEV / kev, rel=0.05)
+        # and they are prepared: a second preparation finds nothing to do
+        again = prepare(Pulses.of(found, dt_ns=DT_NS), RECIPE.preparation, "measured")
+        assert len(again) == len(found)
+        np.testing.assert_allclose(again.pulses.waveforms, found, atol=2e-6)
+
+
+def test_noise_is_of_the_seed_and_may_be_left_out(run, sim):
+    ren = REN.load(run)
+    one, same, other = (ren.translate(sim, energy_kev=2000.0, seed=s) for s in (1, 1, 2))
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+    clean = ren.translate(sim, noise=False)
+    assert not clean[:, :200].any()
+    assert np.array_equal(clean, ren.translate(sim, noise=False))
+
+
+def test_pulses_without_an_energy_get_no_noise_and_a_code(run, sim):
+    ren = REN.load(run)
+    with pytest.raises(CpunetError, match="scaled by 1/energy; give energy_kev"):
+        ren.translate(sim)
+    energies = np.full(len(sim), 2000.0)
+    energies[3] = np.nan
+    done = ren.translate_pulses(Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
+    assert done.codes[3] == Rejection.ENERGY_UNKNOWN
+    assert done.valid.sum() == len(sim) - 1
+
+
+def test_the_way_back_has_no_noise(run):
+    assert not IREN.load(run).needs_energies
