@@ -170,3 +170,24 @@ def test_the_measured_spectrum_suggests_its_calibration(reference_data):
     assert "Th-228" in told["amplitudes"]
     # as found from its lines by hand
     assert float(told["amplitudes"].split()[-1]) == pytest.approx(0.06493, rel=0.01)
+
+
+def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "hits.npz"
+    place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
+    np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
+    told = describe(path, peaks=load_recipe("fast").peaks)["detectors"][""]
+    assert (told["events"], told["hits"]) == (2, 3)
+    assert told["energy_kev"] == [50.0, 2614.5]
+    assert told["r_mm"] == [0.0, 5.0]
+    assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
+    csv = tmp_path / "hits.csv"
+    names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
+    csv.write_text(
+        f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,2,3,4,5\n"
+    )
+    for file, said in ((path, "z_mm        10 … 30"), (csv, "names no unit")):
+        monkeypatch.setattr("sys.argv", ["cpunet", "info", str(file)])
+        with pytest.raises(SystemExit):
+            main()
+        assert said in capsys.readouterr().out

@@ -40,6 +40,8 @@ def info(
 ) -> None:
     """Say what is in a file or run: events, sampling, energies, peaks, provenance.
 
+    Files of hits are described, too: events, energies and where they lie.
+
     Of measured traces it says what earlier pulses have left under them, and the rate of
     pulses that follows.
 
@@ -71,6 +73,10 @@ def info(
         print_table(_tables(told))
         out.print("one of them: --table NAME", highlight=False)
         return
+    if told["kind"] == "hits":
+        told |= told.pop("detectors")
+        if "" in told:
+            told |= {"hits": told.pop("")} if isinstance(told[""], str) else told.pop("")
     width = max(len(name) for name, _ in _lines(told))
     for name, value in _lines(told):
         out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)

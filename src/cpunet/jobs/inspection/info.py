@@ -12,6 +12,7 @@ import numpy as np
 import cpunet
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
+from cpunet.jobs.inspection.hits_info import describe_hits
 from cpunet.outputs import refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
@@ -24,6 +25,7 @@ from cpunet.pulses.spectrum import Values, suggested_calibration
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, PreparationConfig
 from cpunet.regular_files import read_text
+from cpunet.simulation.hit_readers import holds_hits
 from cpunet.yaml_files import MOST_BYTES, plain_json
 
 _RUN_FILE = "run.json"
@@ -66,6 +68,7 @@ def describe(
     -------
     dict
         For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``.
+        For a file of hits, what `describe_hits` gives.
         For a file with several tables of which none was chosen, ``kind`` (``"tables"``),
         ``path`` and ``tables``: by name what `PulseSource.describe` gives, or
         why it cannot be read.
@@ -95,6 +98,8 @@ def describe(
     path = Path(path)
     if path.is_dir():
         return {"kind": "run", "path": str(path), **_run(path)}
+    if holds_hits(path) and without_remains is None:
+        return describe_hits(path, table, peaks or {})
     tables = tables_of(path) if table is None else []
     if len(tables) > 1 and without_remains is None:
         return {"kind": "tables", "path": str(path), "tables": _told_of(path, tables, dt_ns)}

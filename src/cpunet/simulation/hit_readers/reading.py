@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 
+from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.regular_files import require_file
@@ -14,7 +15,7 @@ from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
 from cpunet.simulation.hit_readers.npz import read_npz
-from cpunet.simulation.hit_readers.remage import parts_of, read_remage
+from cpunet.simulation.hit_readers.remage import detectors_of, parts_of, read_remage
 from cpunet.simulation.hit_readers.steps import (
     ReadHits,
     Steps,
@@ -27,6 +28,7 @@ from cpunet.simulation.hits import Hits
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
+_CSV_MAGIC = b"#class tools::wcsv::ntuple"
 _AS_IN_THE_FILE = Transform()
 
 
@@ -110,6 +112,30 @@ def hit_parts(
     return read
 
 
+def holds_hits(path: Path | str) -> bool:
+    """Whether a file is one of hits, and not of pulses.
+
+    Files of simulated pulses that also hold their hits are files of pulses.
+    """
+    file = Path(path)
+    try:
+        with require_file(file).open("rb") as stream:
+            start = stream.read(len(_CSV_MAGIC))
+    except OSError:
+        return False  # which the reader tells
+    if start.startswith(_HDF5_MAGIC):
+        with opened(file) as content:
+            return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
+    if start.startswith(_ZIP_MAGIC):
+        return {"x_mm", "offsets"} <= set(npz_files.keys(file))
+    return start == _CSV_MAGIC
+
+
+def hit_detectors(path: Path | str) -> list[str]:
+    """Names of the detectors of a remage file; of other formats, nothing."""
+    return detectors_of(Path(path)) if _is_remage(Path(path)) else []
+
+
 def _is_remage(path: Path) -> bool:
     try:
         with require_file(path).open("rb") as stream:
@@ -134,7 +160,7 @@ def _steps(path: Path, detector: str | None, units: Units) -> Steps:
     if start.startswith(_ZIP_MAGIC):
         _without_detectors(path, detector)
         return read_npz(path)
-    if start.startswith(b"#class tools::wcsv::ntuple"):
+    if start.startswith(_CSV_MAGIC):
         return read_csv(path, detector, units)
     raise CpunetError(
         f"{path}: no known format of hits; expected remage LH5, g4simple HDF5, "

@@ -66,13 +66,18 @@ def parts_of(path: Path, detector: str | None, size: int = ROWS) -> list[slice] 
     return [slice(a, b) for a, b in pairwise(cuts)]
 
 
-def _detector(path: Path, detector: str | None) -> str:
+def detectors_of(path: Path) -> list[str]:
+    """Names of the tables of steps."""
     with opened(path) as file:
-        there = [
+        return [
             str(name)
             for name, table in file["stp"].items()
             if isinstance(table, h5py.Group) and all(c in table for c in ("edep", *_AXES))
         ]
+
+
+def _detector(path: Path, detector: str | None) -> str:
+    there = detectors_of(path)
     names = ", ".join(there)
     if detector is None:
         if len(there) != 1:
