@@ -1,6 +1,6 @@
 """cpunet: make simulated germanium-detector pulses look measured.
 
-The package is a row of rooms through which data flow one way:
+Data flow in one direction through its subpackages:
 ``pulses`` (containers, files, preparation) → ``networks`` → ``training`` →
 ``translation`` → ``analysis`` → ``jobs`` → ``cli``.  See ``docs/design.md``.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in __all__ and (clash := other_package()):
         warnings.warn(clash, stacklevel=2)
-    # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
+    # torch takes seconds to import; `import cpunet` and `cpunet --help` do not need it
     if name in ("REN", "IREN"):
         from cpunet.translation import translator
 
