@@ -1,11 +1,12 @@
-"""Compiled loops, kept on disk: compiled again when code that they use changes, and then only.
+"""On-disk cache of compiled loops, invalidated only when code that they use changes.
 
-numba's own cache looks at the file of a function alone, so that a function goes on with old
-code of what it calls in other files; and of two processes that compile at once, as the first
-jobs after an installation do, one may be given the other's code.  Neither happens here.
-Where the code is kept is numba's choice: beside the package, or in ``NUMBA_CACHE_DIR``; but
-never where others can write, since whoever chooses the code that is run can do anything.  Then
-it is kept in the user's own cache.  What is damaged is compiled again.
+numba's own cache checks only the file of a function, so the function keeps old code of
+functions that it calls in other files.  Moreover, if two processes compile at once, as the
+first jobs after an installation do, one can load the other's code.  Neither happens here.
+
+numba chooses the folder: beside the package, or ``NUMBA_CACHE_DIR``.  A folder to which others
+can write is never used, since it would let them execute any code; then the user's own cache
+is used.  Damaged files are compiled again.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ import yaml
 
 from cpunet.errors import CpunetError
 
-MOST_BYTES = 10_000_000  # of a text of settings
+MOST_BYTES = 10_000_000  # of a settings file
 _MOST_DEPTH = 50
-_MOST_VALUES = 200_000  # references counted as often as they are made
-_MOST_NUMBER = 10**60  # beyond, no whole number means anything here
+_MOST_VALUES = 200_000  # every reference counts
+_MOST_NUMBER = 10**60  # larger integers are meaningless here
 
 
 def yaml_names(folder: Traversable) -> list[str]:

@@ -35,10 +35,10 @@ def ae_against_drift_time(
     Parameters
     ----------
     amplitude, drift_time
-        By method, those of the measured pulses under ``"data"``; equally long, in pulse heights
-        per sample and in ns.
+        A/E in pulse heights per sample and drift times in ns, by method, of equal length; those
+        of the measured pulses are under ``"data"``.
     bins
-        Of equally many measured pulses each.
+        Number of bins, with equal numbers of measured pulses.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def ae_against_drift_time(
     Raises
     ------
     CpunetError
-        If the data have no event, or the arrays of a method do not fit each other.
+        If the data have no event, or the arrays of a method differ in length.
     """
     known = {
         method: _finite_pairs(method, values, drift_time[method])
@@ -95,11 +95,11 @@ def two_dimensional(
     Parameters
     ----------
     amplitude, drift_time
-        By method, see `ae_against_drift_time`.
+        A/E and drift times by method, see `ae_against_drift_time`.
     max_bins
-        The most bins of an axis.
+        Maximum number of bins of an axis.
     bootstraps, seed
-        Of the ceiling and of the errors.
+        Number and seed of the bootstraps for the ceiling and the errors.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Templates of a pulse-shape library, translated without noise and left in their place in time.
+"""Translate the templates of a pulse-shape library without noise or time shifts.
 
-A template is the charge pulse of one place in the detector; whoever uses the library adds
-templates up, weighted with energies.  So nothing may be aligned or normalised on the way,
-as `Translator.translate` does: a readout chain acts on the template as it stands.
+A template is the charge pulse of one position in the detector.  Users of the library sum
+templates weighted by energy.  Templates must therefore not be aligned or normalised, unlike in
+`Translator.translate`: a readout chain acts directly on the template.
 """
 
 from __future__ import annotations
