@@ -153,6 +153,16 @@ def null_distances(data: Values, draws: Draws) -> NullDistances:
     -------
     NullDistances
         NaN if the data have no finite values or a dataset is empty.
+
+    Examples
+    --------
+    Equal values have no distance:
+
+    >>> import numpy as np
+    >>> from cpunet.analysis.resampling import resampled_twice
+    >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
+    >>> null_distances(np.ones(50), draws).wasserstein
+    0.0
     """
     finite = _finite(data)
     if not (finite.size and all(d.size for d in draws)):
