@@ -6,7 +6,7 @@ part of the noise is absent, since the preparation subtracts the mean of the bas
 
 A window is placed by the end of the rise, so a slow pulse can begin within the recipe's
 baseline; a few such edges would outweigh all noise.  The compared stretch therefore ends
-well before 90 % of the measured pulses begin, and the others are left out.
+well before the start of nine out of ten measured pulses, and the others are left out.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 _LOOKED_AT = 256  # pulses
 _FEWEST_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
 _FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
-_TURNS = 3  # turning points of the baseline: noise has more, a charge signal does not
+_TURNS = 3  # turning points of the baseline: noise has at least these, a charge signal fewer
 _SMALL = 1e-5  # of the height: rounding of a flat line
 _LEAST_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 

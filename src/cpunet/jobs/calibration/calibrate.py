@@ -106,7 +106,7 @@ class Calibration:
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
-        """What is read."""
+        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return (*self.start.files, *self.data.files)
 
     def run(

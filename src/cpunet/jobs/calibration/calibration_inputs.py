@@ -116,7 +116,7 @@ class Start:
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
-        """What is read."""
+        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return (*(self.sim.files if self.sim else ()), self.hits.path if self.hits else None)
 
 

@@ -20,7 +20,7 @@ from cpunet.jobs.validation.scoring import ByMethod
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150
-# of the two-dimensional comparison, what tables show: counts are for the figure
+# entries of the two-dimensional comparison in tables; counts are only for the figure
 _TWO_DIMENSIONAL = ("iou", "iou_std", "missing")
 
 
