@@ -81,7 +81,7 @@ class Residual:
 
     @property
     def z(self) -> Values:
-        """Pull: the difference divided by its error; NaN where there is no error."""
+        r"""Pull :math:`z = (\bar{x} - \bar{x}_{\mathrm{data}}) / \sigma`; NaN without error."""
         known = self.error > 0
         return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
 

@@ -247,10 +247,12 @@ def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
 
 
 def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Values:
-    """Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
+    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
 
-    The step rises at the time `starts` (NaN for no value).  The area ends at the sample
-    `stops`, whose value is the height of the step.
+    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
+
+    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
+    `stops`, with straight lines between samples.
     """
     areas = np.empty(len(waveforms))
     _missing_areas(waveforms, starts, stops, areas)
@@ -260,11 +262,14 @@ def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Value
 def corrected_shapes(
     waveforms: FloatArray, rates: Values, plateau: int, fraction: float
 ) -> tuple[Values, Values]:
-    """Overshoot (a fraction) and late charge (in samples) after pole-zero correction.
+    r"""Overshoot (a fraction) and late charge (in samples) after pole-zero correction.
 
-    Pulses ``(n, length)`` decay with `rates` per sample (NaN for no value).  Their height is
-    the mean of the last `plateau` samples; charge that arrives after `fraction` of it is
-    late.
+    .. math:: \frac{\max_t x(t)}{P} - 1, \qquad \frac{1}{P} \int_{t_f} [P - x(t)] \, dt
+
+    of the corrected pulse :math:`x` with the plateau :math:`P`, the mean of the last `plateau`
+    samples.  The maximum is taken before the plateau, and charge that arrives after
+    :math:`x(t_f) = f P` is late.  Pulses ``(n, length)`` decay with `rates` per sample (NaN for
+    no value).
     """
     overshoots, late = np.empty(len(waveforms)), np.empty(len(waveforms))
     _corrected_shapes(waveforms, rates, plateau, fraction, overshoots, late)
