@@ -1,6 +1,6 @@
 """cpunet: make simulated germanium-detector pulses look measured.
 
-The package is a row of rooms through which data flow one way:
+Data flow in one direction through its subpackages:
 ``pulses`` (containers, files, preparation) → ``networks`` → ``training`` →
 ``translation`` → ``analysis`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
 """

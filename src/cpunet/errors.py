@@ -1,11 +1,11 @@
-"""The one exception a user should ever see: a single line that says what to do."""
+"""The only exception that users see: one line that says what to do."""
 
 from __future__ import annotations
 
 
 class CpunetError(Exception):
-    """Bad input, named in one line: which file, which event, what to do.
+    """Bad input, described in one line: which file, which event, what to do.
 
-    The command line prints the message and exits with status 2; everything
-    else that escapes is a bug and keeps its traceback.
+    The command line prints the message and exits with status 2.  Any other exception is a
+    bug and keeps its traceback.
     """

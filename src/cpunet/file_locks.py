@@ -1,7 +1,7 @@
-"""One process at a time: files that are locked by the system.
+"""File locks of the operating system, for one process at a time.
 
-The system takes a lock back however its process ends, so that none is left behind that
-counts.  On file systems without locks nobody is kept out.
+The system releases a lock however its process ends, so no stale lock remains.  File systems
+without locks do not exclude anyone.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def lock(handle: int, busy: str) -> bool:
     handle
         File descriptor.
     busy
-        What is said if another process holds the lock.
+        Error message if another process holds the lock.
 
     Raises
     ------
     CpunetError
-        If another process holds it.
+        If another process holds the lock.
     """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -40,7 +40,7 @@ def lock(handle: int, busy: str) -> bool:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Hold the lock of a file, which is made if it is missing, for the block; see `lock`."""
+    """Context manager that holds the lock of a file, created if missing; see `lock`."""
     with path.open("a") as stream:
         lock(stream.fileno(), busy)
         yield

@@ -1,9 +1,8 @@
-"""Whether the libraries of HDF5 and FlashCam survive a file.
+"""Check that the libraries of HDF5 and FlashCam can read a file.
 
-On damaged files they may run for ever or crash, and neither can be caught in the process that
-it happens in.  So another one, forked for it, looks through the file first, with little
-processor time and memory: the structure of HDF5, without samples, and the first records of
-FlashCam.
+On damaged files they can hang or crash, and neither can be handled in the same process.  A
+forked process therefore scans the file first, with limits on processor time and memory: the
+structure of HDF5 files without samples, and the first records of FlashCam files.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from cpunet.errors import CpunetError
 Kind = Literal["HDF5", "FlashCam"]
 
 MOST_CPU_S = 5
-# The other process may wait for ever for what a thread of this one held as it was forked.
+# The forked process can deadlock on a lock that a thread of this one held at the fork.
 MOST_WAIT_S = 60.0
 _FAILS = "fails"
 MOST_BYTES = 1 << 30
@@ -35,11 +34,11 @@ _MOST_OBJECTS = 20_000
 
 
 def require_survivable(path: Path, kind: Kind = "HDF5") -> None:
-    """Raise a `CpunetError` if whoever looks through a file would hang or crash.
+    """Raise a `CpunetError` if reading a file would hang or crash.
 
-    A file is looked through once, and again if it changes.
+    A file is scanned once, and again if it changes.
     """
-    if sys.platform != "linux":  # elsewhere a fork is not safe beside other libraries
+    if sys.platform != "linux":  # on other systems a fork is unsafe with other libraries
         return
     try:
         facts = path.stat()
@@ -58,16 +57,16 @@ def require_survivable(path: Path, kind: Kind = "HDF5") -> None:
 def _fate(path: str, kind: Kind, _facts: tuple[int, ...]) -> str:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of threads: the child uses none of their locks
+            warnings.simplefilter("ignore")  # about threads: the child uses none of their locks
             pid = os.fork()
-    except OSError:  # no memory or processes to spare
+    except OSError:  # out of memory or processes
         return ""
     if pid == 0:
         _look_through_and_exit(path, kind)
     _, status = os.waitpid(pid, 0)
     if not os.WIFSIGNALED(status):
         return "" if os.waitstatus_to_exitcode(status) == 0 else _FAILS
-    if os.WTERMSIG(status) == signal.SIGALRM:  # nothing was learned of the file
+    if os.WTERMSIG(status) == signal.SIGALRM:  # timed out without a result for the file
         return ""
     hung = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
     return "runs for ever" if hung else "crashes"
@@ -75,7 +74,7 @@ def _fate(path: str, kind: Kind, _facts: tuple[int, ...]) -> str:
 
 def _look_through_and_exit(path: str, kind: Kind) -> None:
     """In the child: end by itself, or by a signal."""
-    # of FlashCam, what fails for want of memory here would take all there is in the reader
+    # a FlashCam file that fails here for lack of memory would exhaust it in the reader
     ended = 0 if kind == "HDF5" else 1
     try:
         faulthandler.disable()
@@ -94,7 +93,7 @@ def _look_through_and_exit(path: str, kind: Kind) -> None:
             _look_at_records(path)
             ended = 0
     finally:
-        # whatever was raised, the reader meets it too, and can tell
+        # the reader meets the same exception and reports it
         os._exit(ended)
 
 
@@ -123,7 +122,7 @@ def _look_through(file: h5py.File) -> None:
 
 def _look_at_records(path: str) -> None:
     sink = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)  # where the library complains
+    os.dup2(sink, 2)  # silences the messages of the library
     from fcio import fcio_open
 
     stream = fcio_open(path)

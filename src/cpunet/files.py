@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all: written aside, then moved into place."""
+"""Atomic outputs: written to a temporary path, then moved into place."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from cpunet.outputs import (
 
 @contextmanager
 def written_aside(target: Path) -> Iterator[Path]:
-    """Give a temporary file name beside `target`; move it there if all went well.
+    """Yield a temporary file name beside `target`; on success, move the file to `target`.
 
-    On an exception the temporary file is removed and `target` is as it was.
+    On an exception the temporary file is removed and `target` is unchanged.
 
     Raises
     ------
     CpunetError
-        If the folder of `target` cannot be written to.
+        If the folder of `target` is not writable.
     """
     target = Path(target)
     try:
@@ -55,9 +55,9 @@ def written_aside(target: Path) -> Iterator[Path]:
 
 
 def remove_partial(target: Path) -> None:
-    """Remove what killed processes have left of `target`; no other may be writing it now."""
+    """Remove temporary files of killed processes; no process may be writing `target` now."""
     for left in target.parent.glob(f".{glob.escape(target.stem)}-*.partial{target.suffix}"):
-        # the random part has no hyphen, a longer name of another file has
+        # the random part has no hyphen, unlike a longer name of another file
         if "-" not in left.name.removeprefix(f".{target.stem}-"):
             left.unlink(missing_ok=True)
 
@@ -70,26 +70,26 @@ def folder_written_aside(
     force: bool = False,
     note: Note = lambda _message: None,
 ) -> Iterator[Path]:
-    """Give a temporary folder beside `target`; move it there if all went well.
+    """Yield a temporary folder beside `target`; on success, move it to `target`.
 
     Parameters
     ----------
     target
-        The folder to make.
+        Folder to create.
     kind
-        What it is.  With `force`, only an empty folder or one of the same kind is replaced,
-        and in it only what the program wrote.
+        Kind of the folder.  With `force`, only an empty folder or one of the same kind is
+        replaced, and in it only files that the program wrote.
     inputs
-        Files and folders that are read: `target` may neither be nor hold nor lie in one.
+        Files and folders that are read; `target` must not be, contain or lie in any of them.
     force
-        Replace an existing folder.
+        Whether to replace an existing folder.
     note
-        Told of what is kept of an old folder.
+        Function called with a message about files kept from an old folder.
 
     Raises
     ------
     CpunetError
-        If `target` exists and may not be replaced, or its parent cannot be written to.
+        If `target` exists and must not be replaced, or its parent is not writable.
     """
     target = Path(target)
     refuse_existing(target, *inputs, force=force)
@@ -114,7 +114,7 @@ def folder_written_aside(
 
 
 def _take_the_place(aside: Path, target: Path) -> None:
-    """Rename `aside` to `target`; an old folder is removed only once that is done."""
+    """Rename `aside` to `target`; an old folder is removed only afterwards."""
     if not target.exists():
         aside.replace(target)
         return

@@ -1,4 +1,4 @@
-"""HDF5 files opened for reading, with whatever their damage makes the libraries raise."""
+"""Open HDF5 files for reading, and convert library errors on damaged files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import h5py
 
-# The package brings the compression filters of LEGEND's files with it.
+# The package provides the compression filters of LEGEND's files.
 from lh5.io.exceptions import LH5DecodeError
 
 from cpunet.errors import CpunetError
@@ -27,7 +27,7 @@ _LIBRARIES = re.compile(r"(^|[/\\])(h5py|lh5|lgdo|awkward|numpy)[/\\]")
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading; library errors inside become a `CpunetError`.
 
-    File locking is off, as shared file systems of clusters often lack it.
+    File locking is off, since shared file systems of clusters often lack it.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Have what the libraries raise over a damaged file become a `CpunetError`."""
+    """Context manager that converts library errors on a damaged file to a `CpunetError`."""
     try:
         yield
     except FileNotFoundError:
@@ -58,18 +58,18 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
-    """An attribute of text, ``""`` if it is not there."""
+    """A text attribute, ``""`` if it is missing."""
     value = item.attrs.get(name, "")
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def is_column(item: object) -> bool:
-    """Whether something in a file is numbers of one dimension, or one number."""
+    """Whether an object of a file is a one-dimensional array of numbers, or one number."""
     return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
 def require_all_stored(path: Path, item: h5py.Group | h5py.Dataset) -> None:
-    """As `require_stored`, for all datasets within a group."""
+    """Like `require_stored`, for all datasets of a group."""
     if isinstance(item, h5py.Dataset):
         require_stored(path, item)
         return
@@ -80,9 +80,9 @@ def require_all_stored(path: Path, item: h5py.Group | h5py.Dataset) -> None:
 
 
 def require_stored(path: Path, dataset: h5py.Dataset) -> None:
-    """Raise a `CpunetError` if rows of a dataset are a mere claim, without values in the file.
+    """Raise a `CpunetError` if the values of a dataset's rows are not stored in the file.
 
-    Such a file of a few bytes would be read as any number of zeros.
+    A file of a few bytes could otherwise be read as any number of zeros.
     """
     n_bytes = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
     if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MOST_CHUNK_BYTES:

@@ -1,8 +1,8 @@
-"""Whether another package lies over this one.
+"""Detect another package installed over this one.
 
 The authors of CPU-Net publish their own code as ``cpunet``; this package's distribution is
-called ``cpunet-hpge`` and is imported as ``cpunet``, too.  Both write to the same folder, so
-only one of them can be installed in an environment.
+called ``cpunet-hpge`` and is also imported as ``cpunet``.  Both install into the same folder,
+so an environment can contain only one of them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
 
 @cache
 def other_package() -> str | None:
-    """Say in one line what to do if the other package is installed over this one.
+    """One-line remedy if the other package is installed over this one.
 
     Returns
     -------
     str or None
-        None if it is not installed, or lies elsewhere.
+        None if it is not installed, or in another folder.
     """
     try:
         other = distribution(OTHER)

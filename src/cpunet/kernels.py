@@ -1,11 +1,12 @@
-"""Compiled loops, kept on disk: compiled again when code that they use changes, and then only.
+"""On-disk cache of compiled loops, invalidated only when code that they use changes.
 
-numba's own cache looks at the file of a function alone, so that a function goes on with old
-code of what it calls in other files; and of two processes that compile at once, as the first
-jobs after an installation do, one may be given the other's code.  Neither happens here.
-Where the code is kept is numba's choice: beside the package, or in ``NUMBA_CACHE_DIR``; but
-never where others can write, since whoever chooses the code that is run can do anything.  Then
-it is kept in the user's own cache.  What is damaged is compiled again.
+numba's own cache checks only the file of a function, so the function keeps old code of
+functions that it calls in other files.  Moreover, if two processes compile at once, as the
+first jobs after an installation do, one can load the other's code.  Neither happens here.
+
+numba chooses the folder: beside the package, or ``NUMBA_CACHE_DIR``.  A folder to which others
+can write is never used, since it would let them execute any code; then the user's own cache
+is used.  Damaged files are compiled again.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ def kernel(**options: Any) -> Callable[[Loop], Loop]: ...
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a loop by numba's ``njit``, without the interpreter's lock, and keep its code."""
+    """Compile a loop with numba's ``njit``, releasing the GIL, and cache its code."""
     if function is None:
         return functools.partial(kernel, **options)
     if options.get("fastmath"):
-        # The compiler chooses the order of its sums.  Where it is compiled, what calls it would
-        # use its own code; where that is loaded, a copy compiled with the caller, whose last
-        # bits differ.  As a part of the caller there is but one.
+        # The compiler chooses the order of sums.  A caller would use the loop's own code where
+        # it was compiled, and a copy compiled with the caller where it was loaded from the
+        # cache; their last bits differ.  Inlined into the caller there is only one version.
         options.setdefault("forceinline", True)
     compiled = numba.njit(nogil=True, **options)(function)
     compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
@@ -57,7 +58,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 @functools.cache
 def sources(module: str) -> frozenset[Path]:
-    """Files of a module and of all that it imports at its top from its own package."""
+    """Files of a module and of all modules of its package that it imports at the top."""
     package = module.partition(".")[0]
     seen, ahead = {module}, [module]
     found = set()
@@ -73,18 +74,18 @@ def sources(module: str) -> frozenset[Path]:
 
 @functools.cache
 def digest(module: str) -> str:
-    """Digest of the sources of a module, wherever they lie."""
+    """Digest of the sources of a module, independent of their location."""
     contents = sorted(file.read_bytes() for file in sources(module))
     return hashlib.sha256(b"\0".join(contents)).hexdigest()
 
 
 def code_folder(chosen: Path) -> Path | None:
-    """The folder to keep code in, instead of the one chosen if that is not to be trusted.
+    """The cache folder: the chosen one, or a replacement if that is not trusted.
 
     Returns
     -------
     Path or None
-        None if there is no place that only the user can write to.
+        None if no folder is writable by the user alone.
     """
     if trusted(chosen):
         return chosen
@@ -102,13 +103,13 @@ def code_folder(chosen: Path) -> Path | None:
 class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
     """Files of one function: an index, and one with the code for each kind of arguments.
 
-    Code has a digest before it, and neither it nor the index is taken if it is damaged.
+    Code is preceded by a digest.  Damaged code and damaged indices are ignored.
     """
 
     def _load_index(self) -> dict[Any, str]:
         try:
             found = super()._load_index()
-        except Exception:  # whatever unpickling makes of damaged bytes
+        except Exception:  # unpickling damaged bytes can raise anything
             return {}
         return found if isinstance(found, dict) else {}
 
@@ -116,7 +117,7 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
         content = (Path(self._cache_path) / name).read_bytes()
         known, code = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
         if hashlib.sha256(code).digest() != known:
-            raise OSError("damaged")  # numba takes it as not there
+            raise OSError("damaged")  # numba treats it as missing
         return pickle.loads(code)
 
     def _save_data(self, name: str, data: Any) -> None:
@@ -125,29 +126,29 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
             stream.write(hashlib.sha256(code).digest() + code)
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep code; another process may do so at the same time.
+        """Cache code; another process may do so at the same time.
 
-        Where it cannot be kept, as on a full disk, it is compiled again the next time.
+        If that fails, as on a full disk, the code is compiled again next time.
         """
         with suppress(OSError):
             self._keep(key, data)
 
     def _keep(self, key: Any, data: Any) -> None:
-        # numba counts from 1, and two processes give different code the same name
+        # numba numbers files from 1, so two processes would give different code the same name
         name = self._data_name_pattern.format(number=uuid.uuid4().int)
-        self._save_data(name, data)  # first: what the index names is there
+        self._save_data(name, data)  # first, so that files in the index exist
         kept = self._load_index() | {key: name}
         self._save_index(kept)
-        # code of older sources, and what another process's index no longer names
+        # code of older sources, and files that another process has removed from the index
         pattern = self._data_name_pattern.format(number=0).replace(".0.", ".*.")
         for file in Path(self._cache_path).glob(pattern):
             if file.name not in kept.values():
                 with suppress(OSError):
-                    file.unlink()  # one who looks for it compiles
+                    file.unlink()  # a process that looks for it compiles
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of one function, which holds as long as its sources do."""
+    """numba's cache of one function, valid as long as its sources are unchanged."""
 
     _cache_path: str
 

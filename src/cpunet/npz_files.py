@@ -1,7 +1,7 @@
-"""NumPy files read with care: what an array says of itself is checked before it is read.
+"""Read NumPy files safely: the header of an array is checked before its values are read.
 
-A header is a claim: its shape may ask for more memory than there is, its file may be cut off,
-and a few kilobytes of an archive may unpack to gigabytes.
+A header cannot be trusted: its shape can exceed the memory, its file can be truncated, and a
+few kilobytes of an archive can unpack to gigabytes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-# What NumPy and zipfile raise on damaged files: headers are parsed as Python source, and
-# archives may claim any encryption or compression.
+# Exceptions of NumPy and zipfile on damaged files: headers are parsed as Python source, and
+# archives can declare any encryption or compression.
 DAMAGED = (
     OSError,
     ValueError,
@@ -42,14 +42,14 @@ DAMAGED = (
     zlib.error,
     lzma.LZMAError,
 )
-# No archive of pulses or hits shrinks its arrays by more: the limit of deflate itself.
+# Largest possible compression ratio, the limit of deflate.
 _MOST_SHRINKAGE = 1100
-MOST_BYTES = 1 << 31  # of an array that is read whole
+MOST_BYTES = 1 << 31  # of an array that is read at once
 
 
 @dataclass(frozen=True)
 class Header:
-    """What an array says of itself."""
+    """Header of an array."""
 
     shape: tuple[int, ...]
     by_columns: bool
@@ -57,12 +57,12 @@ class Header:
 
     @property
     def n_bytes(self) -> int:
-        """Bytes of all its values."""
+        """Size of all values in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def keys(path: Path) -> list[str]:
-    """Names of the arrays of an archive; ``[""]`` for a file of one array."""
+    """Names of the arrays of an archive; ``[""]`` for a file with one array."""
     if not zipfile.is_zipfile(path):
         return [""]
     with zipfile.ZipFile(path) as archive:
@@ -72,7 +72,7 @@ def keys(path: Path) -> list[str]:
 
 @contextmanager
 def member(path: Path, key: str) -> Iterator[IO[bytes]]:
-    """The ``.npy`` part of that name, or (``""``) the file itself."""
+    """Open the ``.npy`` member of that name, or the file itself for ``""``."""
     if not key:
         with path.open("rb") as file:
             yield file
@@ -82,12 +82,12 @@ def member(path: Path, key: str) -> Iterator[IO[bytes]]:
 
 
 def read_header(file: IO[bytes]) -> Header:
-    """The header of an array, whose values come next.
+    """Read the header of an array; its values come next in the file.
 
     Raises
     ------
     ValueError
-        If it makes no sense.
+        If the header is invalid.
     """
     read = (
         np.lib.format.read_array_header_1_0
@@ -101,12 +101,13 @@ def read_header(file: IO[bytes]) -> Header:
 
 
 def headers(path: Path) -> dict[str, Header]:
-    """The headers of all arrays of a file, whose values are known to be there.
+    """Headers of all arrays of a file, after a check that their values exist.
 
     Raises
     ------
     ValueError
-        If there are fewer values than an array says, or an archive unpacks to more than it can.
+        If an array has fewer values than its header says, or an archive declares an
+        impossible size.
     """
     found: dict[str, Header] = {}
     for key in keys(path):
@@ -121,12 +122,13 @@ def headers(path: Path) -> dict[str, Header]:
 
 
 def read_array(path: Path, key: str, header: Header) -> npt.NDArray[Any]:
-    """Read the values of an array whole.
+    """Read all values of an array.
 
     Raises
     ------
     ValueError
-        If it holds objects, is larger than `MOST_BYTES`, or is not there as it was said.
+        If the array contains objects, is larger than `MOST_BYTES`, or does not match its
+        header.
     """
     if header.dtype.hasobject:
         raise ValueError("objects instead of numbers")
@@ -138,7 +140,7 @@ def read_array(path: Path, key: str, header: Header) -> npt.NDArray[Any]:
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
-    """Read arrays of an archive whole; those that it lacks are left out.
+    """Read all values of some arrays of an archive; missing arrays are left out.
 
     Raises
     ------
@@ -150,13 +152,13 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]
 
 
 def said(error: BaseException) -> str:
-    """What one of `DAMAGED` says, in one line that is not too long."""
+    """Message of one of `DAMAGED` as one short line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else f"{text[:160]}…"
 
 
 def _size(path: Path, key: str) -> int:
-    """Bytes of a part once unpacked, as far as its archive can be believed."""
+    """Unpacked size of a member in bytes, according to its archive."""
     total = path.stat().st_size
     if not key:
         return total

@@ -1,7 +1,7 @@
-"""What an output may replace: never an input, and of a folder only what this program wrote.
+"""Rules for replacing outputs: never an input, and in a folder only what this program wrote.
 
-Every folder that is made holds `MARKER`, which names the program, the command and the files
-that it wrote.  With ``--force`` these are replaced; whatever else lies there is kept.
+Every output folder contains `MARKER`, which lists the program, the command and the files that
+it wrote.  With ``--force`` these files are replaced; all others are kept.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ Given = Path | str | None
 
 @dataclass(frozen=True)
 class FolderKind:
-    """A kind of folder that this program makes.
+    """A kind of output folder of this program.
 
     Parameters
     ----------
     name
-        Of the kind; a folder is replaced only by one of the same.
+        Name of the kind; a folder is replaced only by one of the same kind.
     command
-        That makes it.
+        Command that creates the folder.
     known_by
-        A file of every such folder, by which those without a marker are recognised.
+        Name of a file in every such folder, which identifies folders without a marker.
     own
-        Regular expression of names, relative to the folder, that are always the program's.
+        Regular expression of file names, relative to the folder, that always belong to the
+        program.
     older
-        The same of further names in folders without a list of their files.
+        Regular expression of further such names in folders without a list of their files.
     """
 
     name: str
@@ -51,15 +52,15 @@ class FolderKind:
 
 
 def refuse_inputs(out: Path, *inputs: Given) -> None:
-    """Raise a `CpunetError` if an output is, holds, or lies in something that is read.
+    """Raise a `CpunetError` if an output is, contains, or lies in an input.
 
     Parameters
     ----------
     out
-        File or folder to be written; it need not be there.
+        File or folder to be written; it need not exist.
     inputs
-        Files and folders, as a user gives them: ``FILE:table`` and patterns are understood,
-        and what is no file's name (a preset, None) is passed over.
+        Files and folders as given by the user, including ``FILE:table`` and patterns; values
+        that are not file names (a preset, None) are ignored.
     """
     place = resolved(Path(out))
     for source in (found for given in inputs for found in _named(given)):
@@ -73,12 +74,12 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
 
 
 def resolved(path: Path) -> Path:
-    """A path without links.
+    """A path with all links resolved.
 
     Raises
     ------
     CpunetError
-        If links lead in a circle.
+        If the links form a loop.
     """
     try:
         return path.resolve()
@@ -87,9 +88,9 @@ def resolved(path: Path) -> Path:
 
 
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
-    """Raise a `CpunetError` if `target` is there and `force` is off, or as `refuse_inputs`.
+    """Raise a `CpunetError` if `target` exists and `force` is off, or like `refuse_inputs`.
 
-    A link that leads nowhere is never written through, nor replaced.
+    A dangling link is neither written through nor replaced.
     """
     refuse_inputs(target, *inputs)
     if target.is_symlink() and not target.exists():
@@ -99,9 +100,9 @@ def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
 
 
 def require_replaceable(target: Path, kind: FolderKind) -> None:
-    """Raise a `CpunetError` if `target` is there, but no folder that may be replaced.
+    """Raise a `CpunetError` if `target` exists but must not be replaced.
 
-    An empty folder may be, and one of the same kind that this program made.
+    Only an empty folder, or one of the same kind made by this program, can be replaced.
     """
     if not target.exists():
         return
@@ -113,14 +114,14 @@ def require_replaceable(target: Path, kind: FolderKind) -> None:
 
 
 def made_here(folder: Path, kind: FolderKind) -> bool:
-    """Whether a folder was made by this program, and is of a kind."""
+    """Whether a folder was made by this program and is of the given kind."""
     if (folder / MARKER).is_file():
         return _marker(folder).get("kind") == kind.name
     return (folder / kind.known_by).is_file()
 
 
 def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
-    """Write into a folder who made it, and, if `listed`, that all files in it now are own."""
+    """Write the marker into a folder; if `listed`, with all present files as its own."""
     content: dict[str, object] = {
         "program": PROGRAM,
         "command": kind.command,
@@ -132,18 +133,18 @@ def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
 
 
 def keep_others(old: Path, new: Path, kind: FolderKind) -> list[str]:
-    """Put what is not the program's own in one folder into the one that will replace it.
+    """Transfer files that are not the program's own from a folder to its replacement.
 
-    It is linked, or copied where that cannot be, so that nothing is lost at any moment.  What
-    has the name of a new file gets ``.kept`` at the end.
+    They are linked, or copied where links are impossible, so that nothing is ever lost.  If
+    the name of a new file is taken, the old file gets the suffix ``.kept``.
 
     Returns
     -------
     list of str
-        Names of what is kept, relative to the folder.
+        Names of the kept files, relative to the folder.
     """
     kept = []
-    # first what keeps its name
+    # first the files that keep their names
     for path in sorted(_others(old, kind), key=lambda p: (new / p.relative_to(old)).exists()):
         place = new / path.relative_to(old)
         while os.path.lexists(place):
@@ -161,7 +162,7 @@ def keep_others(old: Path, new: Path, kind: FolderKind) -> list[str]:
 
 
 def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
-    """Copy what has a name of the program's own from one folder into another."""
+    """Copy the files with names of the program's own from one folder to another."""
     own = re.compile(kind.own)
     for path in _leaves(folder):
         if own.fullmatch(_relative(path, folder)) and path.is_file():
@@ -171,19 +172,19 @@ def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
 
 
 def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -> list[str]:
-    """Remove what the program wrote into a folder, and the folder if nothing else is in it.
+    """Remove the program's files from a folder, and the folder if nothing else is in it.
 
     Parameters
     ----------
     folder, kind
-        The folder, and what it is.
+        Folder, and its kind.
     leave
-        Names of files that are the program's own, and in use.
+        Names of the program's own files that are in use and not removed.
 
     Returns
     -------
     list of str
-        Names of what is kept, relative to the folder; then a marker is kept as well.
+        Names of the kept files, relative to the folder; if there are any, so is the marker.
     """
     folder = folder.resolve()  # a link stays
     others = list(_others(folder, kind))
@@ -205,14 +206,14 @@ def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -
 
 
 def told_kept(folder: Path, kept: list[str], note: Note) -> None:
-    """Say what of a folder was kept, if anything was."""
+    """Report the files of a folder that were kept, if any."""
     if kept:
         shown = ", ".join(kept[:5]) + (f" and {len(kept) - 5} more" if kept[5:] else "")
         note(f"{folder}: kept what cpunet did not write: {shown}")
 
 
 def _named(given: Given) -> Iterator[Path]:
-    """Existing files and folders that a word on the command line stands for."""
+    """Existing files and folders that a command-line argument refers to."""
     if given is None or str(given) == "":
         return
     path = Path(given)
@@ -226,7 +227,7 @@ def _named(given: Given) -> Iterator[Path]:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two resolved paths are one thing, also under two names of it."""
+    """Whether two resolved paths are the same file, also under different names."""
     try:
         return one == other or one.samefile(other)
     except OSError:
@@ -252,7 +253,7 @@ def _leaves(folder: Path) -> Iterator[Path]:
 
 
 def _others(folder: Path, kind: FolderKind) -> Iterator[Path]:
-    """What in a folder is not the program's own."""
+    """Paths in a folder that are not the program's own."""
     marker = _marker(folder)
     files = marker.get("files")
     listed = (

@@ -1,4 +1,4 @@
-"""Inputs are regular files: a named pipe would be waited for, a device read without end."""
+"""Require regular files as inputs: a named pipe would block, a device never end."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cpunet.errors import CpunetError
 
 
 def require_file(path: Path | str) -> Path:
-    """Return the path, unless something is there that is neither a file nor a folder.
+    """Return the path, unless it is neither a file nor a folder.
 
-    What is not there, or cannot be looked at, is left to whoever opens it.
+    Missing or inaccessible paths are left to the code that opens them.
 
     Raises
     ------
     CpunetError
-        If it is a pipe, a socket or a device.
+        If the path is a pipe, a socket or a device.
     """
     file = Path(path)
     try:
@@ -29,7 +29,7 @@ def require_file(path: Path | str) -> Path:
 
 
 def is_there(name: Path | str) -> bool:
-    """Whether there is something of a name, also of one that cannot be."""
+    """Whether a path exists; False for impossible names."""
     try:
         return Path(name).exists()
     except (OSError, ValueError):  # too long, or with a NUL
@@ -37,14 +37,14 @@ def is_there(name: Path | str) -> bool:
 
 
 def read_text(path: Path | str, most_bytes: int) -> str:
-    """Text of a file in UTF-8.
+    """Text of a UTF-8 file.
 
     Raises
     ------
     CpunetError
-        If it is no regular file, too large for what it is, or no text.
+        If the path is not a regular file, is larger than `most_bytes`, or is not text.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     file = require_file(path)
     with file.open("rb") as stream:

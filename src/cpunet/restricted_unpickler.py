@@ -1,10 +1,10 @@
-"""Pickles of arrays and plain containers, read without executing anything.
+"""Read pickles of arrays and plain containers without executing anything.
 
-A pickle is a program: it may call any function by name.  Here the names it may use are those
-by which NumPy stores arrays and numbers, and they stand for objects of this module, which
-check what they are given and build plain numeric arrays.  Any other name is refused, and so
-are the instructions that such arrays do not need; the instructions are looked through first,
-so that none of them can ask for more memory than the file is long.
+A pickle is a program that can call any function by name.  Here the only permitted names are
+those with which NumPy stores arrays and numbers.  They are mapped to objects of this module,
+which check their arguments and build plain numeric arrays.  Any other name is refused, and
+so are instructions that such arrays do not need.  The instructions are scanned first, so that
+none of them can request more memory than the length of the file.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 
-KINDS = "biuf"  # booleans, integers, floats: nothing that refers to an object
+KINDS = "biuf"  # booleans, integers, floats: no object references
 
 
-# Other ways to name or build objects.
+# Instructions that name or build objects in other ways.
 _FORBIDDEN = frozenset(
     {
         *("PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ"),
@@ -35,15 +35,15 @@ _REMEMBER = frozenset(("PUT", "BINPUT", "LONG_BINPUT"))
 
 
 class ForbiddenError(Exception):
-    """A pickle asked for something other than arrays, numbers and containers."""
+    """The pickle contains something other than arrays, numbers and containers."""
 
 
 class TruncatedError(Exception):
-    """A pickle ends before its end, or makes no sense."""
+    """The pickle is truncated or damaged."""
 
 
 class _Dtype:
-    """What a pickle builds in place of a `numpy.dtype`."""
+    """Stand-in for a `numpy.dtype` of a pickle."""
 
     __slots__ = ("dtype",)
 
@@ -60,7 +60,7 @@ class _Dtype:
 
 
 class _Array:
-    """What a pickle builds in place of a `numpy.ndarray`."""
+    """Stand-in for a `numpy.ndarray` of a pickle."""
 
     __slots__ = ("values",)
 
@@ -73,7 +73,7 @@ class _Array:
 
 
 class _Name:
-    """A name a pickle may use: it can be called, and nothing else."""
+    """A permitted name of a pickle: it can be called and nothing else."""
 
     __slots__ = ("_name",)
     _name: str
@@ -115,7 +115,7 @@ _NAMES = frozenset(
 
 
 def _numbers(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray[Any, Any]:
-    """An array of the bytes, if they are as many as the shape says."""
+    """An array of the bytes, if their number matches the shape."""
     if not isinstance(dtype, _Dtype) or not isinstance(raw, (bytes, bytearray)):
         raise ForbiddenError("an array of objects")
     if order not in ("C", "F"):
@@ -134,7 +134,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def load(stream: BinaryIO) -> Any:
-    """Read the next object of a stream: arrays, numbers, strings and containers of these.
+    """Read the next object of a stream: arrays, numbers, strings and containers of them.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def load(stream: BinaryIO) -> Any:
     ForbiddenError
         If the pickle names anything but NumPy's arrays and numbers; nothing was executed.
     TruncatedError
-        If it ends too early or is damaged.
+        If the pickle is truncated or damaged.
     """
     start = stream.tell()
     if not stream.read(1):
@@ -167,7 +167,7 @@ def _look_through(stream: BinaryIO) -> None:
     for count, (code, argument, _) in enumerate(pickletools.genops(stream)):
         if code.name in _FORBIDDEN:
             raise ForbiddenError(f"the instruction {code.name}")
-        # what is remembered is numbered one by one
+        # memo entries are numbered consecutively
         if code.name in _REMEMBER and not 0 <= int(argument or 0) <= count:
             raise TruncatedError("memory out of turn")
         if code.name == "FRAME" and int(argument or 0) > size:
@@ -175,14 +175,14 @@ def _look_through(stream: BinaryIO) -> None:
 
 
 def load_all(path: Path) -> Iterator[Any]:
-    """Yield the objects pickled one after the other in a file, one at a time.
+    """Yield the objects of a file of consecutive pickles, one at a time.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read or asks for more than arrays and plain containers.
+        If the file cannot be read or contains more than arrays and plain containers.
     TruncatedError
-        As `load`.
+        If a pickle is truncated or damaged.
     """
     try:
         stream = path.open("rb")
@@ -202,9 +202,9 @@ def load_all(path: Path) -> Iterator[Any]:
 
 
 def _plain(value: Any, done: dict[int, Any] | None = None) -> Any:
-    """Arrays out of their boxes, also in lists, tuples and dictionaries of one another.
+    """Replace stand-ins by arrays, also in nested lists, tuples and dictionaries.
 
-    What a pickle refers to many times is converted once, so that a small file stays small.
+    An object with many references is converted only once, so that a small file stays small.
     """
     done = {} if done is None else done
     if isinstance(value, _Array):

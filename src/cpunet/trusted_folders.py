@@ -1,4 +1,4 @@
-"""Folders to which nobody else can write: only from these may code be loaded."""
+"""Folders to which nobody else can write; code is loaded only from these."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 
 def trusted(folder: Path) -> bool:
-    """Whether only the user, and the system's administrator, can put files into a folder.
+    """Whether only the user and the system administrator can put files into a folder.
 
-    Nobody else may be able to put another one in its place, either.
+    Nobody else must be able to replace the folder, either.
     """
     ours = {os.getuid(), 0} if hasattr(os, "getuid") else set()
-    if not ours:  # other systems have other rules
+    if not ours:  # other systems have different permissions
         return True
     folder = folder.resolve()
     for place in (folder, *folder.parents):
@@ -24,7 +24,7 @@ def trusted(folder: Path) -> bool:
         open_to_all = facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
         if facts.st_uid not in ours:
             return False
-        # in a sticky folder, as /tmp, nobody can move what belongs to us
+        # in a sticky folder such as /tmp, nobody can move the user's files
         if open_to_all and (place == folder or not facts.st_mode & stat.S_ISVTX):
             return False
     return True

@@ -1,6 +1,7 @@
-"""What every reader of YAML and JSON needs: the package's own files by name, texts' fields.
+"""Common functions for YAML and JSON: files of the package by name, and fields of a text.
 
-Texts come from anyone: they may be nested without end, or hold numbers of thousands of digits.
+The texts are untrusted: they can be nested without limit or contain numbers of thousands of
+digits.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ import yaml
 
 from cpunet.errors import CpunetError
 
-MOST_BYTES = 10_000_000  # of a text of settings
+MOST_BYTES = 10_000_000  # of a settings file
 _MOST_DEPTH = 50
-_MOST_VALUES = 200_000  # references counted as often as they are made
-_MOST_NUMBER = 10**60  # beyond, no whole number means anything here
+_MOST_VALUES = 200_000  # every reference counts
+_MOST_NUMBER = 10**60  # larger integers are meaningless here
 
 
 def yaml_names(folder: Traversable) -> list[str]:
-    """Names, without the suffix, of the YAML files in a folder of the package."""
+    """Names of the YAML files in a folder of the package, without the suffix."""
     return sorted(
         file.name.removesuffix(".yaml")
         for file in folder.iterdir()
@@ -31,7 +32,7 @@ def yaml_names(folder: Traversable) -> list[str]:
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values: what looks like a date is text, as no setting is a date."""
+    """Loader of plain values; dates are kept as text, since no setting is a date."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -41,12 +42,12 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def parsed(text: str) -> Any:
-    r"""What a text of YAML or JSON holds.
+    r"""Parse a YAML or JSON text.
 
     Raises
     ------
     yaml.YAMLError
-        If it is neither, or nested too deeply, or holds numbers beyond all reason.
+        If the text is neither, is nested too deeply, or contains unreasonably large numbers.
 
     Examples
     --------
@@ -56,7 +57,7 @@ def parsed(text: str) -> Any:
     try:
         return _yaml(text)
     except yaml.YAMLError:
-        # JSON may be indented by tabs, which YAML refuses
+        # JSON can be indented with tabs, which YAML refuses
         try:
             return plain_json(text)
         except ValueError:
@@ -65,12 +66,12 @@ def parsed(text: str) -> Any:
 
 
 def plain_json(text: str | bytes) -> Any:
-    """What a text of JSON holds.
+    """Parse a JSON text.
 
     Raises
     ------
     ValueError
-        If it is none, or nested too deeply, or holds numbers beyond all reason.
+        If the text is not JSON, is nested too deeply, or contains unreasonably large numbers.
     """
     if len(text) > MOST_BYTES:
         raise ValueError(f"larger than {MOST_BYTES / 1e6:g} MB")
@@ -83,7 +84,7 @@ def plain_json(text: str | bytes) -> Any:
 
 
 def shown(value: Any) -> str:
-    """A value for a message, shortened if it is long.
+    """Format a value for a message, shortened if it is long.
 
     Examples
     --------
@@ -113,13 +114,13 @@ def _yaml(text: str) -> Any:
         _require_plain(found)
     except yaml.YAMLError:
         raise
-    except Exception as error:  # whatever a value is that only looks like a number
+    except Exception as error:  # values that only look like numbers raise various errors
         raise yaml.YAMLError(str(error) or type(error).__name__) from error
     return found
 
 
 def _require_plain(value: Any) -> None:
-    """Raise a `ValueError` for a value with too many parts, too deep, or too large a number."""
+    """Raise a `ValueError` if a value is too large or too deep, or has too large a number."""
     ahead, met = [(value, 0)], 0
     while ahead:
         part, depth = ahead.pop()
@@ -142,16 +143,16 @@ def yaml_fields(text: str, source: str, *, invalid: str, empty: str) -> dict[str
     Parameters
     ----------
     text
-        YAML or JSON.
+        YAML or JSON text.
     source
-        What the errors begin with, such as ``"detector V01.yaml"``.
+        Start of error messages, such as ``"detector V01.yaml"``.
     invalid, empty
-        What they say of a text that is no YAML, and of one without fields.
+        Error messages for a text that is not YAML, and for one without fields.
 
     Raises
     ------
     CpunetError
-        If the text is no mapping of fields.
+        If the text is not a mapping of fields.
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""Pulse-shape parameters, comparison of distributions, paired scores, figures, report."""
+"""Comparison of distributions, paired scores, A/E survival, figures and the report."""

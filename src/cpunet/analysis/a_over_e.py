@@ -1,4 +1,4 @@
-"""The cut on A/E as experiments use it, and how well a simulation predicts it.
+"""The A/E cut as used by experiments, and how well a simulation predicts its survival.
 
 A is the maximum current of a pulse, E its energy.  Events of the double-escape peak
 (DEP) deposit their energy at one site, as the searched decay does: the cut is put
@@ -31,15 +31,15 @@ BOOTSTRAPS = 300
 
 @dataclass(frozen=True)
 class PeakSurvival:
-    """What the cut leaves of one peak.
+    """Survival of one peak after the cut.
 
     Attributes
     ----------
     survival, std
-        In percent; NaN without events.  The error has two parts in quadrature, that
-        of the number of survivors and that of the cut.
+        Survival and its error in percent; NaN without events.  The error combines those of
+        the number of survivors and of the cut in quadrature.
     n, missing
-        Events with an amplitude, and events left out because theirs is not finite.
+        Number of events with a finite amplitude, and of those without.
     """
 
     survival: float
@@ -50,14 +50,14 @@ class PeakSurvival:
 
 @dataclass(frozen=True)
 class Survival:
-    """The cut and what it leaves of each peak.
+    """The cut and the survival of each peak.
 
     Attributes
     ----------
     cut, cut_std
         Lowest A/E that survives, in pulse heights per sample, and its error.
     n, missing
-        Events from which the cut comes, and those without a finite amplitude.
+        Number of events that define the cut, and of those without a finite amplitude.
     peaks
         Survival of the other peaks.
     """
@@ -77,31 +77,47 @@ def ae_survival(
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
 ) -> Survival:
-    """Cut on a low A/E that a given fraction of the DEP survives, applied to other peaks.
+    r"""Survival of other peaks after a low-A/E cut that keeps a given fraction of the DEP.
+
+    .. math:: S = \frac{k}{n}, \qquad \sigma_S^2 = \sigma_k^2 + \sigma_c^2
+
+    with :math:`k` of :math:`n` events at or above the cut :math:`c`, the :math:`1 - a`
+    quantile of the DEP for the acceptance :math:`a`.  :math:`\sigma_k` is the standard
+    deviation of the posterior with a flat prior, and :math:`\sigma_c` the spread of :math:`S`
+    over bootstraps of the cut.
 
     Parameters
     ----------
     dep_ae
-        A/E of the events of the double-escape peak.
+        A/E of the events of the double-escape peak (DEP).
     others
-        A/E of the events of other peaks or ranges, by name.  The DEP itself would
-        survive with `acceptance` by construction; its error would mean nothing.
+        A/E of the events of other peaks or ranges, by name.  The DEP itself would survive
+        with `acceptance` by construction, and its error would be meaningless.
     acceptance
-        Fraction of the DEP that survives, above 0 and below 1.  It is that of *new*
-        events of the same kind on average, also if there are few.
+        Fraction of the DEP that survives, between 0 and 1.  It is exact on average for *new*
+        events of the same kind, also for small samples.
     bootstraps, seed
-        Of the DEP's events, for the error of the cut.
+        Number and seed of the bootstraps of the DEP, for the error of the cut.
 
     Returns
     -------
     Survival
-        The cut, and survival in percent by peak.
+        Cut, and survival in percent by peak.
 
     Raises
     ------
     CpunetError
-        If `acceptance` is no such fraction, or fewer than 20 events of the DEP have a
+        If `acceptance` is not between 0 and 1, or fewer than 20 events of the DEP have a
         finite amplitude.
+
+    Examples
+    --------
+    Of 99 equidistant values the cut at 90 % is the 10th, and 90 of the 99 survive:
+
+    >>> ae = np.arange(1.0, 100.0)
+    >>> found = ae_survival(ae, {"SEP": ae}, acceptance=0.9)
+    >>> round(found.cut, 6), round(found.peaks["SEP"].survival, 2)
+    (10.0, 90.91)
     """
     if not 0 < acceptance < 1:
         raise CpunetError(f"acceptance is {acceptance}; give a fraction such as 0.9")
@@ -136,20 +152,20 @@ def survival_table(
 ) -> dict[str, PeakTable]:
     """Survival of each peak in data and simulations, each of them after its own cut.
 
-    As each set has its own cut, a wrong scale of A/E alone makes no difference here.
+    Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
 
     Parameters
     ----------
     data
         Measured A/E by peak.
     methods
-        The same by method: ``{"raw": …, "ren": …}`` and any others.
+        A/E by method and peak: ``{"raw": …, "ren": …}`` and any others.
     acceptance
         Fraction of the DEP that survives.
     dep
-        Name of the peak from which the cuts come.
+        Name of the peak that defines the cuts.
     bootstraps, seed
-        Of the errors of the cuts.
+        Number and seed of the bootstraps for the errors of the cuts.
 
     Returns
     -------
@@ -157,18 +173,18 @@ def survival_table(
         For each peak, JSON-ready (``None`` where a number does not exist):
 
         ``events``, ``missing``
-            how many events have an amplitude and how many do not, by method and for
-            the ``data``.
+            number of events with and without a finite amplitude, by method and for the
+            ``data``.
         ``cut``, ``cut_std``
-            of the DEP only, by method and for the ``data``; in pulse heights per
-            sample.  None, as all that follows from it, if fewer than 20 events of the
+            for the DEP only, by method and for the ``data``, in pulse heights per sample.
+            The cut and all numbers derived from it are None if fewer than 20 events of the
             DEP have an amplitude.
         ``survival``, ``survival_std``
-            of the other peaks in percent, by method and for the ``data``.
+            for the other peaks in percent, by method and for the ``data``.
         ``difference``, ``difference_std``
-            method less data, in percentage points.
+            method minus data, in percentage points.
         ``sigma``
-            the difference in units of its error.
+            difference divided by its error.
 
     Raises
     ------
@@ -205,25 +221,31 @@ def survival_table(
 def sideband_survival(
     peak_pass: int, peak: int, side_pass: int, side: int, scale: float
 ) -> tuple[float, float]:
-    """Survival of a peak after its background, seen beside it, was subtracted.
+    r"""Survival of a peak after subtraction of its background, estimated from sidebands.
 
-    The survivors are ``peak_pass - scale * side_pass`` of ``peak - scale * side``.
+    .. math:: S = \frac{p - \alpha \, s}{P - \alpha \, S_b}, \qquad
+        \sigma_S^2 = \frac{(1 - S)^2 (p + \alpha^2 s) + S^2 (f + \alpha^2 f_b)}
+        {(P - \alpha \, S_b)^2}
+
+    with :math:`p` of :math:`P` events surviving in the range of the peak, :math:`s` of
+    :math:`S_b` in the sidebands, :math:`f = P - p`, :math:`f_b = S_b - s` and the `scale`
+    :math:`\alpha`.
 
     Parameters
     ----------
     peak_pass, peak
-        Events in the peak's range: those that survive the cut, and all.
+        Number of events in the range of the peak: survivors of the cut, and all.
     side_pass, side
         The same in the sidebands.
     scale
-        Width of the peak's range over that of the sidebands.
+        Width of the peak's range divided by that of the sidebands.
 
     Returns
     -------
     tuple of float
-        Survival and its error in percent, from the Poisson errors of the events that
-        survive and of those that do not; binomial if `scale` is 0.  The error of the
-        cut is not in it.  NaN if no event of the peak is left.
+        Survival and its error in percent, from the Poisson errors of surviving and removed
+        events (binomial if `scale` is 0), without the error of the cut.  NaN if no event of
+        the peak is left.
 
     Raises
     ------
@@ -253,7 +275,7 @@ def sideband_survival(
 
 
 def _cut(dep: Values, acceptance: float) -> float:
-    """Quantile whose acceptance for new events is right on average, whatever their number."""
+    """Quantile whose acceptance for new events is exact on average for any sample size."""
     return float(np.quantile(dep, 1 - acceptance, method="weibull"))
 
 
@@ -263,7 +285,7 @@ def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
     if not n:
         return PeakSurvival(float("nan"), float("nan"), 0, missing)
     passing = n - int(np.searchsorted(finite, cut))
-    # spread of the posterior after a flat prior: not 0 if none or all survive
+    # standard deviation of the posterior with a flat prior: not 0 if none or all survive
     p = (passing + 1) / (n + 2)
     counting = np.sqrt(p * (1 - p) / (n + 3))
     of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)

@@ -1,8 +1,8 @@
-"""A/E in detail: against the drift time, and together with it.
+"""A/E in detail: against the drift time, and jointly with it.
 
-One distribution of the current amplitude may agree where its dependence on the place in
-the detector does not: wrong here and wrong there can cancel.  Amplitudes are those of
-prepared pulses, so that they are A/E (see `cpunet.analysis.a_over_e`).
+The distribution of the current amplitude can agree although its dependence on the position
+in the detector does not, since deviations can cancel.  Amplitudes are those of prepared
+pulses, so they are A/E (see `cpunet.analysis.a_over_e`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from cpunet.errors import CpunetError
 Values = npt.NDArray[np.float64]
 
 QUANTILES = {"q16": 0.16, "median": 0.5, "q84": 0.84}
-FEWEST = 10  # events of a bin, below which its quantiles have no error
+FEWEST = 10  # minimum events of a bin for errors of its quantiles
 TIME_BINS = 8
-EVENTS_PER_CELL = 10  # with fewer, resampled data are more alike than new data would be
+EVENTS_PER_CELL = 10  # with fewer, resampled data agree better than independent data
 MAX_BINS = 25
 
 
@@ -35,23 +35,23 @@ def ae_against_drift_time(
     Parameters
     ----------
     amplitude, drift_time
-        By method, those of the measured pulses under ``"data"``; equally long, in pulse heights
-        per sample and in ns.
+        A/E in pulse heights per sample and drift times in ns, by method, of equal length; those
+        of the measured pulses are under ``"data"``.
     bins
-        Of equally many measured pulses each.
+        Number of bins, with equal numbers of measured pulses.
 
     Returns
     -------
     dict
-        JSON-ready: ``edges_ns`` of the bins; ``left_out``, events by method without a finite
-        amplitude or time or outside the edges; and ``methods``, a list of bins for each, the
-        data too: ``n``, ``time_ns`` (median), and ``q16``, ``median`` and ``q84`` with
-        ``…_error`` of each; or ``missing`` and the reason.
+        JSON-ready: ``edges_ns`` of the bins; ``left_out``, the number of events by method that
+        are outside the edges or lack a finite amplitude or time; and ``methods``, for each
+        method and the data a list of bins with ``n``, ``time_ns`` (median), and ``q16``,
+        ``median`` and ``q84`` with ``…_error`` of each; or ``missing`` with the reason.
 
     Raises
     ------
     CpunetError
-        If the data have no event, or the arrays of a method do not fit each other.
+        If the data have no event, or the arrays of a method differ in length.
     """
     known = {
         method: _finite_pairs(method, values, drift_time[method])
@@ -87,19 +87,19 @@ def two_dimensional(
     bootstraps: int = 100,
     seed: int | np.random.Generator = 0,
 ) -> dict[str, Any]:
-    """Overlap of the distributions of A/E and drift time together.
+    """Overlap of the joint distributions of A/E and drift time.
 
     Both axes are those of the data (`comparisons.data_axis`), with as many bins as leave ten
-    events a cell in the smallest set; what lies outside is in cells of its own at the rims.
+    events per cell in the smallest dataset.  Underflow and overflow have cells of their own.
 
     Parameters
     ----------
     amplitude, drift_time
-        By method, see `ae_against_drift_time`.
+        A/E and drift times by method, see `ae_against_drift_time`.
     max_bins
-        The most bins of an axis.
+        Maximum number of bins of an axis.
     bootstraps, seed
-        Of the ceiling and of the errors.
+        Number and seed of the bootstraps for the ceiling and the errors.
 
     Returns
     -------
@@ -107,22 +107,21 @@ def two_dimensional(
         JSON-ready:
 
         ``amplitude_edges``, ``time_edges_ns``
-            of the cells inside.
+            edges of the inner cells.
         ``iou``, ``iou_std``
             in percent, by method and for the ``ceiling`` (see `comparisons.ceiling`), which
-            here is one to three points too high: data drawn again fill the same cells.
+            here is one to three points too high, since resampled data fill the same cells.
         ``counts``
-            by method, ``data`` among them: counts in the cells, amplitude by time, without
-            the rims.
+            counts in the inner cells, amplitude by time, by method including ``data``.
         ``outside``, ``undefined``
-            events at the rims, and without a finite value, by method.
+            number of events in the outer cells, and without a finite value, by method.
 
         Or ``missing`` with the reason, if the data or a method have too few events.
 
     Raises
     ------
     CpunetError
-        If the arrays of a method do not fit each other.
+        If the arrays of a method differ in length.
     """
     known = {m: _finite_pairs(m, values, drift_time[m]) for m, values in amplitude.items()}
     smallest = min(known, key=lambda method: len(known[method][0]))
@@ -163,7 +162,7 @@ def _bin(ae: Values, time: Values) -> dict[str, Any]:
         return {"n": n, "missing": f"{n} events (at least {FEWEST} are needed)"}
     row: dict[str, Any] = {"n": n, "time_ns": float(np.median(time))}
     for name, p in QUANTILES.items():
-        # how far the rank of a quantile strays by chance, whatever the distribution
+        # scatter of the rank of a quantile, which is independent of the distribution
         stray = np.sqrt(p * (1 - p) / n)
         low, high = np.quantile(ae, np.clip([p - stray, p + stray], 0, 1))
         row |= {name: float(np.quantile(ae, p)), f"{name}_error": float((high - low) / 2)}
@@ -175,7 +174,7 @@ def _count(axes: tuple[hist.axis.Regular, ...]) -> int:
 
 
 def _cells(ae: Values, time: Values, axes: tuple[hist.axis.Regular, ...]) -> Values:
-    """Number of each event's cell, rims included; NaN if it has none."""
+    """Number of each event's cell, including outer cells; NaN if it has none."""
     known = np.isfinite(ae) & np.isfinite(time)
     cells = np.full(len(ae), np.nan)
     row, column = (
@@ -187,7 +186,7 @@ def _cells(ae: Values, time: Values, axes: tuple[hist.axis.Regular, ...]) -> Val
 
 
 def _counts(cells: Values, axes: tuple[hist.axis.Regular, ...]) -> npt.NDArray[np.int64]:
-    """Events in the cells that are not at a rim, amplitude by time."""
+    """Number of events in the inner cells, amplitude by time."""
     known = cells[np.isfinite(cells)].astype(int)
     shape = [axis.size + 2 for axis in axes]
     return np.bincount(known, minlength=_count(axes)).reshape(shape)[1:-1, 1:-1]

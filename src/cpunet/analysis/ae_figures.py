@@ -1,4 +1,4 @@
-"""Figures of A/E against the drift time, and of both together."""
+"""Figures of A/E against the drift time, and of their joint distribution."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from cpunet.pulses.parameters import PARAMETERS
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
-COLUMNS = 3  # panels beside each other
-ROC_POINTS = 201  # of a curve
-ROC_RANGE = (50, 100)  # percent of the DEP, which useful cuts leave
+COLUMNS = 3  # panels per row
+ROC_POINTS = 201  # points per curve
+ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 
 Values = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     Parameters
     ----------
     table
-        Of `ae_details.ae_against_drift_time`.
+        Result of `ae_details.ae_against_drift_time`.
     peak
         Name of the gamma line, for the title.
     """
@@ -68,15 +68,15 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
 
 @styled
 def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figure:
-    """What cuts on a low A/E leave of other peaks, against what they leave of the DEP.
+    """Survival of other peaks after low-A/E cuts, against the survival of the DEP.
 
     Parameters
     ----------
     ae
-        A/E of single pulses by peak and method, the measured ones under ``"data"``; not
-        finite values are left out.
+        A/E of single pulses by peak and method, the measured ones under ``"data"``;
+        non-finite values are left out.
     dep
-        The peak of single-site events.
+        Name of the peak of single-site events.
     """
     others = [peak for peak in ae if peak != dep]
     methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
@@ -101,7 +101,7 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
                 **look,
             )
         axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
-    # cuts that leave few multi-site events are the useful ones
+    # useful cuts leave few multi-site events
     panels[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
     panels[0].yaxis.set_major_formatter("{x:g}")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
@@ -114,12 +114,12 @@ def _finite(values: Values) -> Values:
 
 @styled
 def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
-    """Distributions of A/E and drift time together, a panel for each method.
+    """Joint distributions of A/E and drift time, one panel per method.
 
     Parameters
     ----------
     table
-        Of `ae_details.two_dimensional`, one that is not missing.
+        Result of `ae_details.two_dimensional` that is not missing.
     peak
         Name of the gamma line, for the title.
     """
@@ -152,7 +152,7 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
 
 
 def _ratio(rows: list[Any], data: list[Any]) -> tuple[list[float], list[float], list[float]]:
-    """Time, median over that of the data less 1 in percent, and its error."""
+    """Time, deviation of the median from that of the data in percent, and its error."""
     points: list[tuple[float, float, float]] = []
     for row, measured in zip(rows, data, strict=True):
         if "missing" in row or "missing" in measured or not measured["median"]:

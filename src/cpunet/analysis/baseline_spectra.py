@@ -1,12 +1,12 @@
-"""Noise of measured and translated pulses: its size and its spectrum before the pulse.
+"""Noise of measured and translated pulses: RMS and spectrum of the baseline.
 
-Baselines of prepared windows are normalised to the pulse height, so that noise of one
-size in keV is larger for lower energies: only pulses of one peak are to be compared.
-Their slow part is gone, since the preparation takes the mean of the baseline off.
+Baselines of prepared windows are normalised to the pulse height, so noise of a given RMS
+in keV appears larger at lower energies: compare only pulses of one peak.  The slowest
+part of the noise is absent, since the preparation subtracts the mean of the baseline.
 
-A window is placed by where its pulse ends, so that a slow pulse may begin within what a recipe
-calls the baseline; a few such edges would outweigh all noise.  The stretch compared therefore
-ends well before nine of ten measured pulses begin, and the others are left out.
+A window is placed by the end of the rise, so a slow pulse can begin within the recipe's
+baseline; a few such edges would outweigh all noise.  The compared stretch therefore ends
+well before the start of nine out of ten measured pulses, and the others are left out.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ Values = npt.NDArray[np.float64]
 
 FEWEST = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
-# A pulse has crept up before it is seen to begin, at 1 %; so many samples are left free.
+# A pulse rises slowly before it crosses 1 %, its nominal start; padding in samples before that.
 MARGIN = 60
-EARLY_SHARE = 0.1  # of the measured pulses may begin too early and be left out
+EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are left out
 LEAST_SAMPLES = 32  # of the stretch
 
 
@@ -40,33 +40,33 @@ def baseline_spectra(
     samples: int,
     dt_ns: float,
 ) -> dict[str, Any]:
-    """Compare the noise of each method's baselines with the data's.
+    """Compare the baseline noise of each method with that of the data.
 
     Parameters
     ----------
     windows
-        Prepared pulses of one peak by method, ``"data"`` among them, shape (n, length).
+        Prepared pulses of one peak by method, including ``"data"``, shape (n, length).
     begins
-        By method, the sample at which each pulse begins, shape (n,); NaN if not known.
+        Sample at which each pulse begins, by method, shape (n,); NaN if unknown.
     samples
-        The most, from the first of a window, that are compared.
+        Maximum number of samples that are compared, from the start of the window.
     dt_ns
-        Sampling period.
+        Sampling period in ns.
 
     Returns
     -------
     dict
-        JSON-ready: ``frequency_mhz`` (middle of each band), and by method the ``samples``
-        compared of each of ``n`` pulses, ``power`` and ``power_std`` (mean square in each
-        band, in squared pulse heights), ``rms`` and ``rms_std``, and for methods but the data
-        ``rms_ratio``, its ``sigma`` from 1, ``worst_band_sigma``, and
-        ``spectrum_sigma``: as unlikely as that worst of so many bands; or ``missing`` and
-        the reason.
+        JSON-ready: ``frequency_mhz`` (centre of each band), and by method the number ``n`` of
+        pulses, the ``samples`` compared of each, ``power`` and ``power_std`` (mean square in
+        each band, in squared pulse heights), ``rms`` and ``rms_std``.  For methods other than
+        the data also ``rms_ratio``, its ``sigma`` from 1, ``worst_band_sigma``, and
+        ``spectrum_sigma``, which corrects the latter for the number of bands; or ``missing``
+        with the reason.
 
     Raises
     ------
     CpunetError
-        If the data are not there, or pulses and beginnings not equally many.
+        If the data are missing, or the numbers of pulses and start samples differ.
 
     Examples
     --------
@@ -103,14 +103,14 @@ def baseline_spectra(
 
 @styled
 def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
-    """Draw the noise's power by band and method, and its ratio to the data's.
+    """Draw the noise power by band and method, and its ratio to that of the data.
 
     Parameters
     ----------
     found
-        The result of `baseline_spectra`.
+        Result of `baseline_spectra`.
     peak
-        For the title.
+        Name of the gamma line, for the title.
     """
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     palette = colours(methods)
@@ -144,7 +144,7 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
 
 
 def _free(windows: FloatArray, begins: Mapping[str, Values], method: str) -> Values:
-    """Samples of each window that its pulse does not reach; NaN if not known."""
+    """Number of samples of each window before its pulse; NaN if unknown."""
     known = begins.get(method, np.empty(0))
     if known.shape != (len(windows),):
         raise CpunetError(
@@ -154,13 +154,13 @@ def _free(windows: FloatArray, begins: Mapping[str, Values], method: str) -> Val
 
 
 def _stretch(free: Values) -> int:
-    """Samples that are free in all measured pulses but the earliest."""
+    """Number of samples before the pulse in all measured pulses but the earliest."""
     known = free[np.isfinite(free)]
     return int(np.quantile(known, EARLY_SHARE)) if known.size else 0
 
 
 def _band_edges(samples: int) -> Values:
-    """Edges, in bins of a spectrum, of bands of half an octave; without the mean."""
+    """Edges, in bins of a spectrum, of half-octave bands, without frequency 0."""
     octaves = np.log2(samples // 2 + 1)
     steps = 2 ** np.arange(0, octaves, 1 / BANDS_PER_OCTAVE)
     edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1))
@@ -175,7 +175,7 @@ def _band_powers(baselines: FloatArray, edges: Values) -> Values:
     centred = (known - known.mean(axis=1, keepdims=True)) * window
     power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (window @ window))
     if samples % 2 == 0:
-        power[:, -1] /= 2  # the highest frequency is there once
+        power[:, -1] /= 2  # the highest frequency occurs only once
     starts = edges[:-1].astype(int)
     return (
         np.asarray(np.add.reduceat(power, starts, axis=1)) if len(known) else power[:, starts]
@@ -196,7 +196,7 @@ def _summary(power: Values) -> dict[str, Any]:
 
 
 def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:
-    """How far the noise is from the data's; None where neither has an error."""
+    """Deviation of the noise from that of the data; None where neither has an error."""
     error = np.hypot(own["rms_std"], data["rms_std"])
     difference, errors = (
         np.asarray(own["power"]) - np.asarray(data["power"]),
@@ -215,5 +215,5 @@ def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float
 def _of_so_many(worst: float, n: int) -> float:
     """One-sided deviation as unlikely as the largest of `n` two-sided ones (Šidák)."""
     chance = -np.expm1(n * np.log1p(-erfc(worst / np.sqrt(2))))
-    # beyond 37 standard deviations there is no such number, nor does it matter
+    # beyond 37 standard deviations the probability underflows, and it does not matter
     return float(norm.isf(chance)) if chance > 0 else worst

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: profiles, pulls by function, directions."""
+"""Figures of a calibration: profiles, pulls by moment, directions."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ LINEAR = 3.0
 
 @styled
 def profiles_figure(content: Mapping[str, Any]) -> Figure:
-    """Chi-square along the valley of each free parameter, a panel each.
+    """Profile chi-square of each free parameter, one panel each.
 
     Parameters
     ----------
     content
-        Of ``calibration.json``; with at least one free parameter.
+        Content of ``calibration.json``, with at least one free parameter.
     """
     profiles = content["profiles"]
     rows = -(-len(profiles) // COLUMNS)
@@ -51,12 +51,12 @@ def profiles_figure(content: Mapping[str, Any]) -> Figure:
 
 @styled
 def pulls_figure(content: Mapping[str, Any]) -> Figure:
-    """Deviations of all functions before and after, in standard deviations.
+    """Pulls of all moments before and after the calibration.
 
     Parameters
     ----------
     content
-        Of ``calibration.json``.
+        Content of ``calibration.json``.
     """
     pulls = content["pulls"]
     groups = [_group(name) for name in pulls["names"]]
@@ -85,12 +85,12 @@ def pulls_figure(content: Mapping[str, Any]) -> Figure:
 
 @styled
 def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
-    """Axes of the information as a table of colours, and how well each is known.
+    """Principal axes of the information matrix as a colour table, with the error of each.
 
     Parameters
     ----------
     directions
-        Of ``calibration.json`` or ``plan.json``.
+        Directions from ``calibration.json`` or ``plan.json``.
     """
     names = list(directions[0]["components"])
     matrix = np.array([[d["components"][name] for name in names] for d in directions])
@@ -114,7 +114,7 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _group(name: str) -> str:
-    """What kind of function a moment is."""
+    """Kind of function of a moment."""
     plain = name.split(": ")[-1]
     if plain.endswith("squared"):
         return "squares"

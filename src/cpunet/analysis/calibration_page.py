@@ -1,4 +1,4 @@
-"""A calibration as one page that needs nothing but itself."""
+"""A calibration as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ $axes
 
 
 def calibration_page(content: Mapping[str, Any]) -> str:
-    """Write the page.
+    """Return the page as HTML.
 
     Parameters
     ----------
     content
-        Of ``calibration.json``.
+        Content of ``calibration.json``.
     """
     chi, free = content["chi_square"], content["parameters"]
     directions = content["directions"]

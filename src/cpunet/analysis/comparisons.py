@@ -1,8 +1,8 @@
-"""How much two distributions of a parameter have in common, and how much they could.
+"""Overlap of two distributions of a parameter, and the highest overlap to expect.
 
-An intersection over union (IoU) of two finite samples of the *same* distribution is
-less than 100 %, so each score comes with its ceiling: the IoU of the measured data
-with itself, resampled at the sizes of both sets.
+The intersection over union (IoU) of two finite samples of the *same* distribution is
+less than 100 %.  Each score therefore comes with its ceiling: the IoU of the measured
+data with itself, resampled at the sizes of both datasets.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ Values = npt.NDArray[np.float64]
 ByMethod = dict[str, float | None]
 
 # Tukey's far-out fence: wide enough for both peaks of an escape line's I_max, and
-# up to a quarter of the events may be outliers without moving it.
+# unaffected as long as less than a quarter of the events are outliers.
 FENCE = 3.0
 
 
 class Comparison(TypedDict):
-    """What `compare` says of one parameter."""
+    """Result of `compare` for one parameter."""
 
     iou: ByMethod
     iou_std: ByMethod
@@ -50,18 +50,21 @@ class Comparison(TypedDict):
 
 
 def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
-    """Binning of a parameter from its measured values alone.
+    r"""Binning of a parameter from its measured values alone.
 
-    The axis spans the data within three interquartile ranges of the quartiles, with
-    bins of the Freedman–Diaconis width, 2 IQR / ∛n.  What lies outside is counted in
-    the axis' underflow and overflow bins.
+    The axis spans the data within three interquartile ranges (IQR) of the quartiles, with
+    bins of the Freedman–Diaconis width
+
+    .. math:: w = 2 \, \mathrm{IQR} / \sqrt[3]{n}
+
+    Values outside are counted in the underflow and overflow bins.
 
     Parameters
     ----------
     data
-        Measured values of one parameter; values that are not finite are ignored here.
+        Measured values of one parameter; non-finite values are ignored.
     max_bins
-        The most bins the axis may have (49 in the paper).
+        Maximum number of bins (49 in the paper).
 
     Raises
     ------
@@ -86,15 +89,22 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
         width = 2 * spread / np.cbrt(finite.size)
         bins = int(np.clip(np.ceil((high - low) / width), 1, max_bins))
     else:
-        # Half of the values are equal: one bin holds them, and the rest is outside.
+        # Half of the values are equal: one bin contains them, the others are outside.
         margin = 1e-3 * max(abs(lower), 1.0)
         low, high, bins = lower - margin, upper + margin, 1
-    # the last edge is exclusive, and a maximum inside the fence is no overflow
+    # the last edge is exclusive, but a maximum inside the fence is not an overflow
     return hist.axis.Regular(bins, low, np.nextafter(high, np.inf))
 
 
 def histogram(values: Values, axis: hist.axis.Regular) -> Values:
-    """Counts per bin, none lost: underflow, the bins, overflow, and last the NaNs.
+    """Counts of all values: underflow, the bins, overflow, and the NaNs last.
+
+    Parameters
+    ----------
+    values
+        Values of one parameter.
+    axis
+        Binning, see `data_axis`.
 
     Examples
     --------
@@ -104,27 +114,30 @@ def histogram(values: Values, axis: hist.axis.Regular) -> Values:
     array([1., 1., 2., 1., 1.])
     """
     missing = np.isnan(values)
-    # boost-histogram would put the NaNs into the overflow bin
+    # boost-histogram would count NaNs in the overflow bin
     counts = hist.Hist(axis).fill(values[~missing]).values(flow=True)
     return np.append(counts, float(missing.sum()))
 
 
 def iou(a: Values, b: Values, axis: hist.axis.Regular) -> float:
-    """Intersection over union of two distributions, in percent (paper, section 4.3).
+    r"""Intersection over union of two distributions, in percent (paper, section 4.3).
 
-    Both histograms sum to one, with everything outside the axis in them.
+    .. math:: \mathrm{IoU} = \frac{\sum_i \min(a_i, b_i)}{\sum_i \max(a_i, b_i)}
+
+    over the bins :math:`i` of two histograms (the Jaccard index).  Both histograms sum to
+    one, including underflow, overflow and NaNs.
 
     Parameters
     ----------
     a, b
-        Values of one parameter in both sets.
+        Values of one parameter in both datasets.
     axis
         Common binning, see `data_axis`.
 
     Returns
     -------
     float
-        0 … 100; NaN if one of the sets is empty.
+        0 … 100; NaN if one of the datasets is empty.
 
     Examples
     --------
@@ -137,22 +150,36 @@ def iou(a: Values, b: Values, axis: hist.axis.Regular) -> float:
 
 
 def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float, float]:
-    """IoU of the data with itself: what a perfect translation would score.
+    r"""IoU of the data with itself: the score of a perfect translation.
 
-    Two sets are drawn from the data with replacement, one as large as the simulated
-    set and one as large as the measured one, again and again.
+    .. math:: C = \langle \mathrm{IoU}(D^*_{\mathrm{sim}}, D^*_{\mathrm{data}}) \rangle
+
+    In each draw, two samples :math:`D^*` are drawn from the data with replacement, one of
+    the size of the simulated dataset and one of the size of the measured one.
 
     Parameters
     ----------
-    data, axis
-        As for `iou`.
+    data
+        Measured values of one parameter.
+    axis
+        Common binning, see `data_axis`.
     draws
-        See `cpunet.analysis.resampling.resampled_twice`.
+        Bootstraps of the data, see `cpunet.analysis.resampling.resampled_twice`.
 
     Returns
     -------
     tuple of float
         Mean and standard deviation of the IoU in percent over the draws.
+
+    Examples
+    --------
+    With all data in one bin nothing scatters:
+
+    >>> import numpy as np
+    >>> from cpunet.analysis.resampling import resampled_twice
+    >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
+    >>> ceiling(np.full(50, 0.5), hist.axis.Regular(2, 0, 2), draws)
+    (100.0, 0.0)
     """
     bins, n_bins = _bins(data, axis)
     scores = _overlap(*(of_set.counts(bins, n_bins) for of_set in draws))
@@ -160,17 +187,25 @@ def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float,
 
 
 def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> float:
-    """Standard deviation, in percent, of `iou` under resampling of both sets.
+    """Standard deviation of `iou`, in percent, under resampling of both datasets.
 
-    Near the ceiling it is a sixth larger than the scatter of fresh samples.  The draws are
-    those of `cpunet.analysis.resampling.both_resampled`.
+    Near the ceiling it is a sixth larger than the scatter of independent samples.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both datasets.
+    axis
+        Common binning, see `data_axis`.
+    draws
+        Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
     """
     drawn = (d.counts(*_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
     return float(_overlap(*drawn).std())
 
 
 def _bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
-    """Place of each value in `histogram`, and how many places there are."""
+    """Bin of each value in `histogram`, and the number of bins."""
     places = np.asarray(axis.index(values)) + 1  # type: ignore[arg-type]  # arrays, too
     return np.where(np.isnan(values), axis.size + 2, places), axis.size + 3
 
@@ -188,11 +223,11 @@ def compare(
     data
         Measured values by parameter, see `parameters.pulse_parameters`.
     methods
-        The same by method: ``{"raw": …, "ren": …}`` and any others.
+        Values by method and parameter: ``{"raw": …, "ren": …}`` and any others.
     scores
-        Number of bins and of bootstraps.
+        Score settings: numbers of bins and of bootstraps.
     seed
-        Of the bootstraps.
+        Seed of the bootstraps.
 
     Returns
     -------
@@ -200,17 +235,16 @@ def compare(
         For each parameter, JSON-ready (``None`` where a number does not exist):
 
         ``iou``, ``iou_std``
-            percent, by method and for the ``ceiling``.  The ceiling is that of the
-            largest of the simulated sets.
+            IoU and its error in percent, by method and for the ``ceiling``.  The ceiling
+            is computed for the largest of the simulated datasets.
         ``wasserstein``, ``ks``, ``wasserstein_std``, ``ks_std``
-            of the finite values, by method; in the parameter's unit, and 0 … 1.  The
-            errors are spreads over bootstraps of both sets.
+            distances of the finite values and their errors, by method; in the parameter's
+            unit, and 0 … 1.  The errors are spreads over bootstraps of both datasets.
         ``wasserstein_null``, ``ks_null``, ``wasserstein_null_std``, ``ks_null_std``
-            one number each: what two samples of the data's own distribution have, on
-            average and as spread, at the sizes of the data and of the largest of the
-            simulated sets.
+            mean and spread of the distances of two samples of the data's own distribution,
+            at the sizes of the data and of the largest of the simulated datasets.
         ``missing``
-            how many values are NaN, by method and for the ``data``.
+            number of NaN values, by method and for the ``data``.
         ``axis``
             ``low``, ``high`` and ``bins`` of the binning.
 
@@ -224,7 +258,7 @@ def compare(
             raise CpunetError(f"{method}: parameter {min(absent)} is missing; compute it too")
     if not data:
         return {}
-    # the same events of the data are drawn for all parameters and methods
+    # all parameters and methods share the same draws of data events
     rng, n_data = np.random.default_rng(seed), len(next(iter(data.values())))
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
@@ -247,7 +281,7 @@ def compare(
 def _of_data(
     data: Values, methods: list[str], null: Draws, axis: hist.axis.Regular | None
 ) -> Comparison:
-    """What the data say of themselves; the methods' numbers are not there yet."""
+    """Ceiling and nulls from the data alone, before any method is added."""
     distances = null_distances(data, null)
     result = Comparison(
         iou=dict.fromkeys([*methods, "ceiling"]),
@@ -279,7 +313,7 @@ def _add_method(
     axis: hist.axis.Regular | None,
     draws: Draws,
 ) -> None:
-    """Fill in the numbers of one method."""
+    """Add the scores of one method."""
     w1_error, ks_error = distance_errors(data, values, draws)
     result["wasserstein"][method] = _or_none(wasserstein(data, values))
     result["wasserstein_std"][method] = _or_none(w1_error)

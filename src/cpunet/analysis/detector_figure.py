@@ -1,4 +1,4 @@
-"""The fields of a detector in one picture: potentials, drift paths and times of collection."""
+"""The fields of a detector in one figure: potentials, drift paths and collection times."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from cpunet.simulation.geometry import (
 )
 from cpunet.simulation.settings import SimulationSettings
 
-# Paths and times need no fine steps, and must not end before the charge arrives.
+# Paths and times tolerate coarse steps, but must not end before the charge is collected.
 _SETTINGS = SimulationSettings(step_ns=2.0, dt_ns=16.0, length_ns=6000.0, diffusion=False)
-_MAP_POINTS = 70  # of the collection times, along the longer side of the crystal
+_MAP_POINTS = 70  # grid points of the collection times along the longer side of the crystal
 _OUTLINE_POINTS = 900  # along the same side
-_BLOCK = 500  # paths held at once
+_BLOCK = 500  # paths per block
 _ELECTRON, _HOLE = COLOURS["ren"], COLOURS["raw"]
 _REGIONS = ((LI_CONTACT, "Li contact", "0.55"), (POINT_CONTACT, "p⁺ contact", "#009E73"))
 _WEIGHTING_LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
@@ -36,18 +36,18 @@ _RAY_RAD = np.deg2rad(55)
 def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True) -> Figure:
     """Potential, weighting potential and collection times on the cross-section r, z.
 
-    Collection times are those of holes at the point contact, from the plane y = 0, in
-    which the paths start too.  Paths end where a carrier is collected or can induce no more:
-    those of electrons far from the point contact soon after they start.
+    Collection times are those of holes at the point contact.  They and the paths start in
+    the plane y = 0.  A path ends where its carrier is collected or can induce no further
+    signal; far from the point contact, electron paths end soon after they start.
 
     Parameters
     ----------
     detector
-        Geometry, for the outline.
+        Detector whose outline is drawn.
     fields
-        Its field maps.
+        Field maps of the detector.
     paths
-        Draw drift paths of electrons and holes over the potential.
+        Whether to draw drift paths of electrons and holes over the potential.
     """
     ratio = detector.crystal_length / detector.crystal_radius
     figure = Figure(figsize=(10.5, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
@@ -107,13 +107,13 @@ def _weighting_potential(figure: Figure, axes: Axes, fields: FieldMaps) -> None:
 
 
 def _along_a_ray(fields: FieldMaps) -> list[tuple[float, float]]:
-    """Places for the labels, one per line: on a ray from the contact, so none is cut off."""
+    """Positions of the contour labels on a ray from the contact, so none is cut off."""
     distance = np.arange(0, fields.z_mm[-1], fields.grid_mm)
     r, z = distance * np.cos(_RAY_RAD), distance * np.sin(_RAY_RAD)
     r, z = r[r < fields.r_mm[-1]], z[r < fields.r_mm[-1]]
     rows, columns = (np.rint(x / fields.grid_mm).astype(int) for x in (r, z))
     along = fields.weighting_potential[rows, columns]
-    # beyond the first contact that is met the ray leaves the crystal
+    # beyond the first contact on its way the ray leaves the crystal
     end = int(np.argmax((along <= 0) & (r > 0))) or len(along)
     firsts = [int(np.argmax(along[:end] <= level)) for level in _WEIGHTING_LEVELS[:-1]]
     return [(float(r[i]), float(z[i])) for i in firsts if i]
@@ -143,7 +143,7 @@ def _collection_times(
 
 
 def _hole_times(fields: FieldMaps, r: FloatArray, z: FloatArray) -> FloatArray:
-    """Time in ns from each place to the point contact; NaN if it is not reached."""
+    """Drift time in ns from each point to the point contact; NaN if it is not reached."""
     height = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS).holes[:, :, 2]
     steps = np.isfinite(height).sum(axis=1)
     arrived = (steps > 0) & (steps < height.shape[1])
@@ -155,7 +155,7 @@ def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
     tracks = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS)
     for carrier, colour in ((tracks.electrons, _ELECTRON), (tracks.holes, _HOLE)):
         for track in carrier:
-            # a light rim keeps the line readable on all of the map
+            # a light outline keeps the line visible everywhere on the map
             radius, height = np.hypot(track[:, 0], track[:, 1]), track[:, 2]
             axes.plot(radius, height, color="white", linewidth=2.2, alpha=0.75)
             axes.plot(radius, height, color=colour, linewidth=1.2)
@@ -163,7 +163,7 @@ def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
 
 
 def _starting_points(detector: Detector) -> tuple[FloatArray, FloatArray]:
-    """Few places over the active germanium, well away from its surfaces."""
+    """A few points in the active germanium, well away from its surfaces."""
     r, z = np.meshgrid(
         np.array([0.35, 0.75]) * detector.crystal_radius,
         np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
@@ -175,7 +175,7 @@ def _starting_points(detector: Detector) -> tuple[FloatArray, FloatArray]:
 
 
 def _outline(axes: Axes, detector: Detector) -> None:
-    """Contacts and lithium layer filled, all outside and the ditch white, a line around."""
+    """Fill contacts and lithium layer, blank the outside and the ditch, draw the outline."""
     step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
     r = np.arange(0, 1.05 * detector.crystal_radius, step)
     z = np.arange(0, 1.05 * detector.crystal_length, step)
@@ -184,10 +184,10 @@ def _outline(axes: Axes, detector: Detector) -> None:
     covers = [(~inside, "white")]
     covers += [(inside & (region == n), c) for n, _, c in _REGIONS]
     for where, colour in covers:
-        # slightly too wide, so that no line of the map shows between two covers
+        # slightly too wide, so that no gap shows between two patches
         axes.contourf(r, z, where.astype(float), [0.3, 1.5], colors=[colour], zorder=2.2)
     axes.contour(r, z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3)
-    # no contour runs along the edge of the drawing
+    # contours do not run along the edge of the axes
     bottom = np.where(inside[0], 0.0, np.nan)
     axes.plot(r, bottom, color="black", linewidth=1.0, zorder=2.3)
 
@@ -210,12 +210,12 @@ def _legend(figure: Figure, detector: Detector, fields: FieldMaps, paths: bool) 
 
 
 def _in_germanium(fields: FieldMaps, values: FloatArray) -> FloatArray:
-    """The map with the values of the germanium continued into lithium and ditch."""
+    """The map with the germanium's values extended into the lithium layer and the ditch."""
     return _filled(np.where(np.isin(fields.point_type, (LI_CONTACT, DITCH)), np.nan, values))
 
 
 def _filled(values: FloatArray) -> FloatArray:
-    """Nearest values where there are none, to be covered later: no gaps at the edges."""
+    """Fill missing values with the nearest ones, which avoids gaps at the covered edges."""
     nearest = distance_transform_edt(
         np.isnan(values), return_distances=False, return_indices=True
     )

@@ -1,13 +1,13 @@
-"""How far two distributions of a parameter are apart, and how far they are by chance.
+"""Distances between two distributions of a parameter, and their values by chance.
 
 The Wasserstein-1 (W1) and Kolmogorov–Smirnov (KS) distances of two finite samples of the
-*same* distribution are not zero, so each comes with its null: the distance of two
-samples that are drawn from the data themselves.
+*same* distribution are not zero.  Each therefore comes with its null: the distance of two
+samples drawn from the data themselves.
 
-Distances between the sets themselves are exact.  Those of their bootstraps are computed all at
-once on a common grid: the pooled values' quantiles, with each of the outermost values in
-a bin of its own.  The events of a bin stand at its mean.  With 256 bins and thousands of
-events, W1 is right within a twentieth of its null and KS within 0.004; sets of fewer values
+Distances between the datasets are exact.  Those of their bootstraps are computed together
+on a common grid, the quantiles of the pooled values, with each of the outermost values in
+a bin of its own.  The events of a bin are placed at its mean.  With 256 bins and thousands of
+events, W1 is accurate to a twentieth of its null and KS to 0.004.  Datasets with fewer values
 than bins are treated exactly.
 """
 
@@ -22,9 +22,9 @@ from cpunet.analysis.resampling import Draws
 
 Values = npt.NDArray[np.float64]
 
-NODES = 256  # bins of a bootstrapped error: the spread is that of a finer grid
-# A null's mean is compared with exact values, and on a grid the KS distance is too small:
-# by about 4 % with 256 bins, by 1 % with these.
+NODES = 256  # bins for bootstrapped errors; a finer grid gives the same spread
+# The mean of a null is compared with exact values, and on a grid the KS distance is too
+# small: by about 4 % with 256 bins, by 1 % with this number.
 NULL_NODES = 4096
 
 
@@ -38,9 +38,30 @@ class NullDistances(NamedTuple):
 
 
 def wasserstein(a: Values, b: Values) -> float:
-    """Wasserstein-1 distance of the finite values, in the parameter's own unit.
+    r"""Wasserstein-1 distance of the finite values, in the unit of the parameter.
 
-    NaN if a set has no finite values.
+    .. math:: W_1 = \int |F_a(x) - F_b(x)| \, dx
+
+    with the cumulative distributions :math:`F`.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both datasets.
+
+    Returns
+    -------
+    float
+        Distance; NaN if a dataset has no finite values.
+
+    Examples
+    --------
+    A shift is its own distance:
+
+    >>> import numpy as np
+    >>> values = np.array([0.0, 1.0, 5.0])
+    >>> wasserstein(values, values + 2)
+    2.0
     """
     from scipy.stats import wasserstein_distance
 
@@ -49,9 +70,29 @@ def wasserstein(a: Values, b: Values) -> float:
 
 
 def kolmogorov_smirnov(a: Values, b: Values) -> float:
-    """Largest difference of the cumulative distributions of the finite values, 0 … 1.
+    r"""Kolmogorov–Smirnov distance of the finite values, 0 … 1.
 
-    NaN if a set has no finite values.
+    .. math:: D = \max_x |F_a(x) - F_b(x)|
+
+    with the cumulative distributions :math:`F`.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both datasets.
+
+    Returns
+    -------
+    float
+        Distance; NaN if a dataset has no finite values.
+
+    Examples
+    --------
+    Half of the values are below all of the others:
+
+    >>> import numpy as np
+    >>> kolmogorov_smirnov(np.arange(4.0), np.arange(4.0) + 2)
+    0.5
     """
     a, b = np.sort(_finite(a)), np.sort(_finite(b))
     if not (a.size and b.size):
@@ -62,23 +103,24 @@ def kolmogorov_smirnov(a: Values, b: Values) -> float:
 
 
 def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
-    """Standard deviations of W1 and KS under resampling of both sets.
+    """Standard deviations of W1 and KS under resampling of both datasets.
 
-    Well above the null they are the scatter of fresh samples, within a tenth.  Near it
-    they are a fifth too large, as a bootstrap adds its own scatter to the samples', and
-    `null_distances` has the scale.
+    Well above the null they agree with the scatter of independent samples within a tenth.
+    Near the null they are a fifth too large, since a bootstrap adds its own scatter; there
+    `null_distances` gives the scale.
 
     Parameters
     ----------
     a, b
-        Values of both sets; those that are not finite are resampled, and ignored.
+        Values of both datasets; non-finite ones are resampled but ignored.
     draws
         Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
 
     Returns
     -------
     tuple of float
-        In the parameter's unit, and of the KS distance; NaN if a set has no finite values.
+        Errors of W1 (in the parameter's unit) and of the KS distance; NaN if a dataset has
+        no finite values.
     """
     finite = np.concatenate([_finite(a), _finite(b)])
     if not (np.isfinite(a).any() and np.isfinite(b).any()):
@@ -90,24 +132,37 @@ def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
 
 
 def null_distances(data: Values, draws: Draws) -> NullDistances:
-    """W1 and KS of the data with themselves: what a perfect translation would have.
+    r"""W1 and KS of the data with themselves: the distances of a perfect translation.
 
-    Two sets are drawn from the data with replacement, one as large as the simulated set
-    and one as large as the measured one, again and again.  Both distances scatter with a
-    tail upwards: of two samples of one distribution, 4 … 7 % are further apart than two
-    standard deviations above the mean.
+    .. math:: \langle d(D^*_{\mathrm{sim}}, D^*_{\mathrm{data}}) \rangle, \qquad
+        d = W_1 \text{ or } D
+
+    In each draw, two samples :math:`D^*` are drawn from the data with replacement, one of
+    the size of the simulated dataset and one of the size of the measured one.  Both
+    distances scatter with an upward tail: 4 … 7 % of the draws are more than two standard
+    deviations above the mean.
 
     Parameters
     ----------
     data
-        Measured values; those that are not finite are drawn, and ignored.
+        Measured values; non-finite ones are drawn but ignored.
     draws
         Bootstraps of the data, see `cpunet.analysis.resampling.resampled_twice`.
 
     Returns
     -------
     NullDistances
-        NaN if the data have no finite values or a set is empty.
+        NaN if the data have no finite values or a dataset is empty.
+
+    Examples
+    --------
+    Equal values have no distance:
+
+    >>> import numpy as np
+    >>> from cpunet.analysis.resampling import resampled_twice
+    >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
+    >>> null_distances(np.ones(50), draws).wasserstein
+    0.0
     """
     finite = _finite(data)
     if not (finite.size and all(d.size for d in draws)):
@@ -120,9 +175,9 @@ def null_distances(data: Values, draws: Draws) -> NullDistances:
 
 
 def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
-    """Upper edges of bins that hold every value, and the mean of the values in each.
+    """Upper edges of bins that contain every value, and the mean of the values in each.
 
-    The outermost values have bins of their own: a few far out can be most of W1.
+    The outermost values have bins of their own: a few outliers can dominate W1.
     """
     pooled = np.sort(pooled)
     n, tail = len(pooled), nodes // 8
@@ -138,18 +193,18 @@ def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
 
 
 def _bins(values: Values, upper: Values) -> npt.NDArray[np.intp]:
-    """Bin of each value, one beyond the last for values that are not finite."""
+    """Bin of each value; non-finite values get the number after the last bin."""
     return np.where(np.isfinite(values), np.searchsorted(upper, values), len(upper))
 
 
 def _distances(
     a: npt.NDArray[np.float32], b: npt.NDArray[np.float32], positions: Values
 ) -> tuple[Values, Values]:
-    """W1 and KS of histograms along the first axis whose events stand at `positions`.
+    """W1 and KS of histograms along the first axis, with their events at `positions`.
 
-    Of the draws that have an event in both.
+    Draws in which a histogram is empty are left out.
     """
-    # whole numbers, and sums of them, are exact below 2^24
+    # float32 represents whole numbers and their sums exactly below 2^24
     below = [np.cumsum(h, axis=0) for h in (a, b)]
     drawn = (below[0][-1] > 0) & (below[1][-1] > 0)
     if not drawn.any():

@@ -1,4 +1,4 @@
-"""One score of many validations: a line of small dots each, as SVG."""
+"""Forest plot of one score over many validations, as SVG."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from html import escape
 from cpunet.analysis.side_by_side import Cell, Row
 from cpunet.analysis.style import COLOURS
 
-WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: the panel, the names, what is left free
+WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: panel, names, right margin
 LINE, TOP, BOTTOM = 14, 6, 24
-LONGEST = 27  # characters of a name
+LONGEST = 27  # maximum characters of a name
 
 
 def dot_panel(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> str:
-    """Draw a score with errors, and what chance alone gives in grey.
+    """Draw a forest plot of a score with errors, and its expectation by chance in grey.
 
     Parameters
     ----------
     row
         One score of every validation; at least one has a value.
     names
-        Of the validations.
+        Names of the validations.
     starts
-        Where groups of them begin, by index; a line is drawn above.
+        Indices at which groups of validations begin; a line is drawn above each.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def dot_panel(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> str
 
 
 def _marks(cell: Cell, y: float, at: Callable[[float], float]) -> list[str]:
-    """What chance gives in grey, the score's error bar, and its dot."""
+    """The expectation by chance in grey, the error bar and the dot of a score."""
     marks: list[str] = []
     if cell.value is None:
         return marks
@@ -84,7 +84,7 @@ def _marks(cell: Cell, y: float, at: Callable[[float], float]) -> list[str]:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Two to five round numbers.
+    """Two to five round numbers for the axis.
 
     Examples
     --------
@@ -94,18 +94,18 @@ def ticks(low: float, high: float) -> list[float]:
     decade = 10.0 ** math.floor(math.log10((high - low) / 2))
     step = next(decade * n for n in (5, 2, 1) if decade * n <= (high - low) / 2)
     first, last = math.ceil(low / step), math.floor(high / step)
-    # rounded, as 3 * 0.1 is not 0.3
+    # rounded, since 3 * 0.1 is not exactly 0.3
     return [float(f"{step * i:.12g}") for i in range(first, last + 1)]
 
 
 def span(cells: Sequence[Cell]) -> tuple[float, float]:
-    """What a panel spans: every dot with its error, and what chance gives."""
+    """Range of the axis: every dot with its error, and the expectation by chance."""
     ends = []
     for cell in cells:
         for value, error in ((cell.value, cell.error), (cell.expected, cell.expected_std)):
             if cell.value is not None and value is not None:
                 ends += [value - (error or 0.0), value + (error or 0.0)]
     low, high = min(ends), max(ends)
-    # some space, also if all are equal
+    # some margin, even if all values are equal
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin

@@ -1,16 +1,16 @@
-"""Mean pulses of slices in rise time: where in the detector a translation is wrong.
+"""Mean pulses in slices of rise time: where in the detector a translation is wrong.
 
-Pulses of one slice come from the same places of the detector, and differ by their
-sites and by noise; their mean, aligned at half maximum, is the slice's superpulse.
-Its standard error is known, so a difference between simulation and data can be told
-from chance.
+Pulses of one slice come from the same regions of the detector and differ by their sites
+and by noise.  Their mean, aligned at half maximum, is the slice's superpulse.  Its standard
+error is known, so a difference between simulation and data can be distinguished from chance.
 
-Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``): it begins where the
-pulse does, and ends while that still rises.  The paper's drift time ends at the maximum, on a
-flat top that of the noise, which would smear the slices.
+Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``), which starts with the
+pulse and ends while it still rises.  The paper's drift time ends at the maximum, which on a
+flat top depends on the noise and would smear the slices.
 
-The slices are bounded by quantiles of the *data's* times, and each method is sliced by its
-own: one with the wrong response has other events in a slice, which is its fault as well.
+The slices are bounded by quantiles of the rise times of the *data*.  Each method is sliced
+by its own rise times: a method with the wrong response has other events in a slice, and this
+counts against it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from cpunet.pulses.container import FloatArray
 Values = npt.NDArray[np.float64]
 
 SLICES = 4
-FEWEST = 10  # pulses of a slice, below which the error of its mean is not known
+FEWEST = 10  # minimum pulses of a slice for an error of its mean
 EDGE_SAMPLES = 100
 
 
@@ -40,10 +40,10 @@ class Superpulse:
     Attributes
     ----------
     mean, error
-        Of shape ``(before + after,)``, in pulse heights; NaN where fewer than 2 pulses are
-        known.  Errors of neighbouring samples are correlated.
+        Mean and its standard error, shape ``(before + after,)``, in pulse heights; NaN where
+        fewer than 2 pulses contribute.  Errors of neighbouring samples are correlated.
     n
-        Pulses in the mean.
+        Number of pulses in the mean.
     """
 
     mean: Values
@@ -53,16 +53,17 @@ class Superpulse:
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """The superpulses of a set by time, and how many of its pulses are in none.
+    """The superpulses of a dataset by rise time, and the number of pulses left out.
 
     Attributes
     ----------
     pulses, edges
-        One for each slice, and the edges between them in ns.
+        Superpulse of each slice, and the edges of the slices in ns.
     before
         Samples before the crossing of half the maximum.
     left_out
-        Pulses by reason: ``no_time``, ``outside`` the edges, ``unaligned`` (no crossing).
+        Number of pulses left out by reason: ``no_time``, ``outside`` the edges, ``unaligned``
+        (no crossing).
     """
 
     pulses: tuple[Superpulse, ...]
@@ -73,32 +74,32 @@ class Slices:
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """A method's superpulse less that of the data, with its error, in pulse heights."""
+    """Superpulse of a method minus that of the data, with its error, in pulse heights."""
 
     difference: Values
     error: Values
 
     @property
     def z(self) -> Values:
-        """The difference in units of its error; NaN where there is none."""
+        r"""Pull :math:`z = (\bar{x} - \bar{x}_{\mathrm{data}}) / \sigma`; NaN without error."""
         known = self.error > 0
         return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
 
 
 def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
-    """Edges of slices that hold equally many of the data.
+    """Edges of slices with equal numbers of measured pulses.
 
     Parameters
     ----------
     rise_time
-        Of the measured pulses in ns; NaN and infinity are ignored.
+        Rise times of the measured pulses in ns; NaN and infinity are ignored.
     slices
-        How many; the edges, in ns, are one more.
+        Number of slices; one more edge is returned, in ns.
 
     Raises
     ------
     CpunetError
-        If there are no slices, or no time is finite.
+        If `slices` is less than 1, or no time is finite.
 
     Examples
     --------
@@ -123,16 +124,16 @@ def superpulses(
     windows
         Pulses of shape ``(n, length)`` with the baseline at 0.
     rise_time
-        By which they are sliced, shape ``(n,)``, in ns.
+        Rise time of each pulse in ns, shape ``(n,)``.
     edges
-        Of the slices, see `slice_edges`; the last slice includes its upper one.
+        Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
     before, after
-        Samples before the crossing of half the maximum, and from it on.
+        Number of samples before the crossing of half the maximum, and from it on.
 
     Raises
     ------
     CpunetError
-        If times and pulses are not equally many, or the pulses have no such shape.
+        If the numbers of times and pulses differ, or the pulses have another shape.
     """
     if rise_time.shape != (len(windows),):
         raise CpunetError(
@@ -157,12 +158,12 @@ def superpulses(
 
 
 def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]:
-    """Differences of the superpulses of a method from those of the data.
+    """Differences between the superpulses of a method and those of the data.
 
     Returns
     -------
     tuple
-        One for each slice; None where a side has fewer than 10 pulses.
+        Residual of each slice; None where a side has fewer than 10 pulses.
 
     Raises
     ------
@@ -186,16 +187,17 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
 def slice_table(
     sets: Mapping[str, Slices], dt_ns: float, edge_samples: int = EDGE_SAMPLES
 ) -> dict[str, Any]:
-    """How far each method's superpulses are from those of the data.
+    """Deviations of each method's superpulses from those of the data.
 
     Parameters
     ----------
     sets
-        By method, the measured ones under ``"data"``.
+        Superpulses by method, the measured ones under ``"data"``.
     dt_ns
         Sampling period in ns.
     edge_samples
-        The numbers are those of ``2 * edge_samples + 1`` samples around the crossing.
+        Half-width of the evaluated window: ``2 * edge_samples + 1`` samples around the
+        crossing.
 
     Returns
     -------
@@ -203,21 +205,20 @@ def slice_table(
         JSON-ready:
 
         ``edges_ns``
-            of the slices.
+            edges of the slices.
         ``left_out``
-            pulses in no slice, by method and reason.
+            number of pulses in no slice, by method and reason.
         ``slices``
             by method a list with, for each slice, ``n`` and ``n_data``; ``rms`` of the
-            residual and ``rms_error``, what chance alone would leave, both in percent of
-            full charge; ``largest`` residual in percent and the time of it,
-            ``largest_at_ns``, from the crossing; ``mean_abs_z`` and ``rms_z``, in units of
-            the error (0.80 and 1 if there is no difference).  Or ``missing`` and the
-            reason.
+            residual and ``rms_error``, its expectation by chance, both in percent of full
+            charge; the ``largest`` residual in percent and its time from the crossing,
+            ``largest_at_ns``; ``mean_abs_z`` and ``rms_z``, mean absolute pull and RMS pull
+            (0.80 and 1 if there is no difference).  Or ``missing`` with the reason.
 
     Raises
     ------
     CpunetError
-        If the sets do not fit each other.
+        If the datasets were not sliced and cut out alike.
     """
     data = sets["data"]
     return {

@@ -1,7 +1,6 @@
-"""One page to look at a crystal's pulses place by place: ideal, translated, measured.
+"""A page that shows a crystal's pulses point by point: ideal, translated, measured.
 
-The page needs nothing but itself: pulses are embedded as 16-bit numbers, and no request
-leaves it.
+The page is self-contained: pulses are embedded as 16-bit integers, and it makes no requests.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from cpunet.simulation.geometry import POINT_CONTACT, Detector
 
 Indices = npt.NDArray[np.int64]
 
-EDGE = 150  # samples on both sides of half maximum that are kept one by one
-TAIL_STEP = 4  # of the samples after them, one in so many
+EDGE = 150  # samples on each side of half maximum that are all kept
+TAIL_STEP = 4  # step between the later samples that are kept
 NUMBERS = {
     "drift_time": (PARAMETERS["drift_time"].label, "ns", 1),
     "current_amplitude": ("Current amplitude", "1/sample", 5),
@@ -45,32 +44,32 @@ _MAP_COLOURS = 64
 
 @dataclass(frozen=True, eq=False)
 class Exploration:
-    """What the page shows.
+    """Content of the page.
 
     Parameters
     ----------
     detector
-        For name and outline.
+        Detector whose name and outline are shown.
     recipe
-        Of the runs: preparation and scores.
+        Recipe of the runs, with preparation and scores.
     runs
-        Their names.
+        Names of the runs.
     dt_ns
         Sampling period of all pulses in ns.
     step_mm
-        Distance of neighbouring places.
+        Spacing of the grid points in mm.
     r_mm, z_mm
-        Places in the crystal, each of shape ``(places,)``.
+        Grid points in the crystal in mm, each of shape ``(points,)``.
     missing
-        Why a place has no pulse, ``""`` where it has one.
+        Reason why a grid point has no pulse, ``""`` where it has one.
     ideal
-        Prepared simulated windows of the places with a pulse, ``(n, samples)``.
+        Prepared simulated windows of the points with a pulse, shape ``(n, samples)``.
     translated
-        The same without noise by each run, ``(runs, n, samples)``.
+        Noise-free translations by each run, shape ``(runs, n, samples)``.
     measured, nearest
-        Prepared measured pulses and which of them are drawn, if there are any.
+        Prepared measured pulses, and which of them are drawn, if any.
     notes
-        Lines of plain text for the foot of the page.
+        Lines of plain text for the page footer.
     """
 
     detector: Detector
@@ -89,16 +88,16 @@ class Exploration:
 
 
 def explorer_page(shown: Exploration) -> str:
-    """The page as HTML.
+    """Return the page as HTML.
 
     Parameters
     ----------
     shown
-        Places, pulses and what is known of them.
+        Content of the page.
     """
     folder = files("cpunet.analysis")
     scripts = [(folder / f"explorer_{part}.js").read_text("utf-8") for part in SCRIPTS]
-    # no text in the data can end the element that holds it
+    # escaped, so that no text in the data can close its script element
     data = json.dumps(_content(shown), separators=(",", ":"), allow_nan=False)
     return Template((folder / "explorer.html").read_text("utf-8")).substitute(
         title=escape(f"Pulses of {shown.detector.name or 'a detector'} by place"),
@@ -143,21 +142,21 @@ def _content(shown: Exploration) -> dict[str, Any]:
 
 
 def _samples(recipe: Recipe) -> Indices:
-    """Samples drawn, counted from half maximum: all of the edge, some of the tail."""
+    """Drawn samples, counted from half maximum: the whole edge, part of the tail."""
     before, after = recipe.preparation.samples_before, recipe.preparation.samples_after
     edge = np.arange(-min(EDGE, before), min(EDGE, after))
     return np.concatenate([edge, np.arange(EDGE, after, TAIL_STEP)])
 
 
 def _drawn(windows: FloatArray, samples: Indices) -> FloatArray:
-    """Windows aligned at half maximum, at the samples that are drawn."""
+    """Windows aligned at half maximum, at the drawn samples."""
     before = -int(samples[0])
     aligned = align_half_maximum(windows, before, int(samples[-1]) + 1)
     return aligned[:, samples + before]
 
 
 def _of_runs(shown: Exploration, samples: Indices) -> dict[str, Any]:
-    """The translation and its numbers; of several runs their mean, spread, and the bands."""
+    """Translation and parameters; of several runs their mean, spread and bands."""
     drawn = np.stack([_drawn(windows, samples) for windows in shown.translated])
     by_run = [_numbers(windows, shown) for windows in shown.translated]
     wave = _packed(drawn.mean(axis=0))
@@ -165,7 +164,7 @@ def _of_runs(shown: Exploration, samples: Indices) -> dict[str, Any]:
         return {"wave": wave, "numbers": _told(by_run[0])}
     edge = int((samples < EDGE).sum())
     current = np.stack([_current(waves[:, :edge]) for waves in drawn])
-    # a run without a value leaves the place without one
+    # one run without a value leaves the grid point without one
     columns = {name: np.stack([numbers[name] for numbers in by_run]) for name in NUMBERS}
     told: dict[str, Any] = {
         "wave": wave,
@@ -178,7 +177,7 @@ def _of_runs(shown: Exploration, samples: Indices) -> dict[str, Any]:
 
 
 def _measured(shown: Exploration, samples: Indices) -> dict[str, Any] | None:
-    """The measured pulses that are nearest to some place, each once."""
+    """The measured pulses that are nearest to any grid point, each once."""
     if shown.measured is None or shown.nearest is None:
         return None
     rows, index = np.unique(shown.nearest.index, return_inverse=True)
@@ -214,14 +213,14 @@ def _smoothing() -> Values:
 
 
 def _current(waves: FloatArray) -> FloatArray:
-    """Smoothed rise per sample, halfway between samples; shorter by the smoothing."""
+    """Smoothed current per sample, midway between samples; shortened by the smoothing."""
     kernel = _smoothing()[::-1]
     rise = np.diff(waves.astype(float), axis=1)
     return np.stack([np.convolve(one, kernel, "valid") for one in rise]).astype(np.float32)
 
 
 def _packed(values: FloatArray) -> dict[str, Any]:
-    """Samples as 16-bit numbers in base64; `_MISSING` stands for NaN."""
+    """Samples as base64-encoded 16-bit integers; `_MISSING` represents NaN."""
     top = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
     numbers = np.where(np.isnan(values), _MISSING, np.round(values / top * _FULL))
     return {
@@ -243,12 +242,12 @@ def _colour_map() -> list[str]:
 
 
 def _outlines(detector: Detector) -> dict[str, Any]:
-    """Closed lines (r, z in mm) about crystal, active germanium and point contact."""
+    """Closed outlines (r, z in mm) of crystal, active germanium and point contact."""
     from matplotlib.figure import Figure
 
     length, radius = detector.crystal_length, detector.crystal_radius
     step = max(length, radius) / _OUTLINE_POINTS
-    # nodes half a step off the axis and the face, so that lines run along these
+    # nodes half a step off the axis and the face, so that outlines run along these
     r, z = (np.arange(-0.5, side / step + 2) * step for side in (radius, length))
     rr, zz = np.meshgrid(r, z)
     within = (rr > 0) & (zz > 0)

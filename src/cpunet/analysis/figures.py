@@ -1,7 +1,7 @@
 """Figures of a training and of its validation; each function returns a `Figure`.
 
-Object-oriented matplotlib throughout: nothing is drawn on a global state, so figures
-can be made in worker processes and notebooks alike.  Saving is the caller's.
+Only matplotlib's object-oriented interface is used.  Without global state, figures can be
+made in worker processes and notebooks alike.  The caller saves them.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from cpunet.pulses.parameters import PARAMETERS
 
 Values = npt.NDArray[np.float64]
 
-# Panels of the loss figure: which losses, under which name, in which colour.
-CHI_SQUARE = "chi_square"  # the only loss of a matched response
+# Panels of the loss figure: losses with their label and colour.
+CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Cycle and identity": {
         "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
@@ -46,14 +46,15 @@ LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
 
 @styled
 def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figure:
-    """The losses over the training: each record faint, the moving average on top.
+    """Losses during the training: each record faint, the moving average on top.
 
     Parameters
     ----------
     records
-        The training log: ``{"iteration": i, "losses": {name: value, …}}``, in order.
+        Records of the training log: ``{"iteration": i, "losses": {name: value, …}}``, in
+        order.
     window
-        Records in the moving average.
+        Number of records in the moving average.
 
     Raises
     ------
@@ -84,7 +85,7 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
 
 
 def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Chi-square of a matched response after each step of its fit."""
+    """Chi-square of a fitted chain after each step of the fit."""
     figure = Figure(figsize=(4.6, 3.4))
     axes = figure.subplots()
     axes.plot(
@@ -108,19 +109,19 @@ def cycle_figure(
     dt_ns: float,
     pulses: int = 10,
 ) -> Figure:
-    """A few pulses through one cycle in three panels (paper, figure of the cycles).
+    """A few pulses through one cycle, in three panels (paper, figures of the cycles).
 
     Parameters
     ----------
     start, middle, end
-        Pulses of shape ``(n, length)`` before, half-way through and after the cycle,
-        row by row of the same event.
+        Pulses before, half-way through and after the cycle, shape ``(n, length)``; each
+        row is the same event in all three.
     titles
-        Of the three panels.
+        Titles of the three panels.
     dt_ns
         Sampling period in ns.
     pulses
-        How many of the pulses are drawn.
+        Number of pulses that are drawn.
     """
     figure = Figure(figsize=(10.5, 3.2))
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
@@ -144,21 +145,21 @@ def parameter_histograms(
 ) -> Figure:
     """Distributions of one parameter: the data filled, each method as a line.
 
-    All histograms sum to one.  The outermost bars hold what lies outside the axis, and
-    the legend gives each method's IoU and the ceiling.
+    All histograms sum to one.  The outermost bars are underflow and overflow.  The legend
+    gives each method's IoU and the ceiling.
 
     Parameters
     ----------
     values
-        By method, with the measured ones under ``"data"``.
+        Values of the parameter by method, the measured ones under ``"data"``.
     axis
         Binning, see `comparisons.data_axis`.
     parameter
-        Its name in `PARAMETERS`.
+        Name of the parameter in `PARAMETERS`.
     peak
         Name of the gamma line, for the title.
     comparison
-        The parameter's entry of `comparisons.compare`.
+        Result of `comparisons.compare` for the parameter.
     """
     palette = colours(values)
     edges = _edges_with_flow(axis)
@@ -177,7 +178,7 @@ def parameter_histograms(
             label=f"{label(method)}{_score(method, comparison)}, {_size(values[method])}",
             zorder=1 if is_data else 2,
         )
-    # the bars at the ends may be as high as 1 and would flatten all that is between
+    # the outermost bars can be as high as 1 and would flatten everything in between
     top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
     axes.set(
         xlabel=PARAMETERS[parameter].axis_label,
@@ -192,7 +193,7 @@ def parameter_histograms(
 
 
 class MeanPulse(NamedTuple):
-    """The mean of `n` pulses, aligned at half maximum, `before` samples before it."""
+    """Mean of `n` pulses, aligned at half maximum, which is at sample `before`."""
 
     n: int
     mean: Values
@@ -206,13 +207,13 @@ class MeanPulse(NamedTuple):
 
 @styled
 def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figure:
-    """Mean pulses aligned at half maximum, and their differences from the data's.
+    """Mean pulses aligned at half maximum, and their differences from the data.
 
     Parameters
     ----------
     sets
-        Mean pulses by method, the measured one under ``"data"``; methods are drawn over
-        each other in this order.
+        Mean pulses by method, the measured one under ``"data"``; methods are drawn in this
+        order, later ones on top.
     dt_ns
         Sampling period in ns.
     peak
@@ -224,7 +225,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     time_ns = (np.arange(len(data.mean)) - data.before) * dt_ns
     figure = Figure(figsize=(5.6, 4.8))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    # the translation last, so that nothing hides it
+    # the translation last, so that it is on top
     for method in sorted(means, key=lambda name: name == "ren"):
         mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
         # a broad grey line, so that a method which agrees does not hide the data
@@ -235,7 +236,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         )
         above.plot(time_ns, mean, label=text, **look)
         if method == "raw":
-            # its height alone would be most of its difference
+            # its different height would dominate the difference
             mean, look["linestyle"] = mean * data.mean[-1] / mean[-1], "dashed"
             above.plot(time_ns, mean, label="the same, at the data's height", **look)
         if method != "data":
@@ -255,7 +256,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
 
 
 def _moving_average(series: Values, window: int) -> Values:
-    """Mean of each `window` neighbours; of all values if there are fewer."""
+    """Moving average over `window` values, or over all if there are fewer."""
     width = min(window, len(series))
     return np.convolve(series, np.full(width, 1 / width), mode="valid")
 
@@ -267,7 +268,7 @@ def _shades(count: int) -> Sequence[tuple[float, float, float, float]]:
 
 
 def _edges_with_flow(axis: hist.axis.Regular) -> Values:
-    """Edges of the bins, and of a bar at either end for what lies outside."""
+    """Edges of the bins, and of a bar at either end for underflow and overflow."""
     edges: Values = axis.edges
     bar = max(edges[-1] - edges[0], np.spacing(edges[-1])) / 25
     return np.concatenate([[edges[0] - bar], edges, [edges[-1] + bar]])
@@ -287,7 +288,7 @@ def _size(sample: Values) -> str:
 def _mark_flow(
     axes: Axes, edges: Values, fractions: Mapping[str, Values], palette: Mapping[str, str]
 ) -> None:
-    """Set the outer bars apart, and write the height of those that leave the figure."""
+    """Separate the outermost bars, and label those that exceed the axis."""
     top = axes.get_ylim()[1]
     for bar, edge, side in ((0, edges[1], "left"), (-1, edges[-2], "right")):
         axes.axvline(edge, color="0.55", linewidth=0.8, linestyle=":")

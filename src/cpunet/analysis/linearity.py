@@ -1,17 +1,20 @@
-"""Whether a translation adds: the translated sum of two pulses against the sum of theirs.
+r"""Test of additivity: the translated sum of two pulses against the sum of the translations.
 
-A readout is linear, so the response to an event with two sites is the sum of those to the
-sites.  A network need not be, and a validation on single distributions does not tell.
+A readout is linear: the response to an event with two sites is the sum of the responses to
+the sites.  A network need not be linear, and a validation on single distributions does not
+reveal it.
 
-Two prepared pulses are summed with weights w and 1 − w as they are, aligned at the same
-sample, and the sum is translated.  A translation moves its result to where its maximum
-is, and scales it by its tail: neither move nor height is known.  So the sum's translation
-is compared with ``a T(x1)(t − d1) + b T(x2)(t − d2)`` where the two moves and the two
-heights are those that leave the least squares.  What is left no move or height explains:
-it is 0 for a linear response, and a lower limit for any other, as heights may hide a part
-of what does not add.  With heights in the ratio of w and 1 − w (``shared``) they cannot;
-what is left then includes that a pulse whose charge comes later has decayed less, which
-is linear too: an upper limit.
+Two prepared pulses, aligned at the same sample, are summed with weights :math:`w` and
+:math:`1 - w`, and the sum is translated.  A translation aligns its result at its maximum and
+scales it by its tail, so neither shift nor height is known.  The residual is
+
+.. math:: T(w x_1 + (1 - w) x_2)(t) - a \, T(x_1)(t - d_1) - b \, T(x_2)(t - d_2)
+
+with the shifts :math:`d` and the heights :math:`a, b` that minimise its sum of squares.  It
+is 0 for a linear response.  For any other it is a lower limit, since the free heights can
+absorb a part of the nonlinearity.  With heights in the ratio of :math:`w` and :math:`1 - w`
+(``shared``) they cannot; then the residual also contains that a pulse whose charge arrives
+later has decayed less, which is linear too: an upper limit.
 """
 
 from __future__ import annotations
@@ -32,13 +35,13 @@ Translate = Callable[[FloatArray], FloatArray]
 PAIRS = 200
 WEIGHTS = (0.2, 0.8)
 EDGE_SAMPLES = 100
-REACH = 32  # samples: the largest move of each part that is tried
-STEPS = 12  # of Gauss and Newton
+REACH = 32  # samples: largest shift of each part that is tried
+STEPS = 12  # maximum number of Gauss-Newton steps
 SMALLEST = 1e-7  # of a sample: the last step
 
 
 class _Fit(NamedTuple):
-    """One pair: RMS of the residuals, size of the moves, and how well they are known."""
+    """Fit of one pair: RMS of the residuals, size of the shifts, and their errors."""
 
     rms: float
     edge_rms: float
@@ -49,7 +52,7 @@ class _Fit(NamedTuple):
 
 
 class _Match(NamedTuple):
-    """Moves of the parts, what they leave of the whole, and its derivatives."""
+    """Shifts of the parts, the residual of the sum, and its derivatives."""
 
     moves: Values
     residual: Values
@@ -69,14 +72,15 @@ def linearity_residual(
     Parameters
     ----------
     translate
-        Prepared windows ``(n, length)`` to windows of that shape without noise; rows of NaN
-        where it cannot be done.
+        Function from prepared windows ``(n, length)`` to noise-free translated windows of the
+        same shape, with rows of NaN where a translation fails.
     windows
         Prepared simulated pulses.
     rng
-        Draws the pairs, of different pulses, and the weights, uniform in 0.2 … 0.8.
+        Random generator of the pairs of different pulses and of the weights, which are
+        uniform in 0.2 … 0.8.
     pairs
-        How many.
+        Number of pairs.
     edge_samples
         Half-width of the window around the crossing of half the maximum for ``edge_rms``.
 
@@ -87,16 +91,16 @@ def linearity_residual(
 
         ``pairs``, ``not_translated``, ``unmatched``
             pairs compared; left out because a pulse or the sum could not be translated; left
-            out because no move up to 32 samples matches.
+            out because no shift up to 32 samples fits.
         ``rms``, ``edge_rms``
-            of the residual in units of full charge, over the window and over the edge.
+            RMS of the residual in units of full charge, over the window and over the edge.
         ``shared_rms``, ``shared_edge_rms``
             the same with heights in the ratio of the weights.
         ``move_samples``
-            size of the moves of the parts (the larger of the two), in samples.
+            shift of the parts (the larger of the two), in samples.
         ``ambiguity_samples``
-            error of the difference of the two moves if each sample were off by the residual's
-            RMS at random, 64 at most: with parts alike in shape it is large, and harmless.
+            error of the difference of the two shifts if the residual were random with its
+            RMS, at most 64.  For parts of similar shape it is large, which is harmless.
 
         The last six are ``{"median": …, "q90": …}`` over pairs.  If no pair is left
         there is ``missing`` with the reason instead.
@@ -104,7 +108,7 @@ def linearity_residual(
     Raises
     ------
     CpunetError
-        If there are fewer than 2 pulses, no pair is asked for, or the translation has
+        If there are fewer than 2 pulses, `pairs` is less than 1, or the translation has
         another shape.
     """
     if windows.ndim != 2 or len(windows) < 2 or pairs < 1:
@@ -148,8 +152,8 @@ def _translated(translate: Translate, windows: FloatArray) -> Values:
 def _compare(
     total: Values, one: Values, other: Values, weight: float, edge_samples: int
 ) -> _Fit | None:
-    """Fit moves and heights of both parts to the whole."""
-    inner = np.arange(REACH + 2, len(total) - REACH - 2)  # known whatever the move
+    """Fit shifts and heights of both parts to the translated sum."""
+    inner = np.arange(REACH + 2, len(total) - REACH - 2)  # known for every shift
     if len(inner) < 8:
         return None
     target = total[inner]
@@ -180,7 +184,7 @@ def _matched(
     inner: npt.NDArray[np.int64],
     target: Values,
 ) -> _Match | None:
-    """Least squares in the moves and in the heights, of which `mixing` makes the parts'."""
+    """Least squares in the shifts and heights; `mixing` maps heights to those of the parts."""
     for _ in range(STEPS):
         parts, heights, residual = _at(curves, moves, mixing, inner, target)
         slopes = np.stack(
@@ -204,7 +208,7 @@ def _matched(
 def _best_whole_moves(
     target: Values, one: Values, other: Values, inner: npt.NDArray[np.int64]
 ) -> Values:
-    """The whole samples by which the parts are to be moved, of all within reach."""
+    """The best shifts of the parts in whole samples, of all within reach."""
     moves = np.arange(-REACH, REACH + 1)
     a, b = (pulse[inner - moves[:, np.newaxis]] for pulse in (one, other))
     aa, bb = (a * a).sum(axis=1)[:, np.newaxis], (b * b).sum(axis=1)[np.newaxis]
@@ -225,7 +229,7 @@ def _at(
     inner: npt.NDArray[np.int64],
     target: Values,
 ) -> tuple[Values, Values, Values]:
-    """The moved parts, the best heights and what is left of the whole."""
+    """The shifted parts, the best heights and the residual."""
     columns = [c(inner - d) for c, d in zip(curves, moves, strict=True)]
     parts: Values = np.stack(columns, axis=1)
     heights = np.asarray(np.linalg.lstsq(parts @ mixing, target, rcond=1e-9)[0], float)
@@ -237,13 +241,13 @@ def _rms(values: Values) -> float:
 
 
 def _ambiguity(jacobian: Values, rms: float) -> float:
-    """Error of the difference of the moves, heights and common move being free."""
+    """Error of the difference of the shifts, with heights and common shift free."""
     columns = np.column_stack(
         [jacobian[:, :2], jacobian[:, 2:].sum(axis=1), jacobian[:, 2] - jacobian[:, 3]]
     )
     others, wanted = columns[:, :3], 0.5 * columns[:, 3]
     left = wanted - others @ np.linalg.lstsq(others, wanted, rcond=1e-9)[0]
-    # more than the moves tried would mean nothing
+    # errors beyond the range of shifts are meaningless
     return float(min(rms / max(np.sqrt(left @ left), 1e-12), 2 * REACH))
 
 

@@ -1,4 +1,4 @@
-"""Which measured pulses are most like given ones."""
+"""Find the measured pulses most similar to given ones."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Measured pulses most like each of some others.
+    """Measured pulses nearest to each of the given pulses.
 
     Parameters
     ----------
     index
-        Rows of the measured set, shape ``(n, count)``, the nearest first.
+        Rows of the measured dataset, shape ``(n, count)``, the nearest first.
     rms
-        RMS difference to each, in units of the pulse height.
+        RMS difference from each, in units of the pulse height.
     unaligned
-        Measured pulses left out because too little of the edge region about the crossing of
-        half of their maximum is in their window.
+        Number of measured pulses left out because their window contains too little of the
+        edge region around half maximum.
     """
 
     index: Indices
@@ -40,28 +40,28 @@ def nearest_pulses(
     before: int | None = None,
     least: float = 1.0,
 ) -> Nearest:
-    """Find the measured pulses with the least RMS difference from each of some edges.
+    """Find the measured pulses with the smallest RMS difference from each given edge.
 
-    Noise counts as difference.
+    Noise contributes to the difference.
 
     Parameters
     ----------
     edges
         Pulses aligned at half maximum by `align_half_maximum`, shape ``(n, samples)``.
     measured
-        Prepared windows, ``(m, samples)``, which are aligned likewise.
+        Prepared windows of shape ``(m, samples)``, which are aligned in the same way.
     count
-        How many to find; all, if fewer can be aligned.
+        Number of pulses to find; all, if fewer can be aligned.
     before
         Samples of the edges before half maximum; half of them if None.
     least
-        Part of the samples known of the edges that must be in a measured window; the
-        comparison is on what is known of both.
+        Fraction of the known samples of the edges that a measured window must contain.
+        Samples known in both are compared.
 
     Raises
     ------
     CpunetError
-        If the arrays are no pulses.
+        If the arrays do not have the shape of pulses.
     """
     before = edges.shape[1] // 2 if before is None else before
     best = np.zeros((len(edges), 0))

@@ -1,4 +1,4 @@
-"""Tables of the report's page, and any nesting of values as such."""
+"""HTML tables of the report, from plain rows or nested values."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 from cpunet.analysis.style import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
-STD = "_std"  # end of the name of an error
+STD = "_std"  # suffix of the name of an error
 MOST_DIGITS = 9  # after the decimal point
-LONG = 12  # values, from which on a list is summarised
-BROAD = 6  # columns, from which on a table is turned if it has fewer rows
+LONG = 12  # lists of this length or more are summarised
+BROAD = 6  # tables of this many columns or more are transposed if they have fewer rows
 
 
 def html_table(
@@ -21,10 +21,10 @@ def html_table(
     rows: Sequence[Sequence[str]],
     words: frozenset[int] | set[int] = frozenset(),
 ) -> str:
-    """Return a table in which the columns `words` are aligned as words, others as numbers."""
+    """Return a table; the columns `words` are aligned as text, all others as numbers."""
 
     def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
-        # the page aligns the first column as words already
+        # the style sheet already aligns the first column as text
         return "".join(
             f"<{tag}{attribute}"
             + (' style="text-align: left"' if i in words and i else "")
@@ -41,17 +41,17 @@ def html_table(
 
 
 def nested_html(value: Any, level: int = 4) -> str:
-    """Return any nesting of mappings, lists and values as tables under headings.
+    """Return nested mappings, lists and values as tables under headings.
 
-    A value's error, of the same name with ``_std``, stands beside it; ``missing`` with a
-    text becomes a sentence; long lists are summarised, `metrics.json` has them in full.
+    An error, of the same name with ``_std``, is shown with its value.  ``missing`` with a
+    text becomes a sentence.  Long lists are summarised; `metrics.json` has them in full.
 
     Parameters
     ----------
     value
-        As it comes from ``metrics.json``.
+        Any part of ``metrics.json``.
     level
-        Of the headings, 1 … 6.
+        Level of the headings, 1 … 6.
     """
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(item, Mapping) for item in value):
@@ -80,14 +80,14 @@ def nested_html(value: Any, level: int = 4) -> str:
 
 
 def number(value: Any) -> str:
-    """Write a value as the page shows it: four digits are enough to compare two scores."""
+    """Format a value for the page: four digits suffice to compare two scores."""
     if value is None:
         return NO_VALUE
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def with_std(value: Any, error: Any) -> str:
-    """Write a value with its error, if it has one, to two digits of that.
+    """Format a value with its error, if any, to two digits of the error.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def with_std(value: Any, error: Any) -> str:
 
 
 def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> str:
-    """Return mappings of values side by side: one row each, or one column if that is less."""
+    """Return mappings of values as one table: one row each, or one column each if shorter."""
     rows = {name: _with_errors(row) for name, row in rows.items()}
     names = list(dict.fromkeys(column for row in rows.values() for column in row))
     if len(names) > BROAD and len(names) > len(rows):
@@ -119,7 +119,7 @@ def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> str:
 
 
 def _with_errors(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Join each value with the error of its name, also where both are mappings."""
+    """Join each value with the error of the same name, also where both are mappings."""
     joined: dict[str, Any] = {}
     for name, value in values.items():
         if name.endswith(STD) and name.removesuffix(STD) in values:

@@ -1,8 +1,7 @@
 """Scores of pulses whose true measured shape is known, pulse by pulse.
 
-Two pulses are compared after both were moved so that they cross half of their maximum
-at the same time: a shift that the electronics or the alignment leaves is no
-difference of shape.
+Two pulses are compared after both are shifted to cross half of their maximum at the same
+time: a time shift left by the electronics or the alignment is not a difference of shape.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-BLOCK = 512  # pulses at a time, to bound memory
-BISECTIONS = 30  # of one sample: 1e-9 of it
-PAD = 8  # samples of the edge value; the spline forgets its end by a factor 3.7 a sample
+BLOCK = 512  # pulses per block: bounds memory
+BISECTIONS = 30  # of one sample: a precision of 1e-9
+PAD = 8  # samples of the edge value; the effect of the spline's end falls by 3.7 per sample
 
 
 class PairedScores(TypedDict):
-    """Differences of pulse pairs in units of the full charge, and pairs left out."""
+    """RMS differences of pulse pairs in units of the full charge, and pairs left out."""
 
     rmse: float
     edge_rmse: float
@@ -32,20 +31,19 @@ class PairedScores(TypedDict):
 
 
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
-    """Move each pulse so that it crosses half of its maximum at sample `n_before`.
+    """Shift each pulse so that it crosses half of its maximum at sample `n_before`.
 
     The crossing is the last upward one before the maximum, searched backward from it.
-    Its time and the moved pulse are both read from the pulse's cubic spline: straight
-    lines between samples would smooth the edge.  The maximum is the pulse's own, its
-    largest sample; noise of relative size s on a flat top raises it, and with it the
-    level, by 2–3 s and 1–1.5 s.
+    Its time and the shifted pulse are evaluated with the pulse's cubic spline; linear
+    interpolation would smooth the edge.  The maximum is the largest sample of the pulse.
+    Noise of relative RMS s on a flat top raises it by 2–3 s, and the level by 1–1.5 s.
 
     Parameters
     ----------
     waveforms
         Pulses of shape ``(n, length)`` with the baseline at 0.
     n_before, n_after
-        Samples before the crossing, and from it on.
+        Number of samples before the crossing, and from it on.
 
     Returns
     -------
@@ -56,7 +54,7 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
     Raises
     ------
     CpunetError
-        If `waveforms` has no shape (pulses, samples), or a pulse has fewer than 2 samples.
+        If `waveforms` is not of shape (pulses, samples), or a pulse has fewer than 2 samples.
 
     Examples
     --------
@@ -76,30 +74,42 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
 
 
 def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) -> PairedScores:
-    """Root-mean-square difference of translated pulses from their true shapes.
+    r"""Root-mean-square difference of translated pulses from their true shapes.
 
-    Both sets are aligned at half maximum.  The mean of the squares runs over pulses
-    and samples: all samples that both records of a pair have, and the
+    .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{p, k} (x_{pk} - y_{pk})^2}
+
+    over pulses :math:`p` and samples :math:`k`, after alignment of both at half maximum:
+    once over all samples that both records of a pair have, and once over the
     ``2 * edge_samples + 1`` samples around the crossing.
 
     Parameters
     ----------
     translated, truth
-        Pulses of shape ``(n, length)``, row by row of the same event.
+        Pulses of shape ``(n, length)``; each row is the same event in both.
     edge_samples
-        Half-width of the edge's window.
+        Half-width of the edge window in samples.
 
     Returns
     -------
     dict
-        ``rmse`` and ``edge_rmse`` in units of the full charge, and ``unaligned``, the
-        number of pairs left out because one of the two does not cross half of its
-        maximum.  NaN scores if no pair is left.
+        ``rmse`` and ``edge_rmse`` in units of the full charge (NaN if no pair is left), and
+        ``unaligned``, the number of pairs left out because one of the two does not cross
+        half of its maximum.
 
     Raises
     ------
     CpunetError
-        If the two sets have not equally many pulses, or not such a shape.
+        If the numbers of pulses differ, or the arrays do not have the shape of pulses.
+
+    Examples
+    --------
+    A time shift is no difference of shape:
+
+    >>> import numpy as np
+    >>> time = np.arange(100)
+    >>> early, late = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40, 50)])
+    >>> round(paired_scores(late[None], early[None], edge_samples=10)["rmse"], 6)
+    0.0
     """
     return scores_of_squares(pair_squares({"": translated}, truth, edge_samples)[""])
 
@@ -107,20 +117,20 @@ def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) 
 def pair_squares(
     methods: Mapping[str, FloatArray], truth: FloatArray, edge_samples: int
 ) -> dict[str, Values]:
-    """Squared differences from the truth, pulse by pulse: what `paired_scores` sums.
+    """Squared differences from the truth, pulse by pulse: the summands of `paired_scores`.
 
     Parameters
     ----------
     methods
-        Translated pulses by method, as for `paired_scores`.
+        Translated pulses by method, see `paired_scores`.
     truth, edge_samples
-        As for `paired_scores`.
+        See `paired_scores`.
 
     Returns
     -------
     dict
-        By method, shape ``(n, 4)``: sum of the squares and number of samples, over the
-        whole record and over the edge's window; all 0 where a pulse cannot be aligned.
+        Arrays of shape ``(n, 4)`` by method: sum of squares and number of samples, over the
+        whole record and over the edge window; all 0 where a pulse cannot be aligned.
     """
     _check_shape(truth)
     for translated in methods.values():
@@ -133,7 +143,7 @@ def pair_squares(
     found = {method: np.zeros((len(truth), 4)) for method in methods}
     for first in range(0, len(truth), BLOCK):
         rows = slice(first, first + BLOCK)
-        aligned: dict[int, Values] = {}  # the truth's, by half-width
+        aligned: dict[int, Values] = {}  # of the truth, by half-width
         for method, translated in methods.items():
             half = max(truth.shape[1], translated.shape[1])
             if half not in aligned:
@@ -147,7 +157,7 @@ def pair_squares(
 
 
 def scores_of_squares(squares: Values) -> PairedScores:
-    """`paired_scores` of the pulses whose `pair_squares` are given."""
+    """The result of `paired_scores` from that of `pair_squares`."""
     total = squares.sum(axis=0)
     return {
         "rmse": _root_mean(total[:2]),
@@ -177,7 +187,7 @@ def _aligned(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     start = np.floor(crossing).astype(int)
     end = waveforms.shape[1] - (crossing > start)
     weights = _cubic_weights(crossing - start)
-    # row by row: an index for every sample would take ten times as long
+    # row by row: fancy indexing of every sample would take ten times as long
     for row, curve, at, known, w in zip(
         np.flatnonzero(usable), coefficients, start, end, weights, strict=True
     ):
@@ -191,7 +201,7 @@ def _aligned(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
 def _half_maximum_sample(
     waveforms: FloatArray,
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Which pulses cross half of their maximum, and their last sample below it."""
+    """Mask of the pulses that cross half of their maximum, and their last sample below it."""
     length = waveforms.shape[1]
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
@@ -203,7 +213,7 @@ def _half_maximum_sample(
 
 
 def _spline_coefficients(waveforms: FloatArray) -> Values:
-    """Cubic B-spline coefficients of each pulse, its edge values held for `PAD` samples."""
+    """Cubic B-spline coefficients of each pulse, padded by `PAD` samples of its end values."""
     from scipy.ndimage import spline_filter1d
 
     padded = np.pad(waveforms.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
@@ -229,7 +239,7 @@ def _cubic_weights(fraction: Values) -> Values:
 
 
 def _squares(difference: Values) -> Values:
-    """Sum of the squares of what is not NaN, and how many those are, row by row."""
+    """Sum of squares of the values that are not NaN, and their number, row by row."""
     known = np.isfinite(difference)
     values = np.where(known, difference, 0)
     return np.stack([np.einsum("ij,ij->i", values, values), known.sum(axis=1)], axis=1)

@@ -1,7 +1,7 @@
 """Figures of energies and of single pulses, as in the paper (Bhimani et al. 2026).
 
-Which simulated and which measured pulse come from the same place nobody knows; a simulated
-pulse is shown beside the measured one that is nearest to its translation.
+It is unknown which simulated and which measured pulses come from the same position.  A
+simulated pulse is therefore shown beside the measured one nearest to its translation.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Values = npt.NDArray[np.float64]
 
 BIN_KEV = 2.0
 MOST_BINS = 2000
-BEFORE, AFTER = 100, 150  # samples around the crossing by which the nearest pulse is sought
+BEFORE, AFTER = 100, 150  # samples around the crossing that define the nearest pulse
 LINEAR = 1.0  # percent of full charge, up to which the scale of differences is linear
 ZOOM_NS = (-600.0, 800.0)
-UNDECAYED = "raw"  # the method that has no decay to be corrected for
-TARGETS = ("ren", "truth", "raw")  # to which the measured pulse is to be near, best first
+UNDECAYED = "raw"  # the method without a decay to correct
+TARGETS = ("ren", "truth", "raw")  # methods to which the measured pulse is matched, best first
 
 
 @styled
@@ -41,16 +41,17 @@ def spectrum_figure(
     Parameters
     ----------
     energy_kev
-        By method, the measured ones under ``"data"``; ``"raw"`` is the simulation.
+        Energies in keV by method, the measured ones under ``"data"``; ``"raw"`` is the
+        simulation.
     peaks
         Energy of each line in keV, by name.
     bin_kev
-        Width of the bins; wider ones are taken if there would be more than 2000.
+        Bin width in keV; wider bins are used if there would be more than 2000.
 
     Raises
     ------
     CpunetError
-        If no energy is finite, or the width is not above 0.
+        If no energy is finite, or the width is not positive.
     """
     finite = {m: values[np.isfinite(values)] for m, values in energy_kev.items()}
     everything = np.concatenate([np.empty(0), *finite.values()])
@@ -85,20 +86,20 @@ def spectrum_figure(
 
 
 def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
-    """The pulse most like another: least RMS difference, both aligned at half maximum.
+    """The pulse with the smallest RMS difference from another, aligned at half maximum.
 
     Parameters
     ----------
     windows
-        Pulses of shape ``(n, length)`` to choose from.
+        Pulses to choose from, shape ``(n, length)``.
     target
-        One pulse, shape ``(length,)``.
+        Pulse to compare with, shape ``(length,)``.
 
     Returns
     -------
     tuple
-        Its row, and the RMS difference from 100 samples before the crossing to 150 after, in
-        pulse heights.
+        Row of the pulse, and its RMS difference from 100 samples before the crossing to 150
+        after it, in pulse heights.
 
     Raises
     ------
@@ -122,20 +123,20 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
 
 
 class DataPulse(NamedTuple):
-    """The measured pulse that stands beside simulated ones.
+    """The measured pulse that is shown beside simulated ones.
 
     Parameters
     ----------
     row
-        Its row among the measured pulses.
+        Row of the pulse among the measured pulses.
     rms
-        RMS difference from the simulated pulse `target`, see `nearest`.
+        RMS difference from the simulated pulse, see `nearest`.
     target
-        Method of that.
+        Method of that simulated pulse.
     window
-        The pulse, shape ``(length,)``.
+        Prepared pulse, shape ``(length,)``.
     slope_per_ms
-        Slope of the tails of all measured pulses in 1/ms.
+        Median slope of the tails of all measured pulses in 1/ms.
     """
 
     row: int
@@ -152,15 +153,16 @@ class DataPulse(NamedTuple):
         dt_ns: float,
         samples_before: int,
     ) -> Self:
-        """Take, of windows of shape ``(n, length)``, the one nearest to a pulse.
+        """Choose the measured window nearest to a simulated pulse.
 
-        That is the one of ``"ren"``, or else the ``"truth"`` or the first.  The other
-        parameters are those of `single_pulse_figure`.
+        The simulated pulse is that of ``"ren"``, or else of ``"truth"``, or else the first.
+        `data` are measured windows of shape ``(n, length)``; for the other parameters see
+        `single_pulse_figure`.
 
         Raises
         ------
         CpunetError
-            If there are no pulses, or it or all of the data have no edge or no tail.
+            If there are no pulses, or if the pulse or all data lack an edge or a tail.
         """
         if not pulses:
             raise CpunetError("no pulse to draw; give one by method")
@@ -180,24 +182,25 @@ def single_pulse_figure(
 ) -> Figure:
     """One simulated pulse by every method beside the nearest measured pulse.
 
-    Above as prepared; below corrected for the decay (pole-zero) with the median slope
-    of the measured tails, at unit height, and the differences from the measured pulse, with
-    its noise.  The simulation without electronics has no decay, and is not corrected.
-    All are aligned at half maximum; on the right their edges.
+    The upper panels show the pulses as prepared.  The lower panels show them pole-zero
+    corrected with the median slope of the measured tails, at unit height, and their
+    differences from the measured pulse including its noise.  The simulation without
+    electronics has no decay and is not corrected.  All pulses are aligned at half maximum;
+    the right column shows their edges.
 
     Parameters
     ----------
     pulses
         The pulse by method, each of shape ``(length,)``: ``"raw"``, ``"rc"``, ``"ren"``, ….
-        Without noise, if it is to be told from the electronics.
+        Noise-free pulses show the electronics alone.
     data
-        The measured pulse beside them.
+        Measured pulse for comparison.
     dt_ns
         Sampling period in ns.
     samples_before
         Sample of the windows' alignment, after which the tail begins.
     title
-        Above the figure, ``"SEP, event 12"``.
+        Title of the figure, for example ``"SEP, event 12"``.
 
     Raises
     ------
@@ -244,7 +247,7 @@ def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float
     inside = sorted((e, name) for name, e in peaks.items() if span[0] <= e <= span[1])
     previous, level = -np.inf, 0
     for energy, name in inside:
-        # the names of neighbouring lines are put above each other
+        # the names of neighbouring lines are stacked
         close = energy - previous < 0.06 * (span[1] - span[0])
         previous, level = energy, (level + 1) % 3 if close else 0
         axes.axvline(energy, color="0.5", linewidth=0.9, linestyle=":", zorder=0)
@@ -261,7 +264,7 @@ def _draw(panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float) -
             if method == "data"
             else {"color": palette[method], "linewidth": 1.2}
         )
-        if method == "truth":  # on what agrees with it
+        if method == "truth":  # on top of methods that agree with it
             look["linestyle"] = "--"
         for axes in panels:
             axes.plot(time_ns, pulse, label=label(method), **look)

@@ -1,7 +1,8 @@
-"""What the A/E cut leaves of gamma lines and of the continuum, by ranges of energy.
+"""Survival of gamma lines and of the continuum after the A/E cut, by energy range.
 
-Under a gamma line there is background, mostly Compton events of other lines, that the cut
-removes more or less than the line's own.  It is seen beside the line, and subtracted.
+Under a gamma line there is background, mostly Compton events of other lines, which the cut
+removes more or less than the events of the line.  It is estimated from sidebands and
+subtracted.
 """
 
 from __future__ import annotations
@@ -27,34 +28,34 @@ def peak_survival(
     peak: Range,
     sidebands: Sequence[Range] = (),
 ) -> dict[str, Any]:
-    """What a cut on low A/E leaves of a gamma line, its background subtracted.
+    """Survival of a gamma line after a low-A/E cut, with its background subtracted.
 
-    Without sidebands nothing is subtracted: so for a range of the continuum.
+    Without sidebands, as for a range of the continuum, nothing is subtracted.
 
     Parameters
     ----------
     amplitude, energy_kev
-        Of each event; shape ``(n,)``.
+        Current amplitude and energy in keV of each event, shape ``(n,)``.
     cut
         Lowest amplitude that survives.
     peak
-        Range of the line in keV, from (included) and to (excluded).
+        Range of the line in keV: lower end (included) and upper end (excluded).
     sidebands
-        Ranges beside it, of background only.
+        Ranges in keV beside the line that contain only background.
 
     Returns
     -------
     dict
-        JSON-ready: ``survival`` and ``survival_std`` in percent (the error of the cut is not
-        in it); ``peak``, ``peak_pass``, ``sideband``, ``sideband_pass``, events in the ranges
-        and those that survive; ``scale``, width of the peak's range over that of the
-        sidebands; ``undefined``, events in the ranges without a finite amplitude, which are
-        in none of the counts.  If no survival can be given, ``missing`` with the reason.
+        JSON-ready: ``survival`` and ``survival_std`` in percent (without the error of the
+        cut); ``peak``, ``peak_pass``, ``sideband``, ``sideband_pass``, the numbers of events
+        in the ranges and of those that survive; ``scale``, the width of the peak's range over
+        that of the sidebands; ``undefined``, events in the ranges without a finite amplitude,
+        which are not counted.  If the survival is undefined, ``missing`` with the reason.
 
     Raises
     ------
     CpunetError
-        If a range is empty or overlaps another, or the arrays are not equally long.
+        If a range is empty or overlaps another, or the arrays differ in length.
     """
     if amplitude.shape != energy_kev.shape:
         raise CpunetError(
@@ -93,16 +94,17 @@ def survival_by_range(
     Parameters
     ----------
     amplitude, energy_kev, cuts
-        By method; each has its own cut (see `a_over_e.ae_survival`), NaN if it has none.
+        Amplitudes, energies in keV and cut by method; each method has its own cut (see
+        `a_over_e.ae_survival`), NaN if it has none.
     lines
-        Range and sidebands of each gamma line, in keV, by name.
+        Range and sidebands of each gamma line in keV, by name.
     continua
-        Ranges of the continuum by name.
+        Ranges of the continuum in keV, by name.
 
     Returns
     -------
     dict
-        By name and method, see `peak_survival`.
+        Results of `peak_survival` by name and method.
     """
     ranges = dict(lines) | {name: (span, ()) for name, span in continua.items()}
     return {
@@ -146,7 +148,7 @@ def _survival(
             f"from {peak[0]:g} to {peak[1]:g} keV"
         }
     if not scale:
-        # spread of the posterior after a flat prior: not 0 if none or all survive
+        # standard deviation of the posterior with a flat prior: not 0 if none or all survive
         n, p = counts["peak"], (counts["peak_pass"] + 1) / (counts["peak"] + 2)
         std = float(100 * np.sqrt(p * (1 - p) / (n + 3)))
     return {"survival": survival, "survival_std": std}

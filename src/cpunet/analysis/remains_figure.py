@@ -1,4 +1,4 @@
-"""Remains of earlier pulses in a picture: sizes by the law, and what is left of slopes."""
+"""Figure of the remains of earlier pulses: sizes with the law, and slopes of baselines."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from cpunet.pulses.container import FloatArray, Pulses
 Values = npt.NDArray[np.float64]
 
 SHOWN = 12  # traces
-EMPTY = 0.5  # errors within which a trace has no remainder
+EMPTY = 0.5  # in errors: traces with smaller remains count as empty
 SIGMA_PER_MAD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Slopes of baselines in keV per decay time: the remainder that they alone tell.
+    """Slopes of baselines in keV per decay time, an independent measure of the remains.
 
     Parameters
     ----------
     before, after
-        With and without the remains that were told of each trace.
+        Slopes before and after subtraction of the estimated remains of each trace.
     empty
-        Which traces have none to speak of: their slopes are noise.
+        Mask of the traces with negligible remains, whose slopes are noise.
     """
 
     before: Values
@@ -39,7 +39,7 @@ class Slopes:
 
     @classmethod
     def of(cls, raw: Pulses, remains: Remains) -> Slopes:
-        """Slopes of raw traces, of those whose remains can be told."""
+        """Slopes of the raw traces whose remains can be estimated."""
         kev = remains.measure(raw)
         told = np.isfinite(kev)
         flat = remains.subtracted_from(raw)
@@ -56,7 +56,7 @@ class Slopes:
 
     @property
     def spreads(self) -> tuple[float, float]:
-        """Robust standard deviations after subtraction, and of what is empty anyway."""
+        """Robust standard deviations after subtraction, and of the empty traces."""
         after, noise = self.after, self.before[self.empty]
         return tuple(
             SIGMA_PER_MAD * float(np.median(np.abs(part - np.median(part))))
@@ -66,14 +66,14 @@ class Slopes:
 
 @styled
 def remains_figure(raw: Pulses, remains: Remains) -> Figure:
-    """Shares of traces by size with the law, slopes before and after, and some traces.
+    """Distribution of the remains with the law, slopes before and after, and some traces.
 
     Parameters
     ----------
     raw
-        Traces.
+        Raw traces.
     remains
-        What was told of them, or of others of their channel.
+        Remains estimated from these traces, or from others of the same channel.
     """
     figure = Figure(figsize=(11, 3.6))
     sizes, slopes, traces = figure.subplots(1, 3)

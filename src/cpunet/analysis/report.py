@@ -1,7 +1,7 @@
-"""The validation's outcome as files: ``metrics.json``, figures, one page to read.
+"""Results of a validation as files: ``metrics.json``, figures and an HTML page.
 
-The page needs nothing but itself: figures, data and script are embedded, and its content
-security policy lets no request leave it.
+The page is self-contained: figures, data and script are embedded, and its content security
+policy blocks all requests.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ REPORT = FolderKind(
     r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
 )
 DPI = 150
-COMPRESSION = 1  # of PNG, 0 … 9: a tenth larger than with the usual 6, in half of the time
-WIDE = 2.0  # a figure this many times wider than high takes the whole width of the page
-FIRST = 2  # figures of mean pulses that a page begins with
-MANY = 4  # figures, from which on they are folded away
+COMPRESSION = 1  # of PNG, 0 … 9: files a tenth larger than with the usual 6, in half the time
+WIDE = 2.0  # aspect ratio from which a figure takes the full width of the page
+FIRST = 2  # figures of mean pulses at the top of the page
+MANY = 4  # number of figures from which they are collapsed
 
 SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
 
-# what the views are called, and what is said of each
+# titles and descriptions of the interactive views
 VIEWS = {
     "distributions": (
         "Parameter distributions",
@@ -80,7 +80,7 @@ VIEWS = {
         "the noise.",
     ),
 }
-# parts of the metrics that are shown as they are
+# parts of the metrics that are shown as nested tables
 DETAILS = {
     "ae_details": "A/E in detail",
     "drift_slices": "Slices of rise time, 1 to 90 %",
@@ -104,24 +104,23 @@ def write_report(
         An existing folder, see `files.folder_written_aside`.
     metrics
         ``peaks``: by peak, ``n_sim``, ``n_data``, ``not_prepared`` (counts by method),
-        ``parameters`` (the result of `comparisons.compare`), ``two_sample`` (the classifier
-        test by method) and, if the truth is known, ``paired`` (by method, the
-        result of `paired.paired_scores`), or ``missing``: why it is not scored;
-        ``verdicts``: ``summary``, a list of sentences, and ``table``, by peak, method and
-        quantity its ``sigma`` and ``words``; ``ae_survival``; ``ae_details``,
-        ``drift_slices``, ``linearity``, ``noise``: any nesting, shown as tables;
-        ``compared``: names and values of what was compared;
-        ``training``: how the network was trained; ``rejections``: counts by reason,
-        possibly nested; ``ae_energy``: the result of `ae_energy.against_energy`.  Numbers
-        that are not finite are written as ``null``.
+        ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by
+        method) and, if the truth is known, ``paired`` (result of `paired.paired_scores` by
+        method); or ``missing`` with the reason why the peak is not scored.
+        ``verdicts``: ``summary``, a list of sentences, and ``table`` with ``sigma`` and
+        ``words`` by peak, method and quantity.  ``ae_survival``, ``ae_details``,
+        ``drift_slices``, ``linearity``, ``noise``: nested values, shown as tables.
+        ``compared``: names and values of the compared inputs.  ``training``: how the network
+        was trained.  ``rejections``: counts by reason, possibly nested.  ``ae_energy``: result
+        of `ae_energy.against_energy`.  Non-finite numbers are written as ``null``.
     figures
         Figures by name; the names become file names and captions.
     notes
         Paragraphs of plain text for the top of the page.
     views
-        Data of the interactive charts, as `views` makes them: ``methods`` (see
-        `views.method_looks`), ``distributions``, ``slices``, ``pulses``, ``scatter``; any of
-        them may be missing.  Without, the page has its figures only.
+        Data of the interactive charts from `views`: ``methods`` (see `views.method_looks`),
+        ``distributions``, ``slices``, ``pulses``, ``scatter``; any of them can be missing.
+        Without views the page has only its figures.
     """
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
@@ -168,9 +167,9 @@ def _asset(name: str) -> str:
 def _shared_out(
     drawn: Mapping[str, str], trained_on: str | None
 ) -> tuple[list[str], list[str], list[str], list[str]]:
-    """Figures that come first, those of noise and of A/E cuts, and all others.
+    """Figures at the top of the page, those of noise, those of A/E cuts, and all others.
 
-    Mean pulses come first, of peaks that took no part in the training if there are any.
+    Mean pulses come first, preferably of peaks that were not used in the training.
     """
     held_out = [name for name in drawn if not name.startswith(f"{trained_on} ")]
     chosen = {
@@ -185,7 +184,7 @@ def _shared_out(
 
 
 def _views_html(views: Mapping[str, Any], names: Sequence[str]) -> str:
-    """Where the script draws, or why it does not."""
+    """Elements in which the script draws, or the reason why it does not."""
     if not any(views.get(name) for name in VIEWS):
         return gap("this report was written without the data of the interactive views")
     parts = ["<noscript><p>The views need JavaScript; the figures do not.</p></noscript>"]
@@ -204,7 +203,7 @@ def _script(views: Mapping[str, Any]) -> str:
     if not any(views.get(name) for name in VIEWS):
         return ""
     data = json.dumps(views, allow_nan=False, separators=(",", ":"))
-    # within a script element "<" may begin its end, whatever the JSON
+    # in a script element any "<" of the JSON could start the closing tag
     data = data.replace("<", "\\u003c")
     code = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
     return (
@@ -214,7 +213,7 @@ def _script(views: Mapping[str, Any]) -> str:
 
 
 def _details_html(metrics: Mapping[str, Any]) -> str:
-    """Return the parts of the metrics that are shown as they are, where there are any."""
+    """Return those parts of the metrics that are shown as nested tables, if any."""
     return "\n".join(
         folded(title, nested_html(metrics[name]))
         for name, title in DETAILS.items()
@@ -245,22 +244,22 @@ def _figure_html(name: str, figure: Figure, png: bytes) -> str:
 def _png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     figure.set_dpi(DPI)
-    # ``Figure.savefig`` goes through every figure twice, once without drawing;
-    # without the program's name and version the same figure gives the same file
+    # ``Figure.savefig`` would process every figure twice, once without drawing;
+    # without the program's name and version, equal figures give equal files
     FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
         stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
     )
-    FigureCanvasBase(figure)  # lets go of the pixels, which the figure would keep
+    FigureCanvasBase(figure)  # releases the pixel buffer, which the figure would keep
     return stream.getvalue()
 
 
 def _file_stem(name: str) -> str:
-    """The figure's name with what file systems may refuse replaced."""
+    """Name of the figure, with characters that file systems may refuse replaced."""
     return re.sub(r"[^\w.-]+", "_", name)
 
 
 def _json_ready(value: Any) -> Any:
-    """Plain Python all through, with ``None`` for numbers that are not finite."""
+    """Convert to plain Python types, with ``None`` for non-finite numbers."""
     if isinstance(value, Mapping):
         return {str(key): _json_ready(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Scores as tables of the report's page."""
+"""Scores as HTML tables of the report."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 
 def gap(reason: str) -> str:
-    """Return a sentence that says why something is not there."""
+    """Return a sentence that gives the reason why something is missing."""
     return f'<p class="gap">None recorded: {escape(reason)}.</p>'
 
 
 def folded(title: str, html: str) -> str:
-    """Return what is there for those who ask for it, and on paper."""
+    """Return a collapsed section, which opens on request and when printed."""
     return f"<details><summary>{title}</summary>\n{html}\n</details>"
 
 
 def compared_html(compared: Mapping[str, Any]) -> str:
-    """Return what was compared: files, dates, versions, the quality of the fit."""
+    """Return the compared inputs: files, dates, versions, the quality of the fit."""
     rows = [[name.replace("_", " "), str(number(value))] for name, value in compared.items()]
     return html_table(["Compared", ""], rows, words={0, 1}) if rows else ""
 
 
 def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
-    """Return what the scores say in plain words; nothing if that was not worked out."""
+    """Return the verdicts in plain words; nothing without verdicts."""
     if not verdicts:
         return ""
     parts = []
@@ -57,9 +57,9 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
 def peak_html(
     peak: str, scores: Mapping[str, Any], verdicts: Mapping[str, Any] | None = None
 ) -> str:
-    """Return one peak: its numbers of events and its tables.
+    """Return the section of one peak: numbers of events and tables.
 
-    `verdicts` are the peak's own, by method and parameter, see `verdicts.verdict_table`.
+    `verdicts` are those of the peak by method and parameter, see `verdicts.verdict_table`.
     """
     parameters = scores.get("parameters", {})
     chief = {name: found for name, found in parameters.items() if name in PARAMETERS}
@@ -123,7 +123,7 @@ def survival_html(survival: Mapping[str, Any]) -> str:
 
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> str:
-    """Return names and values; nested names are joined: ``data: saturated``."""
+    """Return a table of names and values; nested names are joined: ``data: saturated``."""
     rows = [[name, number(value)] for name, value in _flat(values)]
     return html_table(list(head), rows) if rows else "<p>None recorded.</p>"
 
@@ -137,7 +137,7 @@ def _parameter_table(
     shown: Callable[[str], bool],
     verdicts: Mapping[str, Any] | None = None,
 ) -> str:
-    """One row per parameter and method shown, and one with the ceiling."""
+    """One row per parameter and shown method, and one with the ceiling."""
     rows = []
     for name, values in parameters.items():
         unit = SHAPE_PARAMETERS[name].unit if name in SHAPE_PARAMETERS else ""
@@ -188,7 +188,7 @@ def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
 
 
 def _texts(value: Any) -> list[str]:
-    """Return all texts of a nesting of lists and mappings, in order."""
+    """Return all strings in nested lists and mappings, in order."""
     if isinstance(value, Mapping):
         value = list(value.values())
     return (

@@ -1,4 +1,4 @@
-"""Bootstrap samples of events: drawn once, and counted in whatever bins are asked for."""
+"""Bootstrap samples of events: drawn once, and histogrammed in any binning."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy.typing as npt
 
 Counts = npt.NDArray[np.float32]
 Bins = npt.NDArray[np.integer]
-Draws = tuple["Resampled", "Resampled"]  # of the two sets that are compared
+Draws = tuple["Resampled", "Resampled"]  # of the two datasets that are compared
 
-# With more events than these the counts of the bins are drawn, which takes as long for any
-# number of events; below, sums over the events drawn are faster by up to ten times.
+# Above this number of events, bin counts are drawn directly, in a time independent of the
+# number of events; below it, sums over drawn events are up to ten times faster.
 MOST_EVENTS = 16_384
 
 
 @dataclass(frozen=True, eq=False)
 class Resampled:
-    """Bootstrap samples of a set of events.
+    """Bootstrap samples of a dataset.
 
     Parameters
     ----------
     events, size
-        Events of the set, and of each sample.
+        Number of events of the dataset, and of each sample.
     draws
-        Samples.
+        Number of samples.
     rng
-        Of what is drawn later.
+        Random generator of bin counts that are drawn later.
     weights
-        How often each event is in each sample, shape ``(events, draws)``; None for a large
-        set, of whose bins the counts are drawn anew each time.
+        Multiplicity of each event in each sample, shape ``(events, draws)``; None for a large
+        dataset, whose bin counts are drawn anew each time.
     """
 
     events: int
@@ -42,7 +42,7 @@ class Resampled:
 
     @classmethod
     def of(cls, events: int, size: int, draws: int, rng: np.random.Generator) -> Self:
-        """Draw `size` of so many events with replacement, `draws` times."""
+        """Draw `size` of `events` events with replacement, `draws` times."""
         weights = None
         if 0 < max(events, size) <= MOST_EVENTS and events:
             drawn = rng.integers(events, size=(size, draws), dtype=np.int32)
@@ -58,14 +58,14 @@ class Resampled:
         Parameters
         ----------
         bins
-            Bin of each event; an event beyond the last is counted in none.
+            Bin of each event; events beyond the last bin are not counted.
         n_bins
-            Number of the bins.
+            Number of bins.
 
         Returns
         -------
         numpy.ndarray
-            Shape ``(n_bins, draws)``, float32; all 0 if the set is empty.
+            Counts, float32, shape ``(n_bins, draws)``; all 0 if the dataset is empty.
         """
         from scipy.sparse import csc_array
 
@@ -82,7 +82,17 @@ class Resampled:
 
 
 def both_resampled(n_a: int, n_b: int, draws: int, seed: int | np.random.Generator) -> Draws:
-    """Bootstraps of two sets, each at its own size."""
+    """Bootstraps of two datasets, each at its own size.
+
+    Parameters
+    ----------
+    n_a, n_b
+        Numbers of events of the datasets.
+    draws
+        Number of samples.
+    seed
+        Seed or random generator.
+    """
     rng = np.random.default_rng(seed)
     return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
 
@@ -90,7 +100,19 @@ def both_resampled(n_a: int, n_b: int, draws: int, seed: int | np.random.Generat
 def resampled_twice(
     events: int, n_sim: int, n_data: int, draws: int, seed: int | np.random.Generator
 ) -> Draws:
-    """Pairs of samples of one set, as large as the simulated and as the measured one."""
+    """Pairs of bootstraps of one dataset, of the simulated and of the measured size.
+
+    Parameters
+    ----------
+    events
+        Number of events of the dataset.
+    n_sim, n_data
+        Numbers of events of the two samples of a pair.
+    draws
+        Number of pairs.
+    seed
+        Seed or random generator.
+    """
     rng = np.random.default_rng(seed)
     return Resampled.of(events, n_sim, draws, rng), Resampled.of(events, n_data, draws, rng)
 
@@ -98,13 +120,25 @@ def resampled_twice(
 def resampled_quantiles(
     values: npt.NDArray[np.float64], quantile: float, draws: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float64]:
-    """Quantiles (NumPy's ``"weibull"``) of bootstrap samples that are not drawn themselves.
+    r"""Quantiles (NumPy's ``"weibull"``) of bootstrap samples, without drawing the samples.
 
-    The k-th smallest of a sample is the value at the rank of the k-th smallest of as many
-    uniform numbers, which is a beta variate, as is the smallest of those above it.
+    The k-th smallest of n uniform numbers follows :math:`\mathrm{Beta}(k, n + 1 - k)`.  The
+    k-th smallest value of a bootstrap sample is the data value at that rank.  The next
+    order statistic follows from another beta variate.
+
+    Parameters
+    ----------
+    values
+        Data, shape ``(n,)``.
+    quantile
+        Quantile, 0 … 1.
+    draws
+        Number of bootstrap samples.
+    rng
+        Random generator.
     """
     ordered, n = np.sort(values), len(values)
-    rank = quantile * (n + 1)  # from 1; mostly between two values
+    rank = quantile * (n + 1)  # counted from 1; usually between two values
     below = int(np.clip(np.floor(rank), 1, n))
     first = rng.beta(below, n + 1 - below, draws)
     lower = ordered[np.minimum((n * first).astype(int), n - 1)]

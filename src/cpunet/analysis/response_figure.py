@@ -1,4 +1,4 @@
-"""Readout chains in numbers and in one picture: step, impulse, tail and noise."""
+"""Readout chains in numbers and in one figure: step, impulse, tail and noise."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from cpunet.recipes.schema import PreparationConfig
 Numbers = dict[str, float]
 
 STEP_NS, IMPULSE_NS, GRID_NS = 2000.0, 600.0, 1.0
-_FINE_NS, _SHORTEST_NS = 0.5, 10_000.0  # of the step responses from which numbers are taken
+_FINE_NS, _SHORTEST_NS = 0.5, 10_000.0  # step and minimum length of step responses
 _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
-# Where a spectrum is flat, in units of half the sampling rate, and bins to smooth it over.
+# Range in which a spectrum is flat, in units of half the sampling rate, and smoothing bins.
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 _LAYOUT = (("step", "impulse"), ("residual", "impulse"), ("tail", "noise"))
-_POINTS = 400  # of the tail, evenly on its logarithmic axis
-_BINS = 150  # of the spectra of noise
+_POINTS = 400  # of the tail, equidistant on the logarithmic axis
+_BINS = 150  # of the noise spectra
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What is known of a readout chain in closed form.
+    """A readout chain in closed form.
 
     Parameters
     ----------
     name
-        For legends.
+        Name in legends.
     whole, undecayed
-        The chain, and the same without its decays, so that a step ends at 1.
+        The chain, and the chain without its decays, whose step response ends at 1.
     frequency_mhz, noise_kev2_per_mhz
-        Density of the noise power at frequencies from 0 up, evenly spaced; None if not known.
+        Equally spaced frequencies from 0 in MHz and noise power density in keV²/MHz; None if
+        unknown.
     """
 
     name: str
@@ -49,23 +50,25 @@ class Chain:
 
 
 def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
-    """Numbers that need no parameters, so that learned and true chains can be compared.
+    """Parametrisation-independent numbers, by which fitted and true chains are compared.
 
     Parameters
     ----------
     chain
-        Learned or true.
+        Fitted or true chain.
     preparation, dt_ns
-        The window of prepared pulses, in which the decay is seen.
+        Preparation settings and sampling period in ns, which define the window in which the
+        decay is visible.
 
     Returns
     -------
     dict
-        By name, the unit at the end.  ``rise_…_ns`` between fractions of the maximum of a
-        step; ``missing_…_ns``: share of the charge that has not arrived, ``overshoot``: of
-        the step without decays; ``effective_decay_us``: from the slope of the logarithm over
-        the fitted tail; ``droop_…_us``: share that has decayed; ``noise_rms_kev`` and
-        ``noise_corner_mhz``, where the power falls to half.
+        Values by name, with the unit as suffix.  ``rise_…_ns``: rise times of the step
+        response between fractions of its maximum.  ``missing_…_ns``: fraction of the charge
+        that has not arrived, and ``overshoot``, both without decays.
+        ``effective_decay_us``: from the slope of the logarithm over the fitted tail.
+        ``droop_…_us``: fraction that has decayed.  ``noise_rms_kev`` and
+        ``noise_corner_mhz``, the frequency at which the noise power falls to half.
     """
     end_ns = align_ns(chain, preparation) + preparation.samples_after * dt_ns
     time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _FINE_NS)
@@ -88,13 +91,13 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
 
 
 def align_ns(chain: Chain, preparation: PreparationConfig) -> float:
-    """When a step is where prepared pulses are aligned."""
+    """Time in ns at which a step response reaches the alignment level of prepared pulses."""
     step = chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS))
     return _reaches_ns(step, preparation.align_fraction)
 
 
 def half_height_ns(chain: Chain) -> float:
-    """When the step response reaches half of its maximum, in ns after the step."""
+    """Time in ns after the step at which its response reaches half of its maximum."""
     time_ns = np.arange(0.0, STEP_NS, GRID_NS)
     step = chain.whole.step(time_ns)
     half = 0.5 * step.max()
@@ -108,18 +111,18 @@ def response_figure(
 ) -> Figure:
     """Step response and its residuals, impulse response, tail, and spectrum of the noise.
 
-    Responses are drawn from half height on, which is how pulses are aligned: a delay of
-    the whole chain cannot be learned from them.  Residuals are differences from the truth,
-    or from the mean of several chains if there is none.
+    Times are counted from half height, by which pulses are aligned: an overall delay of the
+    chain cannot be inferred from them.  Residuals are differences from the truth, or from
+    the mean of several chains if there is no truth.
 
     Parameters
     ----------
     chains
-        Those learned.
+        Fitted chains.
     truth
-        The true one, if known.
+        True chain, if known.
     tail_ns
-        How long after the step the tail is drawn, in ns.
+        Time after the step up to which the tail is drawn, in ns.
     """
     figure = Figure(figsize=(10.5, 8.0))
     panels = figure.subplot_mosaic(
@@ -128,7 +131,7 @@ def response_figure(
     shades = [COLOURS["ren"], *SPARE_COLOURS]
     drawn = [(chain, shades[i % len(shades)], 1.2) for i, chain in enumerate(chains)]
     if truth is not None:
-        # broad and beneath, so that a chain which agrees does not hide it
+        # a broad line underneath, so that a chain which agrees does not hide it
         drawn.insert(0, (truth, COLOURS["truth"], 3.5))
     for chain, colour, width in drawn:
         _responses(panels, chain, colour, width, tail_ns)
@@ -173,7 +176,7 @@ def _residuals(
 def _noise(axes: Axes, chain: Chain, colour: str, width: float) -> None:
     if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
         return
-    # evenly on the logarithmic axis: lower frequencies one by one, higher ones averaged
+    # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
     stop = len(chain.frequency_mhz) - 1
     edges = np.unique(np.geomspace(1, stop, _BINS).astype(int))
     frequency, density = (
@@ -212,11 +215,11 @@ def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
 
 
 def noise_numbers(chain: Chain) -> Numbers:
-    """RMS and corner of a chain's noise, see `chain_numbers`; none if it is not known."""
+    """RMS and corner of a chain's noise, see `chain_numbers`; empty if unknown."""
     frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
     if frequency is None or density is None:
         return {}
-    # frequency 0 is the baseline; the last one stands for half a step
+    # frequency 0 is the baseline; the last one represents half a step
     numbers = {
         "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
     }
@@ -230,7 +233,7 @@ def noise_numbers(chain: Chain) -> Numbers:
 
 
 def _reaches_ns(step: FloatArray, fraction: float) -> float:
-    """When a step response on the grid first reaches a fraction of its maximum."""
+    """Time at which a step response on the grid first reaches a fraction of its maximum."""
     level = fraction * step.max()
     after = max(1, int((step >= level).argmax()))
     low, high = step[after - 1], step[after]

@@ -1,4 +1,4 @@
-"""The scores of a report as panels of dots: every method beside its ceiling, with errors."""
+"""The scores of a report as forest plots: every method beside its ceiling, with errors."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from cpunet.analysis.side_by_side import Cell, Row
 from cpunet.analysis.style import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 
-LAST = "ren"  # methods are in the order of the tables, but for this one
+LAST = "ren"  # drawn last; the other methods are in the order of the tables
 
 
 def score_panels(peak: str, scores: Mapping[str, Any]) -> str:
-    """Return a panel for the IoU of each parameter, and one for the classifier.
+    """Return a forest plot for the IoU of each parameter, and one for the classifier.
 
     Parameters
     ----------
     peak
-        Its name.
+        Name of the gamma line.
     scores
-        Of the peak, as in ``metrics.json``.
+        Scores of the peak, as in ``metrics.json``.
 
     Returns
     -------
     str
-        HTML; nothing if the peak is not scored.
+        HTML; empty if the peak is not scored.
     """
     panels = [dot_panel(row, names) for row, names in _rows(peak, scores)]
     return '<div class="panels">\n' + "\n".join(panels) + "\n</div>" if panels else ""

@@ -1,4 +1,4 @@
-"""How far scores depend on a training's seed (paper, section on uncertainty)."""
+"""Dependence of the scores on the seed of a training (paper, section on uncertainty)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
 
 MARKED = "#D55E00"
-MOST_BARS = 30  # of 1 % each, or of more
+MOST_BARS = 30  # bars are 1 % wide, or wider if there would be more
 
 Scores = dict[str, dict[str, dict[str, Any]]]
 
@@ -26,17 +26,17 @@ def seed_distributions(metrics: Sequence[Mapping[str, Any]], method: str = "ren"
     Parameters
     ----------
     metrics
-        The content of the ``metrics.json`` of each training, validated on the same pulses.
+        Content of the ``metrics.json`` of each training, validated on the same pulses.
     method
-        Whose scores.
+        Method whose scores are collected.
 
     Returns
     -------
     dict
         By peak and parameter, JSON-ready: ``iou``, all known scores in percent;
-        ``missing``, how many trainings have none; ``median``, ``mean``, ``std``, ``low`` and
-        ``high`` of them (None without scores; the ``std`` of one too); ``ceiling`` and
-        ``ceiling_std``, means over the trainings.
+        ``missing``, the number of trainings without one; ``median``, ``mean``, ``std``,
+        ``low`` and ``high`` of the scores (None without scores; ``std`` also with only one);
+        ``ceiling`` and ``ceiling_std``, means over the trainings.
 
     Raises
     ------
@@ -64,16 +64,16 @@ def seed_distributions(metrics: Sequence[Mapping[str, Any]], method: str = "ren"
 def seed_figure(
     distributions: Scores, method: str = "ren", marked: Mapping[str, Any] | None = None
 ) -> Figure:
-    """Histograms of the IoU over seeds, a row per peak and a column per parameter.
+    """Histograms of the IoU over seeds, one row per peak and one column per parameter.
 
     Parameters
     ----------
     distributions
-        Of `seed_distributions`.
+        Result of `seed_distributions`.
     method
-        Its name, for the axes.
+        Name of the method, for the axes.
     marked
-        Metrics of one training to mark, the one that is used.
+        Metrics of one training to mark, such as the one in use.
     """
     peaks = list(distributions)
     names = list(dict.fromkeys(name for rows in distributions.values() for name in rows))
@@ -141,9 +141,9 @@ def _panel(axes: Axes, row: Mapping[str, Any] | None, marked: float | None) -> N
     if marked is not None:
         axes.axvline(marked, color=MARKED, linestyle="--")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_ylim(0, 1.25 * counts.max())  # room for the note
+    axes.set_ylim(0, 1.25 * counts.max())  # space for the note
     note = f"n = {len(iou)}" + (f", {row['missing']} missing" if row["missing"] else "")
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # lines may run below it
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # hides lines behind the text
     axes.text(0.02, 0.97, note, transform=axes.transAxes, va="top", size=8, bbox=box)
 
 

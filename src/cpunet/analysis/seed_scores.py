@@ -1,4 +1,4 @@
-"""Scores of trainings that differ in their seed, as a table: how often does one fail?"""
+"""Table of the scores of trainings that differ in their seed, with the number of failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 Metrics = Mapping[str, Any]
 Values = npt.NDArray[np.float64]
 
-FAILED = 0.9  # of the median: below it, a training has failed
+FAILED = 0.9  # of the median: a training below it has failed
 WORST = 0.05  # quantile
 
 
@@ -21,15 +21,15 @@ def seed_table(metrics: Mapping[int, Metrics]) -> list[dict[str, Any]]:
     Parameters
     ----------
     metrics
-        By seed, the content of its ``metrics.json``.
+        Content of ``metrics.json`` by seed.
 
     Returns
     -------
     list of dict
-        ``peak``, ``score`` (a parameter, whose score is its IoU in percent, or ``"auc"``,
-        ``"edge_rmse"``, which are best when small), ``median``, ``worst`` (the quantile of
-        5 %, or of 95 %), ``failures`` (seeds whose IoU is below 0.9 of the median, or missing;
-        None for the others), ``ceiling``.
+        ``peak``, ``score`` (a parameter, scored by its IoU in percent, or ``"auc"`` and
+        ``"edge_rmse"``, for which small is good), ``median``, ``worst`` (the 5 % or 95 %
+        quantile), ``failures`` (number of seeds whose IoU is below 0.9 of the median or
+        missing; None for the other scores), ``ceiling``.
     """
     rows = []
     for peak, parameter, ious in _compared(metrics):
@@ -49,7 +49,7 @@ def seed_table(metrics: Mapping[int, Metrics]) -> list[dict[str, Any]]:
 
 
 def failed_seeds(metrics: Mapping[int, Metrics]) -> dict[int, list[str]]:
-    """Seeds with scores below 0.9 of the median, or without: which, as ``"SEP drift_time"``."""
+    """Scores below 0.9 of the median, or missing, by seed, such as ``"SEP drift_time"``."""
     poor: dict[int, list[str]] = {}
     for peak, parameter, ious in _compared(metrics):
         limit = FAILED * _median(ious, "ren")
@@ -62,7 +62,7 @@ def failed_seeds(metrics: Mapping[int, Metrics]) -> dict[int, list[str]]:
 def _compared(
     metrics: Mapping[int, Metrics],
 ) -> Iterator[tuple[str, str, list[Mapping[str, Any]]]]:
-    """The IoU of all seeds by peak and parameter, of those that any seed has."""
+    """The IoU of all seeds, for each peak and parameter that any seed has."""
     places = dict.fromkeys(
         (peak, parameter)
         for of_seed in metrics.values()

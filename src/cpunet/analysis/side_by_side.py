@@ -1,4 +1,4 @@
-"""Scores of several validations as rows of one table, and whether they may be compared."""
+"""Scores of several validations as rows of one table, and whether they are comparable."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ NO_VALUE = "–"
 
 @dataclass(frozen=True)
 class Cell:
-    """One run's score: its error, and what chance gives with its spread.
+    """Score of one run with its error, and its expectation by chance with the spread.
 
     Attributes
     ----------
     text
-        The score as it is shown, with error and ceiling.
+        Score as displayed, with error and ceiling.
     value
-        None where a run has no such score.
+        Score; None where a run has none.
     """
 
     text: str = NO_VALUE
@@ -40,11 +40,11 @@ class Row:
     Attributes
     ----------
     peak, score
-        Of which peak, and what it is.
+        Name of the peak and of the score.
     cells
-        In the order of the runs.
+        Scores in the order of the runs.
     best
-        Runs with the best score, by index; empty if fewer than two have one.
+        Indices of the runs with the best score; empty if fewer than two have a score.
     """
 
     peak: str
@@ -55,18 +55,18 @@ class Row:
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Runs beside each other.
+    """Scores of several runs, side by side.
 
     Attributes
     ----------
     names
-        Of the runs.
+        Names of the runs.
     method
-        Whose scores they are.
+        Method that is scored.
     rows
-        Peaks in their order, and the scores of each.
+        Scores, ordered by peak.
     notes
-        What makes the comparison doubtful, one sentence each.
+        Reasons to doubt the comparison, one sentence each.
     """
 
     names: tuple[str, ...]
@@ -81,16 +81,16 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
     Parameters
     ----------
     runs
-        Content of ``metrics.json`` by the run's name. What one lacks, as older files do,
-        has no value.
+        Content of ``metrics.json`` by the name of the run.  Scores missing in older files
+        have no value.
     method
-        Whose scores: ``ren``, ``raw``, a rival, ``truth``.
+        Method that is scored: ``ren``, ``raw``, a baseline method or ``truth``.
 
     Returns
     -------
     SideBySide
-        Best is the highest IoU, the AUC closest to that of shuffled labels, the lowest
-        RMSE of the edge, and the smallest difference of A/E survivals.
+        The best is the highest IoU, the AUC closest to that of shuffled labels, the lowest
+        RMSE of the edge, and the smallest difference of A/E survival.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def _cell(
 
 
 def _notes(runs: Mapping[str, Metrics]) -> list[str]:
-    """What says that the runs were not scored on the same pulses."""
+    """Signs that the runs were not scored on the same pulses."""
     first, *others = runs
     notes = []
     for other in others:
@@ -225,5 +225,5 @@ def _methods(metrics: Metrics) -> list[str]:
 
 
 def _union(names: Any) -> list[str]:
-    """All names in the order in which they come first."""
+    """All names in the order of their first occurrence."""
     return list(dict.fromkeys(name for some in names for name in some))

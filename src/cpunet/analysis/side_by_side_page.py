@@ -1,7 +1,6 @@
-"""The comparison of several runs as one page: a table, and a panel of dots per score.
+"""The comparison of several runs as one page: a table, and a forest plot per score.
 
-The page needs nothing but itself, and is drawn without matplotlib: a panel is a few lines
-of SVG.
+The page is self-contained and made without matplotlib: a forest plot is a few lines of SVG.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ $panels
 
 
 def side_by_side_page(table: SideBySide) -> str:
-    """Write the comparison as HTML that needs no other file.
+    """Return the comparison as self-contained HTML.
 
     Parameters
     ----------
     table
-        See `side_by_side`.
+        Result of `side_by_side`.
     """
     head = '<th scope="col" class="name">Peak</th><th scope="col" class="name">Score</th>'
     head += "".join(f'<th scope="col">{escape(name)}</th>' for name in table.names)

@@ -1,4 +1,4 @@
-"""Simulated and measured pulses over each other, and how their shapes are spread."""
+"""Simulated and measured pulses overlaid, with the distributions of two parameters."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def sides_figure(
     parameters: Mapping[str, Mapping[str, Values]],
     dt_ns: float,
 ) -> Figure:
-    """Some pulses aligned at half maximum, whole and their edges, above; histograms below.
+    """Pulses aligned at half maximum with their edges (top), histograms (bottom).
 
     Parameters
     ----------
     waveforms
-        Pulses of height one, shape (pulses, samples), of ``"raw"`` (the simulation) and of
+        Pulses of unit height, shape (pulses, samples), of ``"raw"`` (the simulation) and
         ``"data"``.
     parameters
-        Two quantities by the label of their axis; of each, values by side.
+        Values of two quantities by axis label and side.
     dt_ns
         Sampling period in ns.
     """

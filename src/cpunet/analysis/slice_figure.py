@@ -1,4 +1,4 @@
-"""The superpulses of slices in rise time, and how methods differ from the data in them."""
+"""Superpulses in slices of rise time, and their differences from the data by method."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals i
 
 @styled
 def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
-    """Superpulses above, residuals with their error bands below, a column per slice.
+    """Superpulses (top) and residuals with error bands (bottom), one column per slice.
 
     Parameters
     ----------
     sets
-        By method, the measured ones under ``"data"``; drawn over each other in this order.
+        Superpulses by method, the measured ones under ``"data"``; drawn in this order, later
+        ones on top.
     dt_ns
         Sampling period in ns.
     peak
@@ -30,7 +31,7 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     Raises
     ------
     CpunetError
-        If the sets do not fit each other.
+        If the datasets were not sliced and cut out alike.
     """
     data = sets["data"]
     n = len(data.pulses)

@@ -1,4 +1,4 @@
-"""One look for all figures: fonts, and a fixed colour and label for each method."""
+"""Common style of all figures: fonts, and a fixed colour and label for each method."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Colours of Okabe and Ito, which the colour-blind can tell apart.
+# Colours of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS = {
     "data": "black",
     "raw": "#D55E00",
@@ -20,7 +20,7 @@ COLOURS = {
 SPARE_COLOURS = ("#E69F00", "#56B4E9", "#7F7F7F", "#8C6D1F", "#5B3A8C")
 DATA_FILL = "0.80"
 
-# end of the name of a method whose noise is left out
+# suffix of the name of a method without noise
 NO_NOISE = "_no_noise"
 
 LABELS = {
@@ -52,13 +52,13 @@ _STYLE = {
 
 
 def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
-    """Run a function that makes a figure with the common look, and only it."""
+    """Decorator that runs a figure function in the common style."""
 
     @wraps(make_figure)
     def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
         from matplotlib import style
 
-        # from matplotlib's defaults, so that no user's settings change a report
+        # based on matplotlib's defaults, so that user settings do not change a report
         with style.context(["default", _STYLE]):
             return make_figure(*args, **kwargs)
 
@@ -66,7 +66,7 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
 
 
 def colours(methods: Iterable[str]) -> Mapping[str, str]:
-    """A colour for each method: its own, or else the next spare one.
+    """Colour of each method: its own, or else the next spare one.
 
     Examples
     --------
@@ -80,6 +80,6 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
 
 
 def label(method: str) -> str:
-    """What a legend calls a method."""
+    """Label of a method in legends."""
     name = method.removesuffix(NO_NOISE)
     return LABELS.get(name, name) + (", no noise" if name != method else "")

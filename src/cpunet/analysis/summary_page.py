@@ -1,6 +1,6 @@
-"""Scores of many detectors and periods as one page: an overview, dots, and plain words.
+"""Scores of many detectors and periods as one page: overview, forest plots, verdicts.
 
-The page needs nothing but itself; its links lead to the reports behind it.
+The page is self-contained; its links lead to the individual reports.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Entry:
     Attributes
     ----------
     detector, period
-        Whose it is.
+        Names of the detector and the period.
     metrics
-        Content of its ``metrics.json``; None if there is no report.
+        Content of ``metrics.json``; None if there is no report.
     link
-        Where its ``report.html`` is, relative to the page; None if nowhere.
+        Path of ``report.html`` relative to the page; None if there is none.
     """
 
     detector: str
@@ -41,17 +41,17 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """Detector and period in one."""
+        """Detector and period as one name."""
         return f"{self.detector}{_NAMES_APART}{self.period}"
 
 
 def summary_page(entries: Sequence[Entry]) -> str:
-    """Write the page as HTML that needs no other file.
+    """Return the page as self-contained HTML.
 
     Parameters
     ----------
     entries
-        Each of another detector or period, in the order in which they are shown. At
+        Validations, each of a different detector or period, in the order of display.  At
         least one has metrics.
 
     Raises
@@ -82,7 +82,7 @@ def _missing(names: Sequence[str]) -> str:
 
 
 def _overview(entries: Sequence[Entry], periods: Sequence[str]) -> list[str]:
-    """A line per detector, a cell per period: how many scores are off, and the report."""
+    """One row per detector, one cell per period: number of scores off, and the report."""
     found = {(entry.detector, entry.period): entry for entry in entries}
     lines = []
     for detector in dict.fromkeys(entry.detector for entry in entries):
@@ -98,13 +98,13 @@ def _cell(entry: Entry | None) -> str:
         return '<td class="missing">no report</td>'
     off, judged = _off(entry.metrics)
     text = f"{off} of {judged} off" if judged else "not judged"
-    # one or two of a few may be off by chance
+    # one or two scores can be off by chance
     marked = ' class="off"' if off > 2 and off > 0.2 * judged else ""
     return f"<td{marked}>{_linked(entry, text)}</td>"
 
 
 def _off(metrics: Mapping[str, Any]) -> tuple[int, int]:
-    """How many scores are off, and how many could be judged."""
+    """Number of scores that are off, and number of scores with a verdict."""
     judged = [
         verdict.agrees
         for peak in part(metrics, "peaks")
@@ -115,7 +115,7 @@ def _off(metrics: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _panels(rows: Sequence[Row], entries: Sequence[Entry]) -> list[str]:
-    """A heading per peak, and a panel per score."""
+    """A heading per peak, and a forest plot per score."""
     names = [entry.name for entry in entries]
     detectors = [entry.detector for entry in entries]
     starts = [i for i, name in enumerate(detectors) if i and name != detectors[i - 1]]

@@ -1,15 +1,16 @@
-"""Can a classifier tell measured pulses from simulated ones?
+"""Can a classifier distinguish measured pulses from simulated ones?
 
-The classifier two-sample test (Lopez-Paz & Oquab, ICLR 2017): train a classifier on
-part of both sets, and see on the rest how well it sorts them.  An area under the ROC
-curve (AUC) of 0.5 means that it found no difference; 1 that it is never wrong.
+The classifier two-sample test (Lopez-Paz & Oquab, ICLR 2017) trains a classifier on part
+of both datasets and tests on the rest how well it separates them.  An area under the ROC
+curve (AUC) of 0.5 means that it found no difference; 1 means that it is never wrong.
 
-The classifier is a ridge regression on ±1 labels with an expanded set of features: the
-shape as it is, and products and waves of its main components.  On made-up pulses with
-small differences of width, noise or ripple it saw as much as a network of two layers
-of 32 or more, in a fifth of the time; where only the spread of a width differed, it
-saw less (AUC 0.70, 0.75).  It has no random start, and as one factorisation serves any
-number of labels, the same test on shuffled labels costs next to nothing.
+The classifier is a ridge regression on ±1 labels with expanded features: the pulse shape,
+and products and sinusoids of its leading components.  On synthetic pulses with small
+differences of width, noise or ripple it was as sensitive as a network of two layers of 32
+or more units, in a fifth of the time.  Where only the spread of a width differed it was less
+sensitive (AUC 0.70, 0.75).  It has no random initialisation.  Since one
+factorisation serves any number of labels, the same test on shuffled labels costs almost
+nothing.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Parameters = Mapping[str, Values]
 
-FEWEST = 40  # pulses a side: 8 in each fold's test
-LARGEST = 2000  # pulses a side: resolves an AUC to 0.01
-BLOCK = 256  # pulses at a time, where more would only take memory
+FEWEST = 40  # pulses per side: 8 in each test fold
+LARGEST = 2000  # pulses per side: resolves an AUC to 0.01
+BLOCK = 256  # pulses per block: bounds memory
 FOLDS = 5
-SHUFFLES = 40  # give the spread of the null to a ninth of itself
+SHUFFLES = 40  # determine the spread of the null to a ninth
 
-COMPONENTS = 30  # that enter as they are
-LEADING = 12  # that enter with their products and waves, too: all 30 would dilute them
-WAVES = (1.5, 2.5)  # radians per standard deviation: features between a slope and a bin
-OUTLIER = 5.0  # standard deviations to which features are clipped
-SMALLEST = 1e-6  # pulse heights: below it there is rounding, not shape
+COMPONENTS = 30  # principal components used as features
+LEADING = 12  # components whose products and sinusoids are used; all 30 would dilute them
+WAVES = (1.5, 2.5)  # radians per standard deviation: between a slope and a histogram bin
+OUTLIER = 5.0  # standard deviations at which features are clipped
+SMALLEST = 1e-6  # pulse heights: smaller values are rounding
 PENALTIES = np.geomspace(1e-4, 1e2, 13)  # per pulse, of features of variance 1 or less
 
 
@@ -48,18 +49,18 @@ class TwoSample:
     Attributes
     ----------
     auc, auc_std
-        Mean over the folds of the AUC of pulses that the classifier was not trained
-        on, and its standard error.  That is DeLong's, widened as much as the AUCs of
-        shuffled labels scatter more than he has it (about 1.4 times): the folds have
-        their training pulses in common.  It is 0 if no pulse is taken for another.
+        AUC of pulses outside the classifier's training, averaged over the folds, and its
+        standard error.  The error is DeLong's, scaled by the ratio of the scatter of the
+        AUCs of shuffled labels to DeLong's estimate of it (about 1.4), because the folds
+        share training pulses.  It is 0 if the separation is perfect.
     null_mean, null_std
-        Mean and standard deviation of the same number for shuffled labels: what two
-        samples of one distribution would give.  `null_std` is the scale on which
-        ``auc - null_mean`` is significant.
+        Mean and standard deviation of the AUC for shuffled labels, which is that of two
+        samples of one distribution.  The significance of a difference is
+        ``(auc - null_mean) / null_std``.
     n_data, n_sim
-        Pulses used.  They are equal: the larger side is thinned out.
+        Numbers of pulses used.  They are equal: the larger side is subsampled.
     missing_data, missing_sim
-        Pulses left out because a value is not finite.
+        Numbers of pulses left out because a value is not finite.
     """
 
     auc: float
@@ -80,12 +81,12 @@ def classifier_auc(
     features: tuple[Parameters, Parameters] | None = None,
     largest: int = LARGEST,
 ) -> TwoSample:
-    """Test whether two sets of pulses can be told apart.
+    """Test whether two sets of pulses can be distinguished.
 
-    The windows are taken as they are, so both sets must be prepared alike.  They
-    enter as principal components of both sets together, with the size and the
-    roughness of what these leave over; noise that is missing is seen.  Pulses of the
-    same events on both sides would pull the AUC below 0.5.
+    The windows are used unchanged, so both sets must be prepared in the same way.  The
+    features are the principal components of both sets together, and the size and roughness
+    of the remainder, which reveals missing noise.  Pulses of the same events on both sides
+    would bias the AUC to below 0.5.
 
     Parameters
     ----------
@@ -93,23 +94,23 @@ def classifier_auc(
         Prepared windows in pulse heights, measured and simulated or translated ones
         of the same peak, of shape ``(n, length)``.
     seed
-        Of the choice of pulses, the folds and the shuffles.
+        Seed of the choice of pulses, the folds and the shuffles.
     features
-        More values per pulse, of the data and of the others, by name; for instance
+        Further values per pulse by name, of the data and of the others; for example
         `parameters.pulse_parameters` of both.
     largest
-        The most pulses of a side that are used, drawn at random.
+        Maximum number of pulses per side; they are drawn at random.
 
     Returns
     -------
     TwoSample
-        The AUC in five-fold cross-validation, and what to compare it with.
+        AUC in five-fold cross-validation, and its null.
 
     Raises
     ------
     CpunetError
-        If the shapes or the names of the features of both sides do not fit together,
-        or a side has fewer than 40 pulses whose values are all finite.
+        If the shapes or the names of the features of the two sides differ, or a side has
+        fewer than 40 pulses with only finite values.
     """
     sides = (data, others)
     extras = _extras(sides, features)
@@ -144,18 +145,28 @@ def classifier_auc(
 
 
 def auc_and_variance(negatives: Values, positives: Values) -> tuple[Values, Values]:
-    """Area under the ROC curve of two sets of scores, and its variance after DeLong.
+    r"""Area under the ROC curve of two sets of scores, and its variance after DeLong.
+
+    With :math:`n` negative scores :math:`x`, :math:`m` positive scores :math:`y`, and
+    :math:`\psi` equal to 1 for :math:`y > x`, 1/2 for :math:`y = x` and 0 otherwise,
+
+    .. math:: A = \frac{1}{n m} \sum_{i, j} \psi(x_i, y_j), \qquad
+        \sigma^2_A = \frac{s^2(\bar{\psi}_i)}{n} + \frac{s^2(\bar{\psi}_j)}{m}
+
+    where :math:`\bar{\psi}_i` is the mean of :math:`\psi` over the positive scores,
+    :math:`\bar{\psi}_j` the mean over the negative scores, and :math:`s^2` the sample
+    variance.
 
     Parameters
     ----------
     negatives, positives
-        Scores, two or more of each, along the first axis; ties count as half.
+        Scores along the first axis, at least two of each; ties count as half.
 
     Returns
     -------
     tuple of numpy.ndarray
-        Probability that a positive's score exceeds a negative's, and the variance of
-        this estimate; of the shape of one row.
+        Probability that a positive score exceeds a negative one, and the variance of this
+        estimate; of the shape of one row.
 
     Examples
     --------
@@ -167,7 +178,7 @@ def auc_and_variance(negatives: Values, positives: Values) -> tuple[Values, Valu
 
     n, m = len(negatives), len(positives)
     ranks = rankdata(np.concatenate([negatives, positives]), axis=0)
-    # fraction of the other set that each score has on its right side
+    # fraction of the other set over which each score is ranked correctly
     above = (ranks[n:] - rankdata(positives, axis=0)) / n
     below = 1 - (ranks[:n] - rankdata(negatives, axis=0)) / m
     variance = above.var(axis=0, ddof=1) / m + below.var(axis=0, ddof=1) / n
@@ -198,10 +209,10 @@ def _extras(
 
 
 def _expanded(windows: Values, extra: Values) -> Values:
-    """Features of all pulses, blind to which side they are from.
+    """Features of all pulses, independent of their side.
 
-    Every block has about the same variance in sum, so that the many products do not
-    drown the shape itself.
+    All blocks have about the same total variance, so that the many products do not
+    outweigh the shape itself.
     """
     components, rest = _components(windows)
     plain = np.column_stack(
@@ -225,12 +236,12 @@ def _expanded(windows: Values, extra: Values) -> Values:
 
 
 def _components(windows: Values) -> tuple[Values, Values]:
-    """Leading principal components, and logarithms of what is left and of its steps."""
+    """Leading principal components, and log RMS of the remainder and of its differences."""
     from scipy.linalg import eigh
 
     centred = windows - np.median(windows, axis=0)
     norms = np.linalg.norm(centred, axis=1, keepdims=True)
-    # a few spoiled pulses must not choose the directions in which all are looked at
+    # a few corrupted pulses must not determine the principal components
     limit = 3 * np.median(norms)
     weighted = centred * (limit / np.maximum(norms, limit) if limit > 0 else 1)
     squares, length = weighted.T @ weighted, windows.shape[1]
@@ -249,10 +260,10 @@ def _components(windows: Values) -> tuple[Values, Values]:
 
 
 def _standard(values: Values, smallest: float = 0.0) -> Values:
-    """Columns with median 0 and the quartiles of a standard normal distribution, clipped."""
+    """Columns scaled to median 0 and the quartiles of a standard normal, then clipped."""
     lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
     spread = np.where(upper > lower, (upper - lower) / 1.349, values.std(axis=0))
-    # a column without a spread becomes 0: its rounding must not grow to a feature
+    # a column without spread becomes 0: rounding must not be amplified to a feature
     scale = np.where(spread > smallest, spread, np.inf)
     return np.asarray(np.clip((values - middle) / scale, -OUTLIER, OUTLIER))
 
@@ -260,9 +271,9 @@ def _standard(values: Values, smallest: float = 0.0) -> Values:
 def _cross_validated(features: Values, rng: np.random.Generator) -> tuple[Values, Values]:
     """AUC of the true labels and of each shuffle, and their errors for independent folds.
 
-    The first half of the rows is one side.  Each fold has equally many of both sides,
-    and labels are shuffled within it: unequal ones would pull the AUC below 0.5, as
-    a side that is rare in the training is frequent in the test.
+    The first half of the rows is one side.  Each fold has equal numbers of both sides, and
+    labels are shuffled within it.  Unequal numbers would bias the AUC to below 0.5, since a
+    side that is rare in the training is frequent in the test.
     """
     size = len(features) // 2
     fold = np.concatenate([rng.permutation(np.arange(size) % FOLDS) for _ in range(2)])
@@ -284,8 +295,8 @@ def _cross_validated(features: Values, rng: np.random.Generator) -> tuple[Values
 def _ridge(features: Values, labels: Values) -> Values:
     """Coefficients of a ridge regression on each column of `labels`.
 
-    The penalty of each is the one with the least leave-one-out error.  The intercept
-    is left out: it does not change the order of the scores.
+    Each penalty minimises the leave-one-out error.  The intercept is omitted: it does not
+    change the order of the scores.
     """
     n = len(features)
     centred = features - features.mean(axis=0)
@@ -295,7 +306,7 @@ def _ridge(features: Values, labels: Values) -> Values:
     shrink = 1 / (np.maximum(eigenvalues, 0)[:, np.newaxis] + PENALTIES * n)
     leverage = rotated**2 @ shrink + 1 / n
     projected = rotated.T @ targets
-    # only to choose among penalties that are factors of three apart
+    # float32 suffices to choose among penalties that are factors of three apart
     few_digits, wanted = rotated.astype(np.float32), targets.astype(np.float32)
     errors = []
     for shrunk, h in zip(shrink.T[..., np.newaxis], leverage.T[..., np.newaxis], strict=True):

@@ -1,17 +1,17 @@
-"""What the scores say in plain words: agrees with the data within errors, or off by N sigma.
+"""Scores in plain words: agrees with the data within errors, or off by N sigma.
 
-A score is compared with what two samples of one distribution would have: the IoU with
+A score is compared with its expectation for two samples of one distribution: the IoU with
 its ceiling, the Wasserstein distance and the classifier's AUC with their nulls, the A/E
-survival and the noise before the pulse with those of the data.  The question is whether
-chance alone explains a score, so the scale is the scatter that chance gives it, the
-*null's* spread.  The spread of the score itself under resampling says how well the score
-is known; a poor translation's would make it look closer to the ceiling than it is.
+survival and the baseline noise with those of the data.  The question is whether chance
+alone explains a score, so deviations are measured in units of the spread of the *null*.
+The spread of the score itself under resampling tells how well the score is known; that of
+a poor translation would make it appear closer to the ceiling than it is.
 
-Of IoU, Wasserstein distance and AUC only one side is worse than chance.  A score on the
+IoU, Wasserstein distance and AUC are worse than chance on one side only.  A score on the
 other side, such as an IoU above its ceiling, agrees.  Up to `AGREES` sigma is agreement.
 A perfect translation exceeds it in 2 … 5 % of IoU, 4 … 7 % of Wasserstein distances (which
-scatter with a tail upwards) and 8 % of parameters in either, so that of twenty parameters
-one or two are off by chance.
+scatter with an upward tail) and 8 % of parameters in either, so of twenty parameters one or
+two are off by chance.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from cpunet.analysis.style import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 
 AGREES = 2.0  # sigma
-TOO_CLOSE = 4.0  # sigma on the good side: no chance, but the same events twice
-LISTED = 6  # quantities that agree by name; more are counted
-BY_CHANCE = 0.08  # of the parameters of a perfect translation are off in IoU or distance
+TOO_CLOSE = 4.0  # sigma on the good side: not by chance, but the same events on both sides
+LISTED = 6  # agreeing quantities listed by name; more are only counted
+BY_CHANCE = 0.08  # fraction of a perfect translation's parameters off in IoU or distance
 WITHIN = "agrees within errors"
 
 Worse = Literal["lower", "higher", "both"]
@@ -35,25 +35,24 @@ Words = dict[str, float | str | None]
 
 _SHORT = {"ren": "REN", "iren": "IREN"}
 _W1, _SPECTRUM = "_wasserstein", "_spectrum"
-_SECOND = (_W1, _SPECTRUM)  # endings of what is judged together with the quantity before them
+_SECOND = (_W1, _SPECTRUM)  # suffixes of verdicts that are combined with the quantity's
 _AUC, _SURVIVAL, _NOISE = "auc", "ae_survival", "noise"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a score is what chance would give, and by how much it is not.
+    """Whether a score agrees with its expectation by chance, and its deviation.
 
     Attributes
     ----------
     sigma
-        Distance from the expected value in units of chance's spread, positive if worse
-        than expected (signed as score less expectation if both sides are); None if there
-        is none.
+        Deviation from the expectation in units of its spread, positive if worse than
+        expected (if both sides are worse: score minus expectation); None if undefined.
     agrees
-        None if there is no value.
+        Whether the score agrees; None if there is no value.
     words
-        The same to be read: ``agrees within errors``, ``off by 3.1 sigma``, or why there
-        is no verdict.
+        Verdict in words: ``agrees within errors``, ``off by 3.1 sigma``, or the reason why
+        there is no verdict.
     """
 
     sigma: float | None
@@ -64,18 +63,23 @@ class Verdict:
 def verdict(
     value: float | None, expected: float | None, spread: float | None, worse: Worse
 ) -> Verdict:
-    """Judge one score.
+    r"""Verdict on one score.
+
+    .. math:: z = \pm (v - \langle v \rangle_0) / \sigma_0
+
+    with the mean and the standard deviation of the score :math:`v` for two samples of one
+    distribution, and the sign such that :math:`z > 0` is worse than expected.
 
     Parameters
     ----------
     value
-        The score.
+        Score.
     expected, spread
-        Mean and standard deviation of the score for two samples of one distribution, as
-        the ceiling for an IoU.
+        Mean and standard deviation of the score for two samples of one distribution, for
+        example the ceiling of an IoU.
     worse
-        Which scores are worse than chance: ``"lower"`` (IoU), ``"higher"`` (a distance,
-        an AUC) or ``"both"`` (a difference).
+        Side that is worse than chance: ``"lower"`` (IoU), ``"higher"`` (a distance, an
+        AUC) or ``"both"`` (a difference).
 
     Examples
     --------
@@ -92,7 +96,7 @@ def verdict(
         return Verdict(None, None, "nothing to compare with")
     apart = (expected - value) if worse == "lower" else (value - expected)
     if spread <= 0:
-        # all events in one bin, say: chance would give one value and no other
+        # for example all events in one bin: chance gives exactly one value
         off = abs(apart) if worse == "both" else apart
         same = off <= 1e-9 * max(abs(expected), 1.0)
         return Verdict(0.0, True, WITHIN) if same else Verdict(None, False, "off")
@@ -111,17 +115,19 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
     Parameters
     ----------
     metrics
-        The content of ``metrics.json``; what older files lack is not judged, and the
-        verdict says so.
+        Content of ``metrics.json``.  Scores missing in older files have no verdict, with
+        the reason in its words.
+    peak, method
+        Names of the peak and of the method.
 
     Returns
     -------
     dict
-        For each parameter, under its name, its IoU against the ceiling, and, with
-        ``_wasserstein`` after the name, its distance against the null; ``auc``: the
-        classifier against its null; ``ae_survival``: the difference to the data, of
-        peaks other than that from which the cut comes; ``noise``: its RMS against the
-        data's, and ``noise_spectrum``: the worst of its bands.
+        For each parameter, under its name, its IoU against the ceiling and, with the suffix
+        ``_wasserstein``, its distance against the null.  ``auc``: the classifier against
+        its null.  ``ae_survival``: the difference from the data, for peaks other than that
+        which defines the cut.  ``noise``: its RMS against that of the data;
+        ``noise_spectrum``: the worst frequency band.
     """
     found: dict[str, Verdict] = {}
     scores = part(metrics, "peaks", peak)
@@ -168,18 +174,18 @@ def _noise_verdicts(noise: Mapping[str, Any], method: str) -> dict[str, Verdict]
 def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Words]]]:
     """Verdicts on all methods, ready for JSON.
 
-    Methods without noise are left out: the noise alone makes them differ.
+    Methods without noise are left out, since the missing noise alone makes them differ.
 
     Parameters
     ----------
     metrics
-        The content of ``metrics.json``.
+        Content of ``metrics.json``.
 
     Returns
     -------
     dict
-        ``{"sigma": …, "words": …}`` by peak, method and quantity, see `method_verdicts`;
-        a peak that is not scored has no methods.
+        ``{"sigma": …, "words": …}`` by peak, method and quantity, see `method_verdicts`.
+        A peak that is not scored has no methods.
     """
     return {
         peak: {
@@ -194,7 +200,7 @@ def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, W
 
 
 def summaries(metrics: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """One line in plain words by peak and method, see `summary`."""
+    """Summary line by peak and method, see `summary`."""
     return {
         peak: {m: summary(metrics, peak, m) for m in methods_of(metrics, peak)}
         for peak in part(metrics, "peaks")
@@ -202,10 +208,10 @@ def summaries(metrics: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 
 def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
-    """Say in one line what agrees with the data and what is off.
+    """Return one line with the quantities that agree with the data and those that are off.
 
-    A parameter is off if its IoU or its Wasserstein distance is, the noise if its RMS or
-    its spectrum is; the one further off is quoted.
+    A parameter is off if its IoU or its Wasserstein distance is; the noise is off if its RMS
+    or its spectrum is.  The larger deviation is quoted.
 
     Returns
     -------
@@ -237,7 +243,7 @@ def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
 
 
 def methods_of(metrics: Mapping[str, Any], peak: str) -> list[str]:
-    """Methods with noise that a peak's scores hold, in their order there."""
+    """Methods with noise in the scores of a peak, in their order there."""
     scores = part(metrics, "peaks", peak)
     names = [
         *(m for p in part(scores, "parameters") for m in part(scores, "parameters", p, "iou")),
@@ -279,7 +285,7 @@ def _called(quantity: str) -> str:
 
 
 def _agreement(agreeing: list[str], n_off: int) -> str:
-    """Name what agrees, or count it where a line would not hold the names."""
+    """List the agreeing quantities, or only their number if they are too many for a line."""
     if len(agreeing) > LISTED:
         total = len(agreeing) + n_off
         count = f"{len(agreeing)} of {total}" if n_off else f"all {total}"
@@ -291,7 +297,7 @@ def _agreement(agreeing: list[str], n_off: int) -> str:
 
 
 def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -> str:
-    """The score behind a verdict, beside what chance gives."""
+    """The score of a verdict and its expectation by chance."""
     scores = part(metrics, "peaks", peak)
     if quantity == _AUC:
         tested = part(scores, "two_sample", method)

@@ -1,4 +1,4 @@
-"""Parts of the interactive charts' data: arrays as text, labels without TeX."""
+"""Data of the interactive charts: arrays as base64, labels without TeX."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOWERED = str.maketrans("0123456789aehklmnopstx", "₀₁₂₃₄₅₆₇₈�
 
 
 def plain_label(text: str) -> str:
-    """Write a label with TeX between dollars without it.
+    """Convert a label with TeX between dollar signs to plain text.
 
     Examples
     --------
@@ -45,14 +45,14 @@ def plain_label(text: str) -> str:
 def packed(values: npt.ArrayLike, bits: int = 16) -> dict[str, Any]:
     """Return an array as base64 of little-endian integers.
 
-    ``value = offset + scale * integer``; the most negative integer is a NaN.
+    ``value = offset + scale * integer``; the most negative integer represents NaN.
 
     Parameters
     ----------
     values
-        Any array; what is not finite becomes NaN.
+        Array of any shape; non-finite values become NaN.
     bits
-        16 or 32.
+        Size of the integers, 16 or 32.
 
     Examples
     --------

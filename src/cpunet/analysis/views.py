@@ -1,6 +1,6 @@
 """Compact data of the report's interactive charts, ready for JSON.
 
-Each function makes one entry of the ``views`` that `report.write_report` takes.
+Each function returns one entry of the ``views`` of `report.write_report`.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ Values = npt.NDArray[np.float64]
 View = dict[str, Any]
 
 MAX_BINS = 49
-EVENTS = 20  # pulses to choose from, per peak
+EVENTS = 20  # selectable pulses per peak
 BEFORE, AFTER = 160, 240  # samples around half maximum
-SEARCHED = 2000  # measured pulses among which the nearest is sought
-POINTS = 1500  # of a method in a scatter
+SEARCHED = 2000  # measured pulses searched for the nearest
+POINTS = 1500  # points per method in a scatter plot
 SCATTER = ("drift_time", "current_amplitude")
-HOME_QUANTILES = (0.005, 0.995)  # of the data, which the scatter shows at first
+HOME_QUANTILES = (0.005, 0.995)  # of the data: initial range of the scatter plot
 HOME_MARGIN = 0.3
 
 
 def method_looks(methods: Iterable[str]) -> list[dict[str, Any]]:
-    """Name, label and colour of each method, one for the whole page.
+    """Name, label and colour of each method, common to the whole page.
 
-    A method without its noise has the colour of the method, is drawn dashed, and is hidden
-    until it is chosen.
+    A method without its noise has the colour of the method, is dashed, and is hidden until
+    selected.
 
     Parameters
     ----------
     methods
-        All methods of the page, in the order of the legends; repetitions are left out.
+        All methods of the page, in the order of the legends; duplicates are dropped.
     """
     methods = list(dict.fromkeys(methods))
     palette = colours(dict.fromkeys(m.removesuffix(NO_NOISE) for m in methods))
@@ -64,24 +64,24 @@ def distributions(
     parameters_info: Mapping[str, Parameter] = PARAMETERS,
     max_bins: int = MAX_BINS,
 ) -> View:
-    """Histograms of all parameters, in the bins in which they are compared.
+    """Histograms of all parameters, in the bins of the comparison.
 
     Parameters
     ----------
     values
-        By peak, method and parameter; the measured ones are under ``"data"``.
+        Values by peak, method and parameter, the measured ones under ``"data"``.
     comparisons
-        By peak, the result of `comparisons.compare`: bins, IoU and ceiling.  Without it the
+        Results of `comparisons.compare` by peak: bins, IoU and ceiling.  Without one the
         bins are those of `comparisons.data_axis`.
     parameters_info
         Labels and units by parameter.
     max_bins
-        The most bins where `comparisons` gives none.
+        Maximum number of bins where `comparisons` gives none.
 
     Returns
     -------
     dict
-        By peak and parameter; ``missing`` and the reason where there is nothing to show.
+        Histograms by peak and parameter, or ``missing`` with the reason.
     """
     return {
         peak: _peak_distributions(found, comparisons.get(peak, {}), parameters_info, max_bins)
@@ -100,14 +100,15 @@ def superpulse_views(
     Parameters
     ----------
     superpulses
-        By peak and method: ``n``, the number of pulses of each slice, and ``mean`` and
-        ``error`` of shape ``(slices, samples)``, in units of the full charge, all aligned.
+        Aligned superpulses by peak and method: ``n``, the number of pulses of each slice,
+        and ``mean`` and ``error`` of shape ``(slices, samples)``, in units of the full
+        charge.
     slices
-        What each slice is called, by peak or for all peaks alike.
+        Names of the slices, by peak or common to all peaks.
     dt_ns
         Sampling period in ns.
     n_before
-        The sample at which the pulses are aligned.
+        Sample at which the pulses are aligned.
     """
     peaks: View = {}
     for peak, methods in superpulses.items():
@@ -120,7 +121,7 @@ def superpulse_views(
             "methods": {
                 method: {
                     "n": [int(count) for count in found["n"]],
-                    # residuals to data are far below the 16 bits of a pulse's height
+                    # residuals are far smaller than the 16-bit resolution of a full pulse
                     "mean": packed(found["mean"], bits=32),
                     "error": packed(found["error"]),
                 }
@@ -139,29 +140,28 @@ def pulse_views(
     n_before: int = BEFORE,
     n_after: int = AFTER,
 ) -> View:
-    """Single events: the same one by every method, and the nearest measured pulse.
+    """Single events by every method, with the nearest measured pulse.
 
     Parameters
     ----------
     pulses
-        By peak and method, noise-free pulses of shape ``(n, samples)``, row by row of the
-        same simulated event.
+        Noise-free pulses by peak and method, shape ``(n, samples)``; each row is the same
+        simulated event for all methods.
     dt_ns
         Sampling period in ns.
     measured
-        Measured pulses by peak.  The nearest to an event is the one with the smallest
-        root-mean-square difference from its truth, or else its REN translation, among
-        `SEARCHED` of them.
+        Measured pulses by peak.  The nearest to an event has the smallest root-mean-square
+        difference from its truth, or else from its REN translation, among `SEARCHED` pulses.
     events
-        How many events there are to choose from; they are spread evenly over the rows.
+        Number of selectable events, equally spaced over the rows.
     n_before, n_after
-        Samples before the crossing of half the maximum, at which all are aligned, and
-        from it on.
+        Number of samples before the crossing of half the maximum, at which all pulses are
+        aligned, and from it on.
 
     Raises
     ------
     CpunetError
-        If the methods of a peak have not equally many pulses.
+        If the methods of a peak have different numbers of pulses.
     """
     window = (n_before, n_after)
     peaks: View = {}
@@ -186,7 +186,7 @@ def pulse_views(
 
 
 def spread(rows: npt.NDArray[np.int64], events: int = EVENTS) -> npt.NDArray[np.int64]:
-    """So many of the rows, or all if they are fewer, evenly spread."""
+    """At most `events` of the rows, equally spaced."""
     places = np.linspace(0, len(rows) - 1, min(events, len(rows))).astype(int)
     return np.asarray(rows[places])
 
@@ -198,18 +198,18 @@ def scatter_views(
     axes: tuple[str, str] = SCATTER,
     seed: int = 0,
 ) -> View:
-    """Two parameters of the same pulses, at most `POINTS` pulses of a method.
+    """Scatter plots of two parameters, with at most `POINTS` pulses per method.
 
     Parameters
     ----------
     values
-        By peak, method and parameter.
+        Values by peak, method and parameter.
     parameters_info
         Labels and units by parameter.
     axes
-        The parameters of the horizontal and of the vertical axis.
+        Parameters of the horizontal and of the vertical axis.
     seed
-        Of the choice of pulses.
+        Seed of the choice of pulses.
     """
     rng = np.random.default_rng(seed)
     peaks: View = {}
@@ -272,7 +272,7 @@ def _peak_distributions(
 
 
 def _binning(data: Values, axis: Mapping[str, Any], max_bins: int) -> hist.axis.Regular:
-    """Return the bins of the comparison, or else those that it would have."""
+    """Return the bins of the comparison, or else those of `comparisons.data_axis`."""
     if axis.get("bins"):
         return hist.axis.Regular(int(axis["bins"]), axis["low"], axis["high"])
     return data_axis(data, max_bins)
@@ -281,7 +281,7 @@ def _binning(data: Values, axis: Mapping[str, Any], max_bins: int) -> hist.axis.
 def _nearest(
     shown: Mapping[str, FloatArray], measured: FloatArray, window: tuple[int, int]
 ) -> View:
-    """Return for each event the measured pulse that differs least from it."""
+    """Return the measured pulse nearest to each event."""
     to = next((m for m in ("truth", "ren") if m in shown), list(shown)[-1])
     every = measured[:: -(-len(measured) // SEARCHED)]
     found = nearest_pulses(shown[to], every, 1, window[0], least=0.5)
@@ -293,7 +293,7 @@ def _nearest(
 
 
 def _home(values: Values) -> list[float]:
-    """Where the bulk of the data lies, with a margin."""
+    """Range of the bulk of the data, with a margin."""
     known = values[np.isfinite(values)]
     if not known.size:
         return [0.0, 1.0]

@@ -1,1 +1,1 @@
-"""Pulses from files, prepared, cut and written again."""
+"""Read pulses from files, prepare them, apply quality cuts and write them."""

@@ -1,6 +1,6 @@
 """Compiled loops of the preparation: one raw trace in, one window and its numbers out.
 
-All sums are taken in float64; a trace is read where it lies, never copied.
+All sums are float64.  Traces are read in place and never copied.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cpunet.kernels import kernel
 
-# Stable codes of the reasons a trace is refused here (`preparation.Rejection` names them).
+# Stable rejection codes; `preparation.Rejection` names them.
 ACCEPTED = 0
 NAN = 1
 CONSTANT = 2
@@ -26,27 +26,27 @@ TAIL_NOT_POSITIVE = 6
 BASELINE, SCALE, ALIGN_SAMPLE, BASELINE_RMS, BASELINE_SLOPE, TAIL_SLOPE, CHI2 = range(7)
 N_COLUMNS = 7
 
-# The alignment moves the baseline window and the baseline moves the 99.9 % threshold,
-# by a thousandth of its own change: two rounds settle all but exact ties.
+# The alignment moves the baseline window, and the baseline moves the 99.9 % threshold by
+# a thousandth of its own change.  Two rounds settle all but exact ties.
 _ROUNDS = 4
-# Where a pulse has begun: above a hundredth of its height and clear of the noise, with room
-# for what lies below.
+# A pulse has begun where it exceeds a hundredth of its height and is clear of the noise.  The
+# baseline ends some samples earlier, since the rise starts below that threshold.
 _BEGUN_FRACTION, _BEGUN_RMS, _BEGUN_MARGIN = 0.01, 8.0, 16
-# Noise alone makes a maximum of three to four RMS in a thousand samples.
+# In a thousand samples, noise alone reaches a maximum of three to four RMS.
 _MIN_AMPLITUDE_RMS = 8.0
-# An earlier pulse disturbs one part of a baseline; the quietest part tells the noise.
+# An earlier pulse disturbs one part of a baseline; the quietest part gives the noise.
 _PARTS = 4
-# Chance below which equal samples at the maximum cannot be the noise's doing.
+# Probability below which equal samples at the maximum are not attributed to noise.
 _FLAT_BY_CHANCE = 1e-6
-# A smooth maximum that looks flat because of the ADC's steps falls by about eight
-# steps over the next equally long stretch; a clipped one by far more.
+# A smooth maximum that looks flat because of the ADC steps falls by about eight steps
+# over the next stretch of equal length; a clipped one falls by far more.
 _FLAT_BY_STEPS = 16.0
 # Values that differ by float32 rounding, in units of the amplitude, count as equal.
 _ROUNDING = 2.0 * 2.0**-23
 
 
 class Settings(NamedTuple):
-    """The preparation settings in the form the compiled loop takes them."""
+    """The preparation settings in the form that the compiled loop accepts."""
 
     simulated: bool
     samples_before: int
@@ -62,7 +62,7 @@ class Settings(NamedTuple):
 
 
 _compiled: Any = kernel(error_model="numpy")
-# Called on finite values only, so that the comparisons may be vectorised.
+# Called on finite values only, so the compiler can vectorise the comparisons.
 _compiled_finite: Any = kernel(error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
 
 
@@ -108,8 +108,8 @@ def _first_at(trace, level):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
-    """Fraction of neighbouring samples that are equal, and the smallest step else."""
-    equal, step = 1, math.inf  # one to begin with: a chance is never quite zero
+    """Fraction of equal neighbouring samples, and the smallest step between unequal ones."""
+    equal, step = 1, math.inf  # start at 1: a probability is never exactly zero
     for i in range(1, len(trace)):
         difference = abs(trace[i] - trace[i - 1])
         if difference == 0:
@@ -121,9 +121,9 @@ def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _longest_run(trace, top, first, shortest):  # type: ignore[no-untyped-def]
-    """Length and end of the longest run of `top`, if there is one of `shortest` samples."""
+    """Length and end of the longest run of `top`, if one has at least `shortest` samples."""
     longest = end = 0
-    for sample in range(first, len(trace), shortest):  # no such run fits between these
+    for sample in range(first, len(trace), shortest):  # no such run fits in between
         if trace[sample] == top:
             start = stop = sample
             while start > first and trace[start - 1] == top:
@@ -137,11 +137,11 @@ def _longest_run(trace, top, first, shortest):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore[no-untyped-def]
-    """Whether the top of a measured trace is flat as neither noise nor ADC steps make it.
+    """Whether the top of a measured trace is flatter than noise and ADC steps can explain.
 
-    `quiet` samples at the trace's beginning tell how often noise makes two neighbours
-    equal.  Where it mostly does (coarse steps, or no noise), the fall after the flat
-    top decides: clipping cuts off far more than one step.
+    The first `quiet` samples show how often noise makes two neighbours equal.  Where it
+    mostly does (coarse steps, or no noise), the fall after the flat top decides: clipping
+    cuts off far more than one step.
     """
     longest, end = _longest_run(trace, top, top_sample, saturation_run)
     if longest < saturation_run:
@@ -169,8 +169,8 @@ def _crossing(trace, top_sample, threshold):  # type: ignore[no-untyped-def]
 def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: ignore[no-untyped-def]
     """The aligned sample; `preferred` if rounding alone could move it there or away.
 
-    Without this, one prepared pulse in ten thousand would shift by a sample when
-    prepared again.
+    Without this preference, one prepared pulse in ten thousand would shift by a sample
+    when prepared again.
     """
     threshold = base + fraction * (top - base)
     slack = _ROUNDING * (top - base)
@@ -183,14 +183,14 @@ def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: i
 
 @_compiled
 def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
-    """Samples of the record in the baseline part of a window; one at least."""
+    """Samples of the record in the baseline part of a window; at least one."""
     first = min(max(start, 0), length - 1)
     return first, min(max(start + s.baseline_samples, first + 1), length)
 
 
 @_compiled
 def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
-    """Align, take the baseline of that window, and align again until nothing moves."""
+    """Align, compute the baseline of that window, and repeat until nothing moves."""
     length = len(trace)
     if s.simulated:
         base = np.float64(_lowest(trace))
@@ -218,7 +218,7 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
 
 @_compiled_finite
 def _line(values):  # type: ignore[no-untyped-def]
-    """Mean, slope per sample and RMS about the line of equally spaced values."""
+    """Mean, slope per sample and RMS about a straight line of equally spaced values."""
     n = len(values)
     if n < 3:
         return _mean(values) if n else 0.0, 0.0, 0.0
@@ -234,7 +234,7 @@ def _line(values):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _quietest_rms(baseline):  # type: ignore[no-untyped-def]
-    """RMS about a line in the quietest of a few parts of the baseline."""
+    """RMS about a straight line in the quietest part of the baseline."""
     size = len(baseline) // _PARTS
     quietest = math.inf
     for part in range(_PARTS):
@@ -245,11 +245,11 @@ def _quietest_rms(baseline):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-def]
-    """The `baseline_samples` of the record before the pulse begins; three at least.
+    """The `baseline_samples` of the record before the pulse begins; at least three.
 
-    The baseline part of a window holds the beginning of a slow pulse, whose slope would
-    make the quality cuts drop long drift times.  What begins in the first half of that
-    part is no slow pulse but a second one, and stays in for the cuts to see.
+    The baseline part of a window can contain the start of a slow pulse, whose slope would
+    make the quality cuts remove long drift times.  A pulse that begins in the first half of
+    that part is not slow: it is a second pulse, and stays in for the cuts to find.
     """
     level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
     begun = _crossing(trace, min(align, len(trace) - 1), level)
@@ -269,7 +269,7 @@ def _residual_squares(tail, logs, mean, slope):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _tail_fit(tail, rms, logs):  # type: ignore[no-untyped-def]
-    """Slope per sample of the logarithm and reduced chi-square; NaN slope if not positive."""
+    """Slope per sample of the logarithm and reduced chi-square; NaN if a value is ≤ 0."""
     if _lowest(tail) <= 0:
         return math.nan, math.nan
     for i in range(len(tail)):
@@ -277,14 +277,14 @@ def _tail_fit(tail, rms, logs):  # type: ignore[no-untyped-def]
     mean, slope, _ = _line(logs)
     if rms == 0:
         return slope, math.nan
-    # The error of a logarithm is the error of the value divided by the value.
+    # The error of a logarithm is the relative error of the value.
     squares = _residual_squares(tail, logs, mean, slope)
     return slope, squares / (rms * rms * (len(tail) - 2))
 
 
 @_compiled
 def _tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
-    """Mean of the `tail_samples` before `stop`; the last value stands for what is missing."""
+    """Mean of the `tail_samples` before `stop`; the last value replaces missing samples."""
     total = 0.0
     for i in range(stop - tail_samples, stop):
         total += np.float64(trace[min(i, len(trace) - 1)])
@@ -293,7 +293,7 @@ def _tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
-    """Write `(trace - base) / scale`; 0 before the record, its last value after."""
+    """Write `(trace - base) / scale`: 0 before the record, its last value after it."""
     length = len(trace)
     first, stop = max(0, -start), min(len(window), length - start)
     factor = 1.0 / scale
@@ -331,7 +331,7 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
         _, slope, rms = _line(trace[first:last])
         if start < -s.max_padding_before or stop > length + s.max_padding_after:
             return WINDOW_OUTSIDE_RECORD
-        if start + s.baseline_samples <= 0:  # nothing to take the baseline from
+        if start + s.baseline_samples <= 0:  # no samples for the baseline
             return WINDOW_OUTSIDE_RECORD
         base = mean
         scale = (_tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
@@ -350,7 +350,7 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
 
 @_compiled
 def _prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
-    """Prepare all traces; those accepted fill the first rows, whose number is returned."""
+    """Prepare all traces; accepted ones fill the first rows.  Return how many there are."""
     logs = np.empty(s.decay_fit_samples)
     kept = 0
     for i in range(len(waveforms)):
@@ -369,13 +369,14 @@ def prepare_block(
     waveforms
         Raw traces, shape ``(n, length)`` with at least one sample each.
     settings
-        What to do with them.
+        Settings of the preparation.
 
     Returns
     -------
     tuple
-        Codes ``(n,)``, and of the accepted traces the windows ``(kept, samples_before
-        + samples_after)`` and numbers ``(kept, N_COLUMNS)``, with slopes per sample.
+        Codes of shape ``(n,)``.  For the accepted traces, windows of shape ``(kept,
+        samples_before + samples_after)`` and numbers of shape ``(kept, N_COLUMNS)``, with
+        slopes per sample.
     """
     n = len(waveforms)
     length = settings.samples_before + settings.samples_after
@@ -383,6 +384,6 @@ def prepare_block(
     numbers = np.empty((n, N_COLUMNS))
     codes = np.empty(n, np.uint8)
     kept = _prepare_block(np.ascontiguousarray(waveforms), settings, windows, numbers, codes)
-    # Gives the unused rows back without copying the others.
+    # Releases the unused rows without copying the others.
     windows.resize((kept, length), refcheck=False)
     return codes, windows, numbers[:kept]

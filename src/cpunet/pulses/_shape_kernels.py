@@ -1,6 +1,6 @@
 """Compiled loops of the shape parameters: one pulse in, its numbers out.
 
-All sums are taken in float64.  A pulse without a value gives NaN, never an exception.
+All sums are float64.  A pulse without a value gives NaN, never an exception.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-# The smoothed current lies within 6 % of its maximum half a sample from it, since
-# the averages alone spread it with a sigma of 1.5 samples.
+# Half a sample from its maximum, the smoothed current is still within 6 % of it: the
+# averages alone smear it with a sigma of 1.5 samples.
 _NEAR_MAXIMUM = 0.8
-# Gauss-Newton steps; three to five settle a tail unless the fit is degenerate.
+# Gauss-Newton steps; three to five suffice unless the fit is degenerate.
 _STEPS = 30
 _SETTLED = 1e-9  # of the slow decay over the length of the fit
-# Slow and fast decay cannot be told apart when nearly equal.
+# Nearly equal slow and fast decays cannot be distinguished.
 _SLOWEST_FAST = 0.5
 _DEGENERATE = 1e-9  # determinant over the product of the diagonal
 
 _compiled: Any = kernel(error_model="numpy")
-# For sums over finite values, which the compiler may then reorder and vectorise.
+# For sums over finite values, which the compiler can then reorder and vectorise.
 _compiled_sum: Any = kernel(
     error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
 )
@@ -53,7 +53,7 @@ def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
     first = math.ceil(start)
     if first >= stop:
         return math.nan
-    # straight lines between samples, and a part of one at the beginning
+    # straight lines between samples, with a partial interval at the start
     share = first - start
     area = 0.0
     if share > 0:
@@ -113,9 +113,9 @@ def _corrected_shapes(waveforms, rates, plateau, fraction, overshoots, late):  #
 
 @_compiled_sum
 def _normal_equations(tail, fast, slow, rate, height, share):  # type: ignore[no-untyped-def]
-    """Sums of products of the three derivatives and of the residual with each, and its square.
+    """Sums for the normal equations: products of derivatives and residuals.
 
-    The derivatives are those by the slow height, its rate and the fast height.
+    The derivatives are those with respect to the slow height, its rate and the fast height.
     """
     centre, kept = 0.5 * (len(tail) - 1), math.exp(-rate)
     value = math.exp(rate * centre)
@@ -143,7 +143,7 @@ def _normal_equations(tail, fast, slow, rate, height, share):  # type: ignore[no
 def _two_decays(tail, fast, slow, rate, fast_rate):  # type: ignore[no-untyped-def]
     """Rate and height of the slow decay, height of the fast one and residual RMS.
 
-    Heights are those at the middle of the tail; `rate` is where the search begins.
+    Heights refer to the middle of the tail; `rate` is the starting value.
     """
     n, height, share = len(tail), np.float64(tail.mean()), 0.0
     for _ in range(_STEPS):
@@ -178,7 +178,7 @@ def _two_decay_fits(tails, rates, fast_rate, offset, results):  # type: ignore[n
         results[i] = math.nan
         if n > 3 and math.isfinite(rates[i]):
             rate, height, share, rms = _two_decays(tails[i], fast, slow, rates[i], fast_rate)
-            # from the middle of the tail back to the aligned sample
+            # extrapolate from the middle of the tail back to the aligned sample
             height *= math.exp(rate * (offset + middle))
             share *= math.exp(fast_rate * (offset + middle))
             results[i, 0], results[i, 1], results[i, 2] = rate, share / (height + share), rms
@@ -218,7 +218,7 @@ def _current_maximum(current, weights, samples):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _half_width(current, weights, top, highest, direction):  # type: ignore[no-untyped-def]
-    """Steps from the maximum to half of it, to the left (-1) or right (+1)."""
+    """Steps from the maximum to half of it, on the left (-1) or right (+1)."""
     steps, reach = len(weights), weights.shape[1] // 2
     first, last = reach * steps, (len(current) - reach) * steps - 1
     step, before = top, highest
@@ -238,7 +238,7 @@ def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
         widths[i] = math.nan
         for j in range(len(current)):
             current[j] = waveforms[i, j + 1] - waveforms[i, j]
-        if math.isfinite(current.sum()):  # nothing with a NaN has a maximum
+        if math.isfinite(current.sum()):  # a current with a NaN has no maximum
             top, highest = _current_maximum(current, weights, samples)
             if top >= 0:
                 left = _half_width(current, weights, top, highest, -1)
@@ -247,10 +247,12 @@ def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
 
 
 def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Values:
-    """Area between a step and each pulse ``(n, length)``, over the step's height, in samples.
+    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
 
-    The step rises at the time `starts` (NaN for no value); the area ends at the sample
-    `stops`, where the pulse is as high as the step.
+    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
+
+    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
+    `stops`, with straight lines between samples.
     """
     areas = np.empty(len(waveforms))
     _missing_areas(waveforms, starts, stops, areas)
@@ -260,10 +262,14 @@ def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Value
 def corrected_shapes(
     waveforms: FloatArray, rates: Values, plateau: int, fraction: float
 ) -> tuple[Values, Values]:
-    """Overshoot (a fraction) and late charge (in samples) of pulses without their decay.
+    r"""Overshoot (a fraction) and late charge (in samples) after pole-zero correction.
 
-    Pulses ``(n, length)`` fall with `rates` per sample (NaN for no value); the mean of the
-    last `plateau` samples is their height, and charge after `fraction` of it is late.
+    .. math:: \frac{\max_t x(t)}{P} - 1, \qquad \frac{1}{P} \int_{t_f} [P - x(t)] \, dt
+
+    of the corrected pulse :math:`x` with the plateau :math:`P`, the mean of the last `plateau`
+    samples.  The maximum is taken before the plateau, and charge that arrives after
+    :math:`x(t_f) = f P` is late.  Pulses ``(n, length)`` decay with `rates` per sample (NaN for
+    no value).
     """
     overshoots, late = np.empty(len(waveforms)), np.empty(len(waveforms))
     _corrected_shapes(waveforms, rates, plateau, fraction, overshoots, late)
@@ -275,10 +281,10 @@ def two_decay_fits(
 ) -> tuple[Values, Values, Values]:
     """Least-squares fit of a decay of free rate and one of known rate to each tail.
 
-    Tails are ``(n, samples)``; the search for the slow rate begins at `rates` per sample
-    (NaN for no value), and `offset` samples lie between the time at which the share is
-    wanted and the tail.  Returns the slow rate per sample, the share of the fast decay in
-    the sum of both, and the residual RMS.
+    Tails have shape ``(n, samples)``.  The search for the slow rate starts at `rates` per
+    sample (NaN for no value).  The share of the fast decay is evaluated `offset` samples
+    before the tail.  Returns the slow rate per sample, the share of the fast decay in the
+    sum of both, and the residual RMS.
     """
     results = np.empty((len(tails), 3))
     _two_decay_fits(tails, rates, fast_rate, offset, results)
@@ -291,6 +297,6 @@ def current_widths(waveforms: FloatArray, weights: FloatArray) -> Values:
     The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`.
     """
     widths = np.empty(len(waveforms))
-    # a weight below 0 is rounding, and would make a current of a pulse that only falls
+    # negative weights are rounding; they would give a falling pulse a positive current
     _current_widths(waveforms, np.clip(weights.astype(float), 0, None), widths)
     return widths

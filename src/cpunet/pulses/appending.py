@@ -1,4 +1,4 @@
-"""One more waveform column, in a copy of an LH5 file."""
+"""Add a waveform column to a copy of an LH5 file."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from cpunet.pulses.writing import Columns
 
 
 class ColumnAppender:
-    """A copy of an LH5 file in the making, whose table gets a column of waveforms.
+    """Writer of a copy of an LH5 file whose table gains a column of waveforms.
 
-    All else in the file stays as it is.  Values that come with the waveforms become columns
-    ``NAME_…``.  The file appears whole at the end, or not at all.
+    Everything else in the file is unchanged.  Values that belong to the waveforms become
+    columns ``NAME_…``.  The file appears only when it is complete.
 
     Parameters
     ----------
@@ -37,19 +37,19 @@ class ColumnAppender:
     source
         The file to copy.
     table
-        The table in it, as ``"geds/raw"``.
+        Path of the table in the file, for example ``"geds/raw"``.
     name
-        Of the new column.
+        Name of the new column.
     waveform_units, t0_ns, samples, force
-        As for `cpunet.pulses.writing.PulseWriter`.
+        See `cpunet.pulses.writing.PulseWriter`.
     attrs
-        Attributes of the column's samples, such as where the pulses come from.
+        Attributes of the column's samples, such as the origin of the pulses.
 
     Raises
     ------
     CpunetError
-        If the file exists (without `force`) or cannot be written, if the table is not one
-        of LH5 or has such a column, or if other than its number of rows come.
+        If the file exists (without `force`) or cannot be written, if the table is not an
+        LH5 table or already has the column, or if the number of rows differs.
     """
 
     def __init__(
@@ -112,16 +112,16 @@ class ColumnAppender:
         columns: Columns | None = None,
         others: Mapping[str, LGDO] | None = None,
     ) -> None:
-        """Add the waveforms of a block of pulses, and values that belong to them.
+        """Append the waveforms of a block of pulses and the values that belong to them.
 
         Parameters
         ----------
         pulses
-            The next rows of the table.
+            Pulses of the next rows of the table.
         columns
             Name → (array of shape ``(n,)``, units); becomes column ``NAME_name``.
         others
-            Columns that the table has already; not written again.
+            Columns that the table already has; not written again.
         """
         del others
         if self._file is None:
@@ -131,7 +131,7 @@ class ColumnAppender:
                 pulses, t0_ns=self._t0_ns, units=self._units, samples=self._samples
             )
         }
-        # of the samples: a table of waveforms with attributes of its own is read only once
+        # set on the samples: a waveform table with attributes of its own is read only once
         content[self._name].values.attrs.update(self._attrs)
         for name, (values, units) in (columns or {}).items():
             array = Array(np.asarray(values), attrs={"units": units} if units else {})
@@ -142,7 +142,7 @@ class ColumnAppender:
         self.n_pulses += len(pulses)
 
     def stamp(self, name: str, text: str) -> None:
-        """Set an attribute of the file, such as a record of how it was made."""
+        """Set an attribute of the file, such as its provenance record."""
         if self._file is None:
             raise ValueError("stamp outside of the appender's with block")
         self._file.h5.attrs[name] = text
@@ -161,7 +161,7 @@ class ColumnAppender:
                 )
 
     def _declare(self, table: h5py.Group) -> None:
-        """Name the new columns in the table's datatype, where LH5 looks for them."""
+        """List the new columns in the table's datatype attribute, as LH5 requires."""
         named = text_attribute(table, "datatype").removeprefix("table{").removesuffix("}")
         names = [name for name in named.split(",") if name]
         names += [name for name in self._new if name not in names]

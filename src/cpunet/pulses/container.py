@@ -1,4 +1,4 @@
-"""One container for a set of pulses, whatever file or simulator they came from."""
+"""A container for sets of pulses from any file or simulator."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ FloatArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Pulses:
-    """A set of equally long, equally sampled pulses and what is known of each.
+    """A set of pulses of equal length and sampling, with energy and event number.
 
     Parameters
     ----------
     waveforms
-        Float32 array of shape ``(n, length)``: ADC counts for raw traces, units
+        Float32 array of shape ``(n, length)``, in ADC counts for raw traces and in units
         of the full charge for simulated and prepared pulses.
     dt_ns
         Sampling period in ns, the same for all pulses.
     energy_kev
-        Energy of each pulse in keV; NaN where it is not known.
+        Energy of each pulse in keV; NaN where unknown.
     event_number
-        The source's own number of each event.
+        Event number in the source.
     peak
-        Name of the gamma line each energy falls on (``"FEP"``, …), ``""`` for none.
+        Name of the gamma line of each energy (``"FEP"``, …), ``""`` for none.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class Pulses:
         event_number: npt.ArrayLike | None = None,
         peak: npt.ArrayLike | None = None,
     ) -> Pulses:
-        """Build a set from anything array-like, with defaults for what is not known."""
+        """Build a set from array-likes, with defaults for unknown quantities."""
         values = np.asarray(waveforms, dtype=np.float32)
         n = len(values)
         return cls(
@@ -101,7 +101,7 @@ class Pulses:
     def __getitem__(
         self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
     ) -> Pulses:
-        """The pulses of a slice, a mask or a list of rows."""
+        """The pulses selected by a slice, a mask or row numbers."""
         return Pulses(
             waveforms=self.waveforms[which],
             dt_ns=self.dt_ns,
@@ -116,7 +116,7 @@ class Pulses:
 
     @classmethod
     def concatenate(cls, sets: Sequence[Pulses]) -> Pulses:
-        """Join sets of the same length and sampling into one."""
+        """Concatenate sets of equal length and sampling."""
         if not sets:
             raise CpunetError("no sets of pulses to join")
         first = sets[0]

@@ -1,13 +1,13 @@
 """Quality cuts that remove pile-up, decaying baselines and outliers (paper, section 3.3).
 
-The windows are medians plus or minus a number of robust standard deviations
-(1.4826 MAD) of the set itself, so that no constant of one detector enters.
+Each window is the median plus or minus a number of robust standard deviations
+(1.4826 MAD) of the set itself, so that no detector-specific constant enters.
 
-Noise in ADC counts is the same for all pulses of a channel, so the error of a slope
-of a normalised pulse goes as 1/amplitude.  Slopes are therefore compared as they
-would be at the set's median amplitude, which makes one window fit all energies.
-Chi-square is compared as if every pulse had the median noise: a pulse that sits in
-its own baseline window would otherwise excuse its bad fit by its large "noise".
+The noise in ADC counts is the same for all pulses of a channel, so the error of a slope
+of a normalised pulse scales as 1/amplitude.  Slopes are therefore compared as they
+would be at the set's median amplitude, and one window serves all energies.
+Chi-square is compared as if every pulse had the median noise.  Otherwise a pulse that
+extends into its own baseline window would hide its bad fit behind a large "noise".
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from cpunet.pulses.preparation import FloatColumn, Prepared, Rejection
 from cpunet.recipes.base import Config
 from cpunet.recipes.schema import CutConfig
 
-# Below this many pulses the MAD says nothing and no window is drawn.
+# With fewer pulses the MAD is meaningless and no window is set.
 _FEWEST = 10
 _SIGMA_PER_MAD = 1.4826
 _FLOAT32_ROUNDING = 2.0**-23
 
 
 class CutWindow(Config):
-    """One accepted interval; a bound of None does not bound.
+    """One accepted interval; a bound of None means no bound.
 
     ``tail_slope`` and ``baseline_slope`` are in 1/ms at the median amplitude,
-    ``baseline`` in units of the raw trace, ``chi2`` without unit.
+    ``baseline`` is in units of the raw trace, and ``chi2`` is dimensionless.
     """
 
     name: str
@@ -40,14 +40,14 @@ class CutWindow(Config):
 
 
 class CutWindows(Config):
-    """The windows of a set, with what its pulses are compared at.
+    """The windows of a set, with the amplitude and noise at which pulses are compared.
 
     Parameters
     ----------
     amplitude, noise
         Median scale and median baseline RMS of the set, in units of the raw trace.
     windows
-        In the order in which they are applied.
+        Windows in the order in which they are applied.
     """
 
     amplitude: float
@@ -56,21 +56,21 @@ class CutWindows(Config):
 
 
 def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
-    """Draw the windows from the set's own medians and MADs.
+    """Derive the windows from the medians and MADs of the set.
 
     Parameters
     ----------
     prepared
-        Measured pulses of one channel.  Of several energies at once only if
-        prepared from raw traces: pulses scaled before hide how their noise differs.
+        Measured pulses of one channel.  Pulses of several energies must have been prepared
+        from raw traces: if they were scaled before, their different noise is hidden.
     config
         Half-widths in robust standard deviations.
 
     Returns
     -------
     CutWindows
-        For ``tail_slope``, ``chi2`` (upper bound only), ``baseline`` and
-        ``baseline_slope``; none from fewer than ten pulses.
+        Windows for ``tail_slope``, ``chi2`` (upper bound only), ``baseline`` and
+        ``baseline_slope``; none with fewer than ten pulses.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
             continue
         centre = float(np.median(values[finite]))
         deviations = np.abs((values - centre) * weights)[finite]
-        # A baseline is no outlier for differing by less than one sample's noise.
+        # A baseline within the noise of one sample is not an outlier.
         floor = noise if name == "baseline" else 0.0
         rounding = _FLOAT32_ROUNDING * float(np.median(np.abs(values[finite])))
         sigma = max(_SIGMA_PER_MAD * float(np.median(deviations)), floor, rounding)
@@ -105,15 +105,15 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
 
 
 def compared(prepared: Prepared, cuts: CutWindows, window: CutWindow) -> FloatColumn:
-    """Each pulse's value in the form that `window` bounds, for cutting and for figures."""
+    """Value of each pulse in the form that `window` bounds, for cuts and figures."""
     values, weights = _values(prepared, window.name, cuts.amplitude, cuts.noise)
     return window.centre + (values - window.centre) * weights
 
 
 def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
-    """Drop the pulses outside a window and count each under the first that it fails.
+    """Drop the pulses outside any window and count each under the first one it fails.
 
-    A value that does not exist (chi-square without noise) fails no window.
+    An undefined value (chi-square without noise) fails no window.
     """
     reasons: npt.NDArray[np.uint8] = np.zeros(len(prepared), np.uint8)
     for window in cuts.windows:
@@ -130,7 +130,7 @@ def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
 def _values(
     prepared: Prepared, name: str, amplitude: float, noise: float
 ) -> tuple[FloatColumn, FloatColumn]:
-    """A parameter and the factor by which deviations of each pulse count."""
+    """A parameter, and the weight of each pulse's deviation from the median."""
     values: FloatColumn = getattr(prepared, name)
     if name in ("tail_slope", "baseline_slope"):
         return values, prepared.scale / amplitude

@@ -1,4 +1,4 @@
-"""What files of pulses are made of, and why one could not be written."""
+"""Waveform tables of LH5 files, and error messages of failed writes."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from cpunet.pulses.container import Pulses
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-# Chunks of whole traces, so that a block of events is read without unpacking others.
+# Chunks of whole traces: a block of events is read without decompressing others.
 _CHUNK_BYTES = 1 << 18
-# The lowest level of gzip: noise hardly shrinks any further, and it takes half the time.
+# Lowest gzip level: noise hardly compresses further, and it takes half the time.
 _GZIP_LEVEL = 1
 
 
 @contextmanager
 def write_errors(path: Path) -> Iterator[None]:
-    """Turn what the HDF5 library raises, as on a full disk, into a line of a `CpunetError`."""
+    """Convert errors of the HDF5 library, such as a full disk, into a `CpunetError`."""
     try:
         yield
     except (OSError, RuntimeError) as error:
@@ -40,16 +40,16 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 class HeldFile(io.FileIO):
-    """A file whose failed writes are kept for later, and hidden from the HDF5 library.
+    """A file that stores its first failed write and hides it from the HDF5 library.
 
-    After a failed write that library can neither go on nor close its file: it fills the
-    screen, and may crash as the program ends.
+    After a failed write the library can neither continue nor close its file: it floods the
+    screen with messages and can crash at exit.
     """
 
     failure: OSError | None = None
 
     def write(self, data: ReadableBuffer, /) -> int:
-        """Write all of it, unless that failed before or fails now."""
+        """Write everything, unless this or an earlier write fails."""
         left = memoryview(data).cast("B")
         size = len(left)
         try:
@@ -60,7 +60,7 @@ class HeldFile(io.FileIO):
         return size
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Change the size, unless something failed before or this does."""
+        """Change the size, unless this or an earlier call fails."""
         try:
             if self.failure is None:
                 return super().truncate(size)
@@ -70,16 +70,16 @@ class HeldFile(io.FileIO):
 
 
 class FileInTheMaking:
-    """An HDF5 file that is being written: raises a `CpunetError` in place of other errors.
+    """An HDF5 file being written, whose errors are raised as `CpunetError`.
 
     Parameters
     ----------
     aside
-        Where it is written.
+        Temporary path that is written.
     target
-        What it is to become; for messages.
+        Final path, for error messages.
     mode
-        ``"w"`` for a new file, ``"r+"`` to change the one that is there.
+        ``"w"`` for a new file, ``"r+"`` to modify an existing one.
     """
 
     def __init__(self, aside: Path, target: Path, mode: Literal["w", "r+"] = "w") -> None:
@@ -100,7 +100,7 @@ class FileInTheMaking:
             self._raise_failure()
 
     def write(self, item: LGDO, name: str, group: str) -> None:
-        """Append rows to what is at `name` in `group`."""
+        """Append rows to the object `name` in `group`."""
         with write_errors(self._target):
             lh5.write(item, name, self.h5, group=group, wo_mode="append")
             self._raise_failure()
@@ -111,7 +111,7 @@ class FileInTheMaking:
 
 
 def os_reason(error: Exception) -> str:
-    """Why the system refused, in words: HDF5 hides it in a text of many lines."""
+    """The operating system's reason, which HDF5 hides in a message of many lines."""
     number = error.errno if isinstance(error, OSError) else None
     hidden = re.search(r"errno = (\d+)", str(error))
     if number is None and hidden is not None:
@@ -122,10 +122,10 @@ def os_reason(error: Exception) -> str:
 def waveform_table(
     pulses: Pulses, *, t0_ns: float, units: str, samples: npt.DTypeLike = np.float32
 ) -> WaveformTable:
-    """Waveforms as LH5 has them, with samples of this type, in chunks of whole traces."""
+    """LH5 waveform table with the given sample type, in chunks of whole traces."""
     n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
-    # not called "units": dspeed copies those to its buffer of the table, which the LH5 library
-    # then refuses to fill a second time
+    # not called "units": dspeed copies that attribute to its table buffer, which the LH5
+    # library then refuses to fill a second time
     values = ArrayOfEqualSizedArrays(
         nda=pulses.waveforms.astype(samples, copy=False),
         attrs={

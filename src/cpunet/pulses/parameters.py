@@ -1,8 +1,8 @@
 """Pulse-shape parameters of prepared pulses: current amplitude, drift time, tail slope.
 
-The three parameters by which the paper judges a translation (section 4.3).  Current
-amplitude and drift time come from dspeed's processors, so that they are the numbers
-which the production analysis of the experiments would give.
+These are the three parameters by which the paper evaluates a translation (section 4.3).
+Current amplitude and drift time use dspeed's processors, so they equal the values of
+the experiments' production analysis.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """How a parameter is written on an axis: its label and its unit."""
+    """Label and unit of a parameter for an axis."""
 
     label: str
     unit: str
@@ -39,30 +39,33 @@ PARAMETERS = {
     "tail_slope": Parameter("Tail slope", "1/ms"),
 }
 
-# The definition of I_max used by Majorana and LEGEND: 16 steps per sample (1 ns for
-# 16-ns records) and three moving averages over 48 of them.
+# I_max as defined by Majorana and LEGEND: 16 steps per sample (1 ns for 16-ns records)
+# and three moving averages over 48 steps.
 UPSAMPLING = 16
 AVERAGE_STEPS = 48
 AVERAGES = 3
 
-# Samples beyond which the averages see nothing: they look 94 steps back and 47 ahead.
+# Reach of the averages in samples: they cover 94 steps back and 47 ahead.
 REACH = 8
-# Samples around the steepest point in which the maximum is sought first.
+# Samples around the steepest point that are searched first for the maximum.
 NEIGHBOURHOOD = 96
 
-BLOCK = 256  # pulses at a time: bounds memory, and the buffers stay in the cache
+BLOCK = 256  # pulses per block: bounds memory and keeps the buffers in the cache
 
 
 def current_amplitude(waveforms: FloatArray) -> Values:
-    """Maximum current of each pulse (A of A/E; the paper's I_max, section 4.3.2).
+    r"""Maximum current of each pulse (A of A/E; the paper's I_max, section 4.3.2).
 
-    The maximum of ``avg_current(1)`` → ``upsampler(16)`` →
-    ``moving_window_multi(48, 3, 0)`` → ``min_max``, all of them dspeed's processors.
+    .. math:: I_{\max} = \max_t \, (h * h * h * i)(t), \qquad i_k = x_{k+1} - x_k
 
-    Each value of that chain is a mean, with positive weights, of the current's
-    values at most `REACH` samples away.  So the chain needs to be run only around
-    the steepest point of a pulse wherever no value of the current elsewhere exceeds
-    the maximum found there; pulses that fail this test go through it in full.
+    with the moving average :math:`h` over 48 steps of 1/16 sample, as defined by Majorana
+    (arXiv:1901.05388).  It is computed with dspeed's processors ``avg_current(1)`` →
+    ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``.
+
+    Each value of that chain is a positively weighted mean of the current at most `REACH`
+    samples away.  The chain is therefore first run only around the steepest point of a
+    pulse.  If the current elsewhere exceeds the maximum found there, the whole pulse is
+    processed.
 
     Parameters
     ----------
@@ -78,38 +81,49 @@ def current_amplitude(waveforms: FloatArray) -> Values:
     ------
     CpunetError
         If the pulses are shorter than the moving averages.
+
+    Examples
+    --------
+    A straight rise over 200 samples has a current of 1/200:
+
+    >>> import numpy as np
+    >>> ramp = np.clip(np.arange(-100.0, 300.0) / 200.0, 0, 1).astype(np.float32)
+    >>> current_amplitude(ramp[np.newaxis]).round(6)
+    array([0.005])
     """
     shortest = AVERAGE_STEPS // UPSAMPLING + 3
     return _by_blocks(_current_amplitude, waveforms, shortest)
 
 
 def current_amplitude_kernel() -> npt.NDArray[np.float32]:
-    """Weights with which the current's samples enter the amplitude's fine grid.
+    """Weights of the current's samples on the fine grid of the current amplitude.
 
     Returns
     -------
     numpy.ndarray
-        Float32, shape ``(16, 2 * REACH + 1)``: for each step of a sample, the weights of the
-        current from `REACH` samples before to `REACH` after.
+        Float32, shape ``(16, 2 * REACH + 1)``: for each step within a sample, the weights of
+        the current from `REACH` samples before to `REACH` samples after it.
     """
     current = np.zeros((1, 4 * REACH + 2), np.float32)
     current[0, 2 * REACH] = 1
     grid = _averaged(current)[0].reshape(-1, UPSAMPLING)
     around = grid[REACH : 3 * REACH + 1]
-    # a unit of current at 0 reaches sample j with the weight that j gives to sample -j
+    # a unit current at 0 contributes to sample j with the weight that j gives sample -j
     return np.ascontiguousarray(around[::-1].T)
 
 
 def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Values:
-    """Time from a small fraction of the maximum to the maximum (paper, section 4.3.1).
+    r"""Time from a small fraction of the maximum to the maximum (paper, section 4.3.1).
 
-    The first sample that holds the maximum ends the interval.  From there the pulse
-    is searched backward for its crossing of `start_fraction` times the maximum, whose
-    time is interpolated linearly between two samples; a whole number of samples would
-    put steps of `dt_ns` into the distribution.
+    .. math:: T_{\mathrm{drift}} = t_{100} - t_f, \qquad x(t_f) = f \, x_{\max}
 
-    Where a pulse has a long flat top the maximum is wherever noise puts it: this is the
-    paper's number, and no time after which the charge is collected.
+    with :math:`f` the `start_fraction`.  The interval ends at the first sample that holds
+    the maximum.  The pulse is searched backward from there for its crossing of
+    :math:`f x_{\max}`, whose time is interpolated linearly between two samples; whole
+    samples would put steps of `dt_ns` into the distribution.
+
+    On a long flat top, noise decides where the maximum is.  This is the paper's definition;
+    it is not the time until the charge is collected.
 
     Parameters
     ----------
@@ -142,7 +156,7 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
         from dspeed.processors import interpolated_time_point_thresh, min_max
 
         _, end, _, height = min_max(block)
-        # dspeed ignores a NaN start only after casting it to an integer
+        # dspeed checks for a NaN start only after casting it to an integer
         known = np.isfinite(end)
         start = interpolated_time_point_thresh(
             block, start_fraction * height, np.where(known, end, 0).astype(int), 0, ord("l")
@@ -153,10 +167,14 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
 
 
 def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
-    """Slope of the logarithm of the tail, by an unweighted straight-line fit.
+    r"""Slope of the logarithm of the tail, by an unweighted straight-line fit.
 
-    The paper (section 4.3.3) fits the logarithm of 300 samples.  The slope is
-    negative for a decay and 0 for a simulation without electronics.
+    .. math:: c_{\mathrm{tail}} = \frac{\sum_k (t_k - \bar{t}) \ln x_k}
+        {\sum_k (t_k - \bar{t})^2} = -\frac{1}{\tau}
+
+    where the last equality is for an exponential decay with time constant :math:`\tau`.
+    The paper (section 4.3.3) fits the logarithm of 300 samples.  The slope is negative for
+    a decay and 0 for a simulation without electronics.
 
     Parameters
     ----------
@@ -165,7 +183,7 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     dt_ns
         Sampling period in ns.
     fit_samples
-        The number of samples, counted from the end of the pulse, that are fitted.
+        Number of samples at the end of the pulse that are fitted.
 
     Returns
     -------
@@ -198,7 +216,12 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
 
 
 def decay_constant_us(tail_slope_per_ms: npt.ArrayLike) -> Values:
-    """Decay constant in µs of a tail slope in 1/ms; infinite for a slope of 0.
+    r"""Decay constant :math:`\tau = -1/c_{\mathrm{tail}}` in µs; infinite for a slope of 0.
+
+    Parameters
+    ----------
+    tail_slope_per_ms
+        Slope of the logarithm of the tail in 1/ms.
 
     Examples
     --------
@@ -207,7 +230,7 @@ def decay_constant_us(tail_slope_per_ms: npt.ArrayLike) -> Values:
     """
     slope = np.asarray(tail_slope_per_ms, dtype=float)
     with np.errstate(divide="ignore"):
-        # abs() of the zero keeps a flat tail at +inf whatever the sign of its zero
+        # abs() gives a flat tail +inf whatever the sign of its zero
         return np.where(slope == 0, np.inf, -1e3 / slope)
 
 
@@ -221,9 +244,9 @@ def pulse_parameters(
     pulses
         Prepared pulses.
     preparation
-        Says how many samples of the tail are fitted.
+        Preparation settings, with the number of tail samples that are fitted.
     scores
-        Says at which fraction of the maximum the drift time begins.
+        Score settings, with the fraction of the maximum at which the drift time begins.
 
     Returns
     -------
@@ -242,7 +265,7 @@ def pulse_parameters(
 def _by_blocks(
     function: Callable[[FloatArray], Values], waveforms: FloatArray, shortest: int
 ) -> Values:
-    """Apply `function` to blocks of pulses that have at least `shortest` samples."""
+    """Apply `function` to blocks of pulses of at least `shortest` samples."""
     if waveforms.ndim != 2 or waveforms.shape[1] < shortest:
         raise CpunetError(
             f"waveforms have shape {waveforms.shape}; "
@@ -251,7 +274,7 @@ def _by_blocks(
     values = np.empty(len(waveforms))
     for first in range(0, len(waveforms), BLOCK):
         rows = slice(first, first + BLOCK)
-        # dspeed's processors know float32 and float64 only
+        # dspeed's processors accept float32 and float64 only
         values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
     return values
 
@@ -269,11 +292,11 @@ def _current_amplitude(waveforms: FloatArray) -> Values:
     first = current.argmax(axis=1) - NEIGHBOURHOOD // 2
     first = np.clip(first, 0, length - 1 - NEIGHBOURHOOD)[:, np.newaxis]
     near = np.take_along_axis(current, first + np.arange(NEIGHBOURHOOD), axis=1)
-    # averages near the ends of the neighbourhood are not those of the whole pulse
+    # near the ends of the neighbourhood the averages differ from those of the whole pulse
     inner = slice(REACH * UPSAMPLING, (NEIGHBOURHOOD - REACH) * UPSAMPLING)
     values = _averaged(near)[:, inner].max(axis=1).astype(float)
 
-    # samples that no average left out of `inner` can see
+    # samples that averages outside `inner` do not reach
     sample = np.arange(length - 1)
     inside = (sample >= first + 2 * REACH) & (sample < first + NEIGHBOURHOOD - 2 * REACH)
     elsewhere = np.where(inside, -np.inf, current).max(axis=1)
@@ -288,7 +311,7 @@ def _averaged(current: FloatArray) -> FloatArray:
     from dspeed.processors import moving_window_multi, upsampler
 
     n, samples = current.shape
-    # dspeed centres each sample, so the grid's end is not filled: leave it off
+    # dspeed centres each sample, so the end of the grid is not filled: drop it
     fine = np.empty((n, (samples - 1) * UPSAMPLING), np.float32)
     upsampler(current, UPSAMPLING, fine)
     smooth: FloatArray = np.empty_like(fine)

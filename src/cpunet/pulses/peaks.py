@@ -1,4 +1,4 @@
-"""Gamma lines and energy ranges: which pulses belong to which."""
+"""Assign pulses to gamma lines and energy ranges."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _RANGE = re.compile(rf"{_NUMBER}\s*-\s*{_NUMBER}?")
 def label_peaks(
     energy_kev: npt.ArrayLike, peaks: Mapping[str, PeakConfig]
 ) -> npt.NDArray[np.str_]:
-    """Name the gamma line on whose window each energy falls.
+    """Name the gamma line whose window contains each energy.
 
     Parameters
     ----------
     energy_kev
-        Energies in keV, shape ``(n,)``; NaN falls on no line.
+        Energies in keV, shape ``(n,)``; NaN belongs to no line.
     peaks
-        The lines: energy and half-width of the window, ends included.
+        Gamma lines: energy and half-width of the window, both ends included.
 
     Returns
     -------
     numpy.ndarray
-        Names, shape ``(n,)``; ``""`` for none.  Where windows overlap the
-        nearest line wins.
+        Names, shape ``(n,)``; ``""`` for none.  Where windows overlap, the
+        nearest line is taken.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def label_peaks(
     centres = np.array([peak.energy_kev for peak in peaks.values()])
     widths = np.array([peak.half_width_kev for peak in peaks.values()])
     distance = np.abs(energies[:, np.newaxis] - centres)
-    # NaN is within no window, since every comparison with it is false.
+    # NaN is in no window, since every comparison with it is false.
     distance = np.where(distance <= widths, distance, np.inf)
     nearest = distance.argmin(axis=1)
     within = np.isfinite(distance.min(axis=1))
@@ -63,11 +63,11 @@ class EnergySelection:
     name
         The selection as the user wrote it.
     peaks
-        All lines known: a pulse between two belongs to the nearest.
+        All known lines; a pulse between two belongs to the nearest.
     chosen
-        Names of the lines selected.
+        Names of the selected lines.
     ranges_kev
-        Ranges selected, from (included) and to (excluded), in keV.
+        Selected ranges in keV: lower end (included) and upper end (excluded).
     """
 
     name: str
@@ -77,7 +77,7 @@ class EnergySelection:
 
     @property
     def parts(self) -> list[EnergySelection]:
-        """Its lines and ranges, one by one."""
+        """Its lines and ranges, each as a selection of its own."""
         lines = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
         return lines + [
             EnergySelection(f"{low:g}-{high:g}", self.peaks, (), ((low, high),))
@@ -86,7 +86,7 @@ class EnergySelection:
 
     @property
     def lines_in_ranges(self) -> list[str]:
-        """Lines that were not chosen by name, but lie in a range that was."""
+        """Lines that were not chosen by name but lie in a chosen range."""
         return [
             name
             for name, line in self.peaks.items()
@@ -95,7 +95,7 @@ class EnergySelection:
         ]
 
     def select(self, energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Mask of the energies (keV, shape ``(n,)``) selected; never of NaN."""
+        """Mask of the selected energies (keV, shape ``(n,)``); False for NaN."""
         energies = np.asarray(energy_kev, np.float64)
         mask = np.isin(label_peaks(energies, self.peaks), self.chosen)
         for low, high in self.ranges_kev:
@@ -104,19 +104,19 @@ class EnergySelection:
 
 
 def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelection:
-    """Read a selection: lines and ranges in keV, separated by commas.
+    """Parse a selection: lines and ranges in keV, separated by commas.
 
     Parameters
     ----------
     text
-        Such as ``"FEP"``, ``"SEP,DEP"``, ``"300-3000"`` or ``"300-"``.
+        The selection, for example ``"FEP"``, ``"SEP,DEP"``, ``"300-3000"`` or ``"300-"``.
     peaks
-        The lines known.
+        Known gamma lines.
 
     Raises
     ------
     CpunetError
-        If a part is neither a known line nor a range, listing the lines.
+        If a part is neither a known line nor a range; the message lists the lines.
 
     Examples
     --------

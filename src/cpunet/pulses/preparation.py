@@ -1,9 +1,9 @@
 """From raw traces to the aligned, normalised windows that a network sees.
 
-The definition is that of the paper (Bhimani et al. 2026, section 3.3): measured
-traces are aligned at 99.9 % of their maximum, lose their baseline and are scaled
-to a fixed level of their last samples; simulated pulses are aligned alike and
-scaled to 0…1.  Nothing is skipped silently: each trace gets a `Rejection`.
+The definition follows the paper (Bhimani et al. 2026, section 3.3).  Measured traces
+are aligned at 99.9 % of their maximum, baseline-subtracted and scaled to a fixed level
+of their last samples.  Simulated pulses are aligned in the same way and scaled to 0…1.
+Nothing is skipped silently: each trace gets a `Rejection`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Codes = npt.NDArray[np.uint8]
 
 
 class Rejection(IntEnum):
-    """Why a pulse was dropped; the values and labels are stored and never change.
+    """Reason why a pulse was rejected; values and labels are stored and never change.
 
     Examples
     --------
@@ -51,24 +51,24 @@ class Rejection(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name used in counts and reports."""
+        """Name used in counts and reports."""
         return self.name.lower()
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Prepared pulses, how each was made, and what became of those not among them.
+    """Prepared pulses, how each was prepared, and why others were rejected.
 
     ``pulses.waveforms = (raw - baseline) / scale``, one row per accepted pulse.
 
     Parameters
     ----------
     pulses
-        The accepted pulses, windows of shape ``(n, samples_before + samples_after)``.
+        Accepted pulses, windows of shape ``(n, samples_before + samples_after)``.
     index
-        Row of each in the source.
+        Row of each pulse in the source.
     baseline, scale
-        Of the raw trace, in its units.
+        Baseline and scale of the raw trace, in its units.
     align_sample
         Sample of the raw trace that became sample ``samples_before``.
     baseline_rms
@@ -77,14 +77,14 @@ class Prepared:
     baseline_slope
         Slope of that line divided by `scale`, in 1/ms.
     tail_slope
-        Slope of the logarithm of the tail, in 1/ms: negative for a decay.
+        Slope of the logarithm of the tail, in 1/ms; negative for a decay.
     chi2
         Reduced chi-square of that fit, with `baseline_rms` as the error of each
         sample; NaN for pulses without noise.
     codes
-        A `Rejection` for every row read, accepted or not.
+        `Rejection` code of every row read, accepted or not.
     first_index
-        Row of the source that ``codes[0]`` belongs to.
+        Row of the source to which ``codes[0]`` belongs.
     """
 
     pulses: Pulses
@@ -104,7 +104,7 @@ class Prepared:
 
     @property
     def n_read(self) -> int:
-        """Pulses looked at, accepted or not."""
+        """Number of pulses read, accepted or not."""
         return len(self.codes)
 
     @property
@@ -120,21 +120,21 @@ class Prepared:
     def __getitem__(
         self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
     ) -> Prepared:
-        """The pulses of a slice, a mask or a list of rows.
+        """The pulses selected by a slice, a mask or row numbers.
 
-        Leaving pulses out this way is a choice, not a rejection: `codes` and the
-        counts stay those of everything read.
+        Pulses left out this way are not rejected: `codes` and the counts still describe
+        everything read.
         """
         columns = {name: getattr(self, name)[which] for name in _PER_PULSE}
         return replace(self, **columns)
 
     def rejected(self, reasons: Codes) -> Prepared:
-        """Drop the pulses with a reason other than ``Rejection.ACCEPTED`` and count them.
+        """Reject the pulses whose code is not ``Rejection.ACCEPTED``, and count them.
 
         Parameters
         ----------
         reasons
-            One `Rejection` for each of the pulses.
+            One `Rejection` for each pulse.
         """
         if not reasons.any():
             return self
@@ -144,10 +144,10 @@ class Prepared:
 
     @classmethod
     def concatenate(cls, sets: Sequence[Prepared]) -> Prepared:
-        """Join sets in the order they were read.
+        """Concatenate sets in the order in which they were read.
 
-        Rows are counted on from set to set: for consecutive blocks of a file they
-        stay the rows of that file, for several files they are rows of the sequence.
+        Row numbers continue from set to set.  For consecutive blocks of a file they
+        remain the rows of that file; for several files they are rows of the sequence.
 
         Raises
         ------
@@ -176,29 +176,29 @@ def prepare(
 ) -> Prepared:
     """Align, cut out and normalise every pulse (paper, section 3.3).
 
-    The time that becomes sample ``samples_before`` is the first sample after the
-    last one below ``align_fraction`` of the maximum.  A *measured* window loses the
-    mean of its first ``baseline_samples`` and is scaled so that its last
-    ``tail_samples`` average ``tail_level``.  A *simulated* one is scaled from its
-    lowest and highest value to 0…1.  Before the record the window is filled with 0,
-    after it with the record's last value; a measured window may need no more of this
-    than the ``max_padding`` settings allow.  Preparing prepared pulses changes nothing.
+    The window is placed so that its sample ``samples_before`` is the first one after the
+    last sample below ``align_fraction`` of the maximum.  From a *measured* window the mean
+    of its first ``baseline_samples`` is subtracted, and it is scaled so that its last
+    ``tail_samples`` average ``tail_level``.  A *simulated* window is scaled so that its
+    lowest and highest values are 0 and 1.  The window is padded with 0 before the record and
+    with the record's last value after it; measured windows that need more padding than the
+    ``max_padding`` settings allow are rejected.  Preparing prepared pulses changes nothing.
 
     Parameters
     ----------
     pulses
         Raw traces of any length, in any units.
     config
-        Lengths in samples, fractions and levels.
+        Preparation settings: lengths in samples, fractions and levels.
     kind
-        Which of the two normalisations.
+        Normalisation: ``"measured"`` or ``"simulated"``.
     first_index
         Row of the first pulse in its source.
 
     Returns
     -------
     Prepared
-        The accepted pulses; ``codes`` says for each input what became of it.
+        Accepted pulses; ``codes`` holds the outcome of every input pulse.
 
     Raises
     ------

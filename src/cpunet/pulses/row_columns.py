@@ -1,4 +1,4 @@
-"""Columns that stand beside the waveforms of a file, of any kind, copied by rows."""
+"""Columns beside the waveforms of a file, copied row by row."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
 from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.lh5_rows import read_rows
 
-SUFFIX = "_source"  # of columns whose name the translation needs for its own
+SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"
 
 
 @dataclass(frozen=True)
 class RowColumns:
-    """Columns of one table of a file, to be read by rows as LH5 objects.
+    """Columns of one table of a file, read by rows as LH5 objects.
 
     Parameters
     ----------
     path
         The file.
     table
-        The group that holds them; not used for columns of other formats.
+        Group that holds them; not used for other formats.
     names
-        Names in the file, and under which they are given.
+        Name in the file → name in the output.
     left_out
-        Names of those that cannot be copied, and why.
+        Name of each column that cannot be copied → the reason.
     columns
-        Of files other than HDF5: what their reader found.
+        Columns that the reader of a format other than HDF5 found.
     """
 
     path: Path
@@ -48,19 +48,19 @@ class RowColumns:
     def of_hdf5(
         cls, path: Path, waveforms: str, n_pulses: int, own: Collection[str]
     ) -> RowColumns:
-        """Find the columns beside the waveforms at `waveforms`, but for these.
+        """Find the columns beside the waveforms, without the waveforms themselves.
 
         Parameters
         ----------
         path
-            An LH5 or HDF5 file.
+            LH5 or HDF5 file.
         waveforms
-            Path of the waveforms in it.
+            Path of the waveforms in the file.
         n_pulses
-            Rows that each column must have.
+            Number of rows that each column must have.
         own
-            Names that the output has for itself.  A column called so is given with `SUFFIX`,
-            unless it says the same: the event number, or an energy in keV.
+            Names that the output uses itself.  A column with such a name gets `SUFFIX`,
+            unless it has the same meaning: the event number, or an energy in keV.
         """
         table, _, chosen = waveforms.rpartition("/")
         names, left_out = {}, {}
@@ -80,7 +80,7 @@ class RowColumns:
     def of_columns(
         cls, path: Path, columns: Mapping[str, Column], own: Collection[str]
     ) -> RowColumns:
-        """Take the columns that the reader of another format found; names as above."""
+        """Use the columns that the reader of another format found; names as above."""
         names = {
             name: name + SUFFIX if name in own else name
             for name, column in columns.items()
@@ -89,7 +89,7 @@ class RowColumns:
         return cls(path, names=names, columns=columns)
 
     def read(self, start: int, n: int, repeats: int = 1) -> dict[str, LGDO]:
-        """Rows from `start` on, each `repeats` times in a row."""
+        """The `n` rows from `start` on, each repeated `repeats` times."""
         if not self.names:
             return {}
         if self.columns:
@@ -105,7 +105,7 @@ class RowColumns:
 
 
 def repeated(column: LGDO, repeats: int) -> LGDO:
-    """Each row of an LH5 object so many times."""
+    """An LH5 object with each row repeated `repeats` times."""
     attrs = {k: v for k, v in column.attrs.items() if k != "datatype"}
     if isinstance(column, Table):
         inner = {name: repeated(values, repeats) for name, values in column.items()}
@@ -140,7 +140,7 @@ def _from_column(column: Column, start: int, n: int) -> Array:
 
 
 def _is_same(name: str, item: object, own: Collection[str]) -> bool:
-    """Tell whether a column says what the output's own of that name does."""
+    """Whether a column has the same meaning as the output's column of that name."""
     if name not in own or not isinstance(item, h5py.Dataset):
         return False
     return name == "event_number" or _in_kev(name, text_attribute(item, "units"))
@@ -151,7 +151,7 @@ def _in_kev(name: str, units: str) -> bool:
 
 
 def _unreadable(item: h5py.Group | h5py.Dataset | None, n_pulses: int) -> str:
-    """Why a column cannot be copied; empty if it can."""
+    """Reason why a column cannot be copied; empty if it can."""
     if item is None:
         return "a link that leads nowhere"
     if not text_attribute(item, "datatype"):
@@ -164,6 +164,6 @@ def _unreadable(item: h5py.Group | h5py.Dataset | None, n_pulses: int) -> str:
         try:
             rows = lh5.read_n_rows(item.name, item.file)
             _rows(item, 0, 1)
-        except Exception as error:  # whatever the library makes of a foreign type
+        except Exception as error:  # the library raises various errors on foreign types
             return f"the LH5 library cannot read it ({' '.join(str(error).split())})"
     return "" if rows == n_pulses else f"{rows} rows beside {n_pulses} pulses"

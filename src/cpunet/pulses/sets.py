@@ -1,7 +1,7 @@
-"""A file of raw pulses becomes one prepared set, block by block.
+"""Prepare a file of raw pulses, block by block.
 
-Only the windows of accepted pulses are kept, so memory grows with what is used of a
-file and not with the file.
+Only the windows of accepted pulses are kept, so memory grows with the pulses used and
+not with the size of the file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Traces held at a time: 20 to 130 MB for the record lengths in use.
+# Traces per block: 20 to 130 MB for the record lengths in use.
 BLOCK_SIZE = 4096
 
 Select = Callable[[FloatColumn], npt.NDArray[np.bool_]]
@@ -42,11 +42,11 @@ _REMEDIES = {
 
 
 class Source(Protocol):
-    """Anything that yields raw pulses in blocks, as the readers do."""
+    """A source of raw pulses in blocks, such as a reader."""
 
     @property
     def path(self) -> Path:
-        """The file, for messages."""
+        """Path of the file, for messages."""
 
     @property
     def dt_ns(self) -> float:
@@ -71,28 +71,28 @@ def load_prepared(
     Parameters
     ----------
     source
-        Where the raw pulses come from.
+        Source of the raw pulses.
     config, kind
-        As for `prepare`.
+        See `prepare`.
     select
-        From energies in keV to a mask of those wanted; without it, all are, even
-        those whose energy is not known.
+        Function that returns a mask of the wanted energies in keV.  Without it all pulses
+        are wanted, even those of unknown energy.
     peaks
-        From energies in keV to the name of the peak of each.
+        Function that returns the name of the peak of each energy in keV.
     limit
-        Stop reading once this many pulses were accepted.
+        Number of accepted pulses after which reading stops.
     progress
-        Called after each block with the number of pulses read since the last call.
+        Function called after each block with the number of pulses read since the last call.
 
     Returns
     -------
     Prepared
-        The accepted pulses of the file; every pulse read has a code.
+        Accepted pulses of the file; every pulse read has a code.
 
     Raises
     ------
     CpunetError
-        If no pulse is left: the message names the file, counts by reason, and what to do.
+        If no pulse is left; the message gives the file, the counts by reason and a remedy.
     """
     sets: list[Prepared] = []
     n_read = n_kept = 0
@@ -113,8 +113,8 @@ def load_prepared(
 
 
 def _joined(sets: list[Prepared], n: int) -> Prepared:
-    """Join blocks; the list lets go of the waveforms of each once they are copied."""
-    # memory that is taken as it is filled: at no time are all pulses there twice
+    """Concatenate blocks; each block's waveforms are released once they are copied."""
+    # this memory is allocated as it is filled, so the pulses never exist twice in full
     waveforms = np.empty((n, sets[0].pulses.length), np.float32)
     first = 0
     for number, part in enumerate(sets):
@@ -134,7 +134,7 @@ def _prepare_selected(
     peaks: PeakNames | None,
     first_index: int,
 ) -> Prepared:
-    """Prepare the selected pulses of a block; the others get their code."""
+    """Prepare the selected pulses of a block; the others are coded as not selected."""
     codes: Codes = np.zeros(len(block), np.uint8)
     if select is not None:
         known = np.isfinite(block.energy_kev)
@@ -156,7 +156,7 @@ def _prepare_selected(
 
 
 def _shortened(part: Prepared, n: int) -> Prepared:
-    """The first `n` pulses, as if nothing had been read after them."""
+    """The first `n` pulses, as if reading had stopped there."""
     n_read = int(part.index[n - 1]) + 1 - part.first_index
     return replace(part[:n], codes=part.codes[:n_read])
 

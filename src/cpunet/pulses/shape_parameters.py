@@ -1,7 +1,8 @@
-"""Further pulse-shape parameters: times, charge that comes late, tail, current, noise.
+"""Further pulse-shape parameters: times, late charge, tail, current, noise.
 
-`cpunet.pulses.parameters` holds the three by which a translation is judged; here are
-those and what else an analysis may cut on, each with its definition and source.
+`cpunet.pulses.parameters` defines the three parameters by which a translation is
+evaluated.  This module adds others on which an analysis may cut, each with its definition
+and source.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ RISE_TIMES = {
     "rise_10_99": ("t10", "t99"),
     "rise_90_99": ("t90", "t99"),
 }
-LATE_FRACTION = 0.8  # charge after 80 % of the height is late (Majorana)
-# The fast of two decays.  The window holds no more than the difference of a tail
-# from a slow decay, so that a second free time would only follow the noise.
+LATE_FRACTION = 0.8  # charge that arrives after 80 % of the height is late (Majorana)
+# Time of the fast decay.  The window constrains only the difference of a tail from a slow
+# decay, so a second free time would follow the noise.
 FAST_DECAY_NS = 4000.0
 
 
 @dataclass(frozen=True)
 class ShapeParameter(Parameter):
-    """A parameter with its definition in one sentence and the source of that definition."""
+    """A parameter with its definition and the source of that definition."""
 
     definition: str
     source: str
@@ -162,20 +163,20 @@ def all_parameters(
     pulses
         Prepared pulses.
     preparation
-        Says where they are aligned and what belongs to baseline and tail.
+        Preparation settings, with the alignment and the samples of baseline and tail.
     scores
-        Says at which fraction of the maximum the drift time begins.
+        Score settings, with the fraction of the maximum at which the drift time begins.
 
     Returns
     -------
     dict
-        Float64 arrays of shape ``(n,)`` in the units of `SHAPE_PARAMETERS` and in its order;
-        NaN for a pulse with a value that is not finite and for one without such a parameter.
+        Float64 arrays of shape ``(n,)`` in the units and the order of `SHAPE_PARAMETERS`.
+        NaN where a pulse has a non-finite sample or the parameter is undefined.
 
     Raises
     ------
     CpunetError
-        If the pulses do not have the length that the preparation makes, or too few samples.
+        If the pulses do not have the length of the preparation, or too few samples.
 
     Examples
     --------
@@ -196,8 +197,8 @@ def all_parameters(
     for first in range(0, len(pulses), BLOCK):
         rows = slice(first, first + BLOCK)
         block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
-        block[~np.isfinite(block).all(axis=1)] = np.nan  # one kind of unusable is enough
-        # what overflows is as good as unknown, and is NaN below
+        block[~np.isfinite(block).all(axis=1)] = np.nan  # treat infinities as NaN
+        # overflows become NaN below
         with np.errstate(all="ignore"):
             found = _of_block(block, pulses.dt_ns, preparation, scores)
         for name, column in found.items():
@@ -228,7 +229,7 @@ def _of_block(
 
 
 def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
-    """Time points and what follows from them, in ns."""
+    """Time points and the times derived from them, in ns."""
     from dspeed.processors import interpolated_time_point_thresh, min_max
 
     _, top, _, height = min_max(block)

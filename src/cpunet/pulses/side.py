@@ -1,4 +1,4 @@
-"""Which side pulses are of, simulated or measured: by what their file says, or their look."""
+"""Decide whether pulses are simulated or measured, by file attributes or by their shape."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"  # attributes 
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 
 _LOOKED_AT = 256  # pulses
-_FEWEST_SAMPLES = 100  # of a trace; a shorter one has no ends to look at
-_FULL_HEIGHT = 10.0  # in ADC counts; whole numbers below may be a charge in its own units
-_TURNS = 3  # of a trace's beginning that noise makes, and a charge signal does not
-_SMALL = 1e-5  # of the height: what rounding makes of a flat line
-_LEAST_END = 0.98  # of the height: without electronics a pulse ends where it is highest
+_FEWEST_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
+_FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
+_TURNS = 3  # turning points of the baseline: noise has at least these, a charge signal fewer
+_SMALL = 1e-5  # of the height: rounding of a flat line
+_LEAST_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 
 
 @dataclass(frozen=True)
 class Recognised:
-    """What pulses are.
+    """Recognised side of a set of pulses.
 
     Parameters
     ----------
     side
-        Simulated, or measured; translated ones are what they were made like.
+        Simulated or measured; translated pulses count as the side they imitate.
     why
-        How that is known, to follow "these".
+        Reason, phrased to follow "these".
     certain
-        Whether the file says so; else it is a guess.
+        Whether the file states the side; otherwise it is a guess.
     """
 
     side: Kind
@@ -44,24 +44,24 @@ class Recognised:
 
 
 def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool) -> None:
-    """Refuse pulses that are of the other side.
+    """Refuse pulses of the wrong side.
 
     Parameters
     ----------
     source
-        A file of pulses.
+        File of pulses.
     wanted
-        What it was given as.
+        Side as which the file was given.
     remedy
-        What to do if it is the other.
+        Remedy to suggest if the pulses are of the other side.
     insist
-        Whether the user knows better than a guess.
+        Whether to override a guess.
 
     Raises
     ------
     CpunetError
-        If the file says that its pulses are of the other side, or, unless `insist`, they
-        look so.
+        If the file states that its pulses are of the other side, or if they look like it
+        and `insist` is False.
     """
     found = recorded_side(source)
     if found is None and not insist:
@@ -74,7 +74,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
 
 
 def recorded_side(source: PulseSource) -> Recognised | None:
-    """What a file that this program wrote says of its pulses; None for others."""
+    """Side recorded in a file that this program wrote; None for other files."""
     told = source.describe()
     if told["format"] not in ("LH5", "HDF5"):
         return None
@@ -98,15 +98,16 @@ def recorded_side(source: PulseSource) -> Recognised | None:
 
 
 def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
-    """What pulses look like; None if that does not tell.
+    """Side that pulses appear to be of; None if it is ambiguous.
 
-    Measured are whole numbers with noise before the pulse, simulated what has neither noise nor
-    a decay.  A charge signal with noise, or a trace without its baseline, may be either.
+    Whole numbers with noise before the pulse are measured; pulses with neither noise nor a
+    decay are simulated.  A charge signal with noise, or a trace without its baseline, may be
+    either.
 
     Parameters
     ----------
     waveforms
-        Traces, shape ``(n, samples)``.
+        Traces of shape ``(n, samples)``.
 
     Examples
     --------
@@ -141,14 +142,14 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
 def _turns(
     part: npt.NDArray[np.float64], height: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.int64]:
-    """How often each trace turns from rising to falling or back."""
+    """Number of turning points of each trace."""
     steps = np.diff(part, axis=1)
     signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
     return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
 
 
 def _places(file: h5py.File, waveforms: str) -> list[h5py.Group | h5py.Dataset]:
-    """Where attributes of pulses may be: their table, their column, its samples."""
+    """Objects that may carry attributes of pulses: table, column and samples."""
     column = file[waveforms]
     places = [file[waveforms.rpartition("/")[0] or "/"], column]
     if isinstance(column, h5py.Group) and "values" in column:

@@ -1,4 +1,4 @@
-"""Where the lines of a spectrum are."""
+"""Find gamma lines in a spectrum."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import scipy.ndimage
 
 Values = npt.NDArray[np.float64]
 
-WITHIN = 0.03  # of its energy: where a line is looked for
+WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
-FEWEST = 30  # counts in the highest bins of a line
-ABOVE = 4.0  # times the counts beside it: a line
-WIDTH_BINS = 3  # to either side, whose mean is its energy
+FEWEST = 30  # minimum counts in the highest bins of a line
+ABOVE = 4.0  # ratio of a line's counts to those beside it
+WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
 
 def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
-    """Energy of the line nearest to where one is expected.
+    """Energy of the gamma line nearest to an expected energy.
 
     Parameters
     ----------
     energies_kev
-        Of all pulses, shape ``(n,)``; may hold NaN.
+        Energies of all pulses in keV, shape ``(n,)``; may contain NaN.
     expected_kev
-        Of the line; it is looked for within 3 % of it.
+        Expected energy of the line in keV; the search range is within 3 % of it.
 
     Returns
     -------
     float or None
-        In keV; None if no line stands out there.
+        Energy in keV; None if no line stands out.
 
     Examples
     --------
@@ -48,7 +48,7 @@ def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
     if len(counts) < 2 * WIDTH_BINS + 1:
         return None
     near = np.convolve(counts, np.ones(3), "same")
-    # where several are as high, the one nearest to the middle
+    # of equally high bins, the one nearest to the middle
     centre = 0.5 * (edges[1:] + edges[:-1])
     highest = np.flatnonzero(near == near.max())
     top = int(highest[np.abs(centre[highest] - expected_kev).argmin()])
@@ -58,30 +58,30 @@ def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
     return float(np.average(centre[part], weights=counts[part]))
 
 
-# Gamma lines in keV of the sources that detectors are calibrated with (ENSDF), strongest in a
-# spectrum first; single and double escape of Tl-208 among them.
+# Gamma lines in keV of common calibration sources (ENSDF), strongest in a spectrum first, with
+# the single and double escape peaks of Tl-208.
 SOURCES = {
     "Th-228": (2614.511, 583.187, 238.632, 510.77, 1592.511, 2103.511, 727.33, 860.56),
     "Co-60": (1332.492, 1173.228),
     "Co-56": (846.770, 1238.288, 2598.500, 1771.357, 1037.843, 3253.503),
 }
-LOG_BIN = 0.002  # of the logarithm of the amplitude
-BACKGROUND = 25  # bins to either side, whose median is what lies under a line
-HIGHEST = 12.0  # standard deviations that one line counts at most
-CLEAR, FEWEST_LINES = 4.0, 3  # a line is clear above so many; so many lines are needed
+LOG_BIN = 0.002  # bin width in the logarithm of the amplitude
+BACKGROUND = 25  # bins to either side whose median is the background under a line
+HIGHEST = 12.0  # standard deviations that one line contributes at most
+CLEAR, FEWEST_LINES = 4.0, 3  # significance of a clear line; clear lines required
 
 
 class Suggestion(NamedTuple):
-    """A calibration that puts lines of a source where they belong.
+    """An energy calibration that matches the gamma lines of a source.
 
     Parameters
     ----------
     kev_per_adc
-        keV for one unit of the amplitude.
+        Energy in keV per unit of the amplitude.
     source
-        Whose lines they are.
+        Calibration source of the lines.
     lines_kev
-        Those that stand out.
+        Energies in keV of the lines found.
     """
 
     kev_per_adc: float
@@ -94,20 +94,20 @@ class Suggestion(NamedTuple):
 
 
 def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
-    """Look for the lines of calibration sources in a spectrum of amplitudes.
+    """Search a spectrum of amplitudes for the lines of calibration sources.
 
-    On a logarithmic axis a calibration is a shift: that one is taken at which most lines meet
-    an excess of counts.
+    On a logarithmic axis a calibration is a shift.  The shift is chosen at which most lines
+    coincide with an excess of counts.
 
     Parameters
     ----------
     amplitudes
-        In any unit, shape ``(n,)``; may hold NaN.
+        Amplitudes in any unit, shape ``(n,)``; may contain NaN.
 
     Returns
     -------
     Suggestion or None
-        None if no source has enough lines in it.
+        None if too few lines of every source are found.
 
     Examples
     --------
@@ -133,7 +133,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
 
 
 def _excess(counts: npt.NDArray[np.integer]) -> Values:
-    """Counts of three bins above those beside them, in standard deviations."""
+    """Excess of the counts of three bins over their background, in standard deviations."""
     beside = scipy.ndimage.median_filter(counts.astype(float), 2 * BACKGROUND + 1)
     smooth = scipy.ndimage.uniform_filter1d(counts.astype(float), 2 * BACKGROUND + 1)
     under = 3 * np.maximum(beside, 0.3 * smooth)
@@ -144,18 +144,18 @@ def _excess(counts: npt.NDArray[np.integer]) -> Values:
 def _shifted(
     excess: Values, first: float, source: str, lines_kev: tuple[float, ...]
 ) -> tuple[float, float, str, tuple[float, ...]] | None:
-    """The shift at which the lines of a source have most counts above those beside them."""
+    """The shift at which the lines of a source have the largest excess of counts."""
     places = np.log(lines_kev) / LOG_BIN
     offsets = np.round(places - places[0]).astype(int)
     n = len(excess)
     at = np.arange(n)[:, np.newaxis] + offsets
     inside = (at >= 0) & (at < n)
     values = np.where(inside, excess[np.clip(at, 0, n - 1)], 0.0)
-    # the first line, the strongest one, has to be there
+    # the first (strongest) line must be present
     score = np.clip(values, -CLEAR, HIGHEST).sum(axis=1)
     score[values[:, 0] < CLEAR] = -np.inf
     best = int(score.argmax())
-    # two lines alone meet by chance more easily than three
+    # two lines coincide by chance more easily than three
     limit = CLEAR if len(lines_kev) > 2 else 2 * CLEAR
     clear = tuple(
         line for line, value in zip(lines_kev, values[best], strict=True) if value > limit
@@ -167,7 +167,7 @@ def _shifted(
 
 
 def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, ...]) -> float:
-    """The factor from the amplitudes near the highest of the lines."""
+    """The calibration factor from the amplitudes near the highest line."""
     line = max(lines_kev)
     near = np.abs(log_amplitudes + log_factor - np.log(line)) < 2 * LOG_BIN
     middle = float(np.median(log_amplitudes[near])) if near.any() else np.log(line) - log_factor

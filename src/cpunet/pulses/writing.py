@@ -1,4 +1,4 @@
-"""Pulses into LH5 files, block by block, as LEGEND's software reads them."""
+"""Write pulses to LH5 files, block by block, in the layout that LEGEND's software reads."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ Columns = Mapping[str, tuple[npt.ArrayLike, str]]
 
 
 class PulseWriter:
-    """An LH5 file in the making: append blocks of pulses, leave the ``with`` block.
+    """Writer of an LH5 file: append blocks of pulses, then leave the ``with`` block.
 
-    The table holds ``waveform`` (t0, dt, values; times in ns), ``energy`` (keV) and
-    ``event_number``, and whatever columns each block brings; all is compressed as
-    the LH5 library does.  The file appears whole at the end, or not at all.
+    The table contains ``waveform`` (t0, dt, values; times in ns), ``energy`` (keV),
+    ``event_number`` and the columns of the blocks, with the LH5 library's compression.
+    The file appears only when it is complete.
 
     Parameters
     ----------
     path
         The file to write.
     table
-        Where in it the table goes.
+        Path of the table in the file.
     waveform_units
         Units of the samples: ``"ADC"``, or ``""`` for units of the full charge.
     t0_ns
         Time of the first sample in ns.
     attrs
-        Attributes of the table, such as where the pulses come from.
+        Attributes of the table, such as the origin of the pulses.
     samples
-        Type in which samples are stored, such as ``numpy.uint16``; they must fit.
+        Data type of the stored samples, such as ``numpy.uint16``; the values must fit.
     force
         Whether to replace an existing file.
 
@@ -49,7 +49,7 @@ class PulseWriter:
     ------
     CpunetError
         If the file exists (without `force`) or cannot be written, if blocks differ
-        in length, sampling or columns, or if there were none.
+        in length, sampling or columns, or if no block was written.
 
     Examples
     --------
@@ -110,16 +110,16 @@ class PulseWriter:
         columns: Columns | None = None,
         others: Mapping[str, LGDO] | None = None,
     ) -> None:
-        """Add a block of pulses.
+        """Append a block of pulses.
 
         Parameters
         ----------
         pulses
-            The block; an empty one adds nothing.
+            Pulses to append; an empty block adds nothing.
         columns
-            More values per event: name → (array of shape ``(n,)``, units).
+            Further values per event: name → (array of shape ``(n,)``, units).
         others
-            Columns of any kind as the LH5 library has them, of n rows.
+            Further columns as LH5 objects of n rows.
         """
         if self._file is None:
             raise ValueError("append outside of the writer's with block")
@@ -142,12 +142,12 @@ class PulseWriter:
         self.n_pulses += len(pulses)
 
     def append_rows(self, table: str, columns: Columns) -> None:
-        """Add rows to another, flat table of the file, such as the hits of the events.
+        """Append rows to another, flat table of the file, such as the hits of the events.
 
         Parameters
         ----------
         table
-            Where in the file, as ``"geds/hits"``.
+            Path of the table in the file, for example ``"geds/hits"``.
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
@@ -165,13 +165,13 @@ class PulseWriter:
             self._file.write(Table(content), name, group or "/")
 
     def annotate(self, attrs: Mapping[str, str | float]) -> None:
-        """Add attributes to the table of pulses, once it holds some."""
+        """Add attributes to the table of pulses after the first block."""
         if self._file is None or self._table not in self._file.h5:
             raise ValueError("annotate before any pulse was appended")
         self._file.h5[self._table].attrs.update(attrs)
 
     def stamp(self, name: str, text: str) -> None:
-        """Set an attribute of the file, such as a record of how it was made."""
+        """Set an attribute of the file, such as its provenance record."""
         if self._file is None:
             raise ValueError("stamp outside of the writer's with block")
         self._file.h5.attrs[name] = text
@@ -212,18 +212,18 @@ def write_pulses(
     attrs: Mapping[str, str | float] | None = None,
     force: bool = False,
 ) -> int:
-    """Write pulses to an LH5 file (see `PulseWriter`), one block or many in turn.
+    """Write pulses to an LH5 file (see `PulseWriter`), at once or in blocks.
 
     Parameters
     ----------
     path
         The file to write.
     blocks
-        Pulses, all at once or in blocks; only one block is held at a time.
+        Pulses, at once or in blocks; only one block is in memory at a time.
     table, waveform_units, t0_ns, attrs, force
-        As for `PulseWriter`.
+        See `PulseWriter`.
     columns
-        More values per event, for all blocks together: name → (array of shape
+        Further values per event for all blocks together: name → (array of shape
         ``(total,)``, units).
 
     Returns
@@ -234,7 +234,7 @@ def write_pulses(
     Raises
     ------
     CpunetError
-        As `PulseWriter`; also if a column is longer or shorter than all pulses.
+        As for `PulseWriter`, and if a column does not have one value per pulse.
     """
     extra = {name: (np.asarray(v), units) for name, (v, units) in (columns or {}).items()}
     writer = PulseWriter(

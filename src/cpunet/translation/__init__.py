@@ -1,1 +1,1 @@
-"""A trained run applied to pulses."""
+"""Apply a trained run to pulses."""

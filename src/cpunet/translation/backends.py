@@ -1,4 +1,4 @@
-"""What stands behind a translator: a network, a readout chain, or its inverse."""
+"""Backends of a translator: a network, a readout chain, or its inverse."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Backend(ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
+        """Device of the computation."""
         weights: torch.Tensor = next(iter(self.network.state_dict().values()))
         return weights.device
 
@@ -46,15 +46,15 @@ class Backend(ABC):
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Return windows, rows of NaN where there is none, and a `Rejection` for each."""
+        """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
 
 class NetworkBackend(Backend):
-    """A network from window to window; its noise is the latent one."""
+    """A network that maps windows to windows; its noise is the latent noise."""
 
     def __init__(self, network: PositionalUNet) -> None:
         self.network = self._unet = network.eval()
-        # made when first needed: an importer or exporter may yet change or move the network
+        # created on first use: an importer or exporter may still change or move the network
         self._frozen: FrozenUNet | None = None
 
     def __call__(
@@ -65,7 +65,7 @@ class NetworkBackend(Backend):
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Run the network; its output is a prepared window as it is."""
+        """Run the network; its output is a prepared window already."""
         if remains_kev is not None:
             raise CpunetError(
                 "a network has what it was shown; remains of earlier pulses belong to readout "
@@ -141,7 +141,7 @@ class NoisyNetworkBackend(NetworkBackend):
 
 
 class ResponseBackend(Backend):
-    """A readout chain, electronic noise, and the preparation of measured traces."""
+    """A readout chain with electronic noise and the preparation of measured traces."""
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
         self.network = self.chain = generator.eval()
@@ -155,12 +155,12 @@ class ResponseBackend(Backend):
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Respond, add noise in proportion to 1/energy, and prepare like data.
+        """Apply the chain, add noise proportional to 1/energy, and prepare like data.
 
         Raises
         ------
         CpunetError
-            If noise is wanted and an energy is not known.
+            If noise is requested and an energy is unknown.
         """
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         if noise and energy_kev is None:
@@ -187,7 +187,7 @@ class ResponseBackend(Backend):
         seed: int,
         remains_kev: Energies,
     ) -> tuple[FloatArray, Codes]:
-        """The same, each record on what earlier pulses have left."""
+        """The same, with the remains of earlier pulses added to each record."""
         remains = self.chain.remains
         if remains is None or energy_kev is None or not noise:
             raise CpunetError(
@@ -207,7 +207,7 @@ class ResponseBackend(Backend):
 
 
 class InverseBackend(Backend):
-    """A linear inverse, and the preparation of simulated pulses."""
+    """A linear inverse, followed by the preparation of simulated pulses."""
 
     def __init__(
         self, inverse: LinearInverse | InverseUNet, config: PreparationConfig, dt_ns: float
@@ -224,7 +224,7 @@ class InverseBackend(Backend):
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Undo the response and the noise; nothing is drawn."""
+        """Invert the response and suppress the noise; deterministic."""
         del energy_kev, noise, generator, remains_kev
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)

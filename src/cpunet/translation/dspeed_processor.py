@@ -1,7 +1,7 @@
 """REN and IREN as processors of a dspeed chain, on whole blocks of waveforms.
 
-In the chain's JSON or YAML the functions here are named with ``init_args``; what they give
-back is called with each block::
+The chain's JSON or YAML names the functions of this module with ``init_args``; the processor
+that they return is called with each block::
 
     wf_ren:
       function: ren
@@ -32,26 +32,26 @@ def ren(
 ) -> GUFuncWrapper:
     """Make a processor of a trained run: simulated waveforms → measured-like windows.
 
-    It takes a waveform, and the energy in keV if it adds electronic noise (a run of a
-    readout chain with `noise` on), and gives a window of as many samples as the run's
-    preparation says (800); a row that cannot be translated is NaN.
+    Its inputs are a waveform and, if it adds electronic noise (a run of a readout chain with
+    `noise` on), the energy in keV.  Its output is a window of the length of the run's
+    preparation (800 samples); rows that cannot be translated are NaN.
 
     Parameters
     ----------
     run
         Folder of a training run; in JSON or YAML in quotes within quotes.
     period
-        The waveform's ``.period``, or its sampling period in ns: compared with the run's.
-        None leaves that unchecked.
+        ``.period`` of the waveform, or its sampling period in ns, which is compared with
+        that of the run; None skips the check.
     noise, seed
-        Add noise, drawn with this seed; what is drawn depends on the block width too.
+        Whether to add noise, and its seed; the draw also depends on the block width.
     device
-        ``"cpu"`` or ``"cuda"``.
+        Torch device, ``"cpu"`` or ``"cuda"``.
 
     Raises
     ------
     CpunetError
-        If the folder is no finished run, or was trained on another sampling.
+        If the folder is not a finished run, or the run has another sampling period.
     """
     return _processor(REN.load(run, device), period, noise, seed)
 
@@ -59,8 +59,8 @@ def ren(
 def iren(run: str, period: Any = None, seed: int = 0, device: str = "cpu") -> GUFuncWrapper:
     """Make a processor of a trained run: measured waveforms → simulation-like windows.
 
-    Parameters are those of `ren`; a network draws its latent noise, a readout chain's
-    inverse draws nothing.
+    For the parameters see `ren`.  A network draws latent noise; the inverse of a readout
+    chain is deterministic.
     """
     return _processor(IREN.load(run, device), period, True, seed)
 

@@ -1,4 +1,4 @@
-"""Many trainings as one translator: their mean, their spread, or one of them per pulse."""
+"""An ensemble of trainings as one translator: mean, spread, or a random member per pulse."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from cpunet.translation.translator import BATCH, REN
 
 Values = npt.NDArray[np.float64]
 
-BISECTIONS = 30  # of one sample: 1e-9 of it
+BISECTIONS = 30  # of one sample: a precision of 1e-9
 
 
 class EnsembleREN(REN):
     """RENs that differ in their seed.
 
-    It translates like a single `REN`, but draws one of them for each pulse, so that a
-    translated set carries the spread of the seeds; ``noise=False`` leaves the electronic noise
-    out, not that draw.  What is the same every time is `mean_and_spread`.
+    It translates like a single `REN` but draws a random member for each pulse, so that a
+    translated dataset contains the spread of the seeds.  ``noise=False`` switches off the
+    electronic noise but not this draw.  `mean_and_spread` is deterministic.
 
     Parameters
     ----------
     members
-        Two RENs or more, of one preparation and sampling period.
+        Two or more RENs with the same preparation and sampling period.
 
     Raises
     ------
     CpunetError
-        If there are fewer, or they do not go together.
+        If there are fewer than two, or their preparations or sampling periods differ.
     """
 
     def __init__(self, members: Sequence[REN]) -> None:
@@ -57,12 +57,12 @@ class EnsembleREN(REN):
 
     @classmethod
     def load(cls, ensemble: str | Path, device: str = "cpu") -> Self:
-        """Load all finished seeds from the folder of `cpunet ensemble`.
+        """Load all finished seeds from a folder of `cpunet ensemble`.
 
         Raises
         ------
         CpunetError
-            If fewer than two are finished, or a run cannot be loaded.
+            If fewer than two seeds are finished, or a run cannot be loaded.
         """
         runs = finished_members(Path(ensemble))
         if len(runs) < 2:
@@ -71,17 +71,17 @@ class EnsembleREN(REN):
 
     @property
     def needs_energies(self) -> bool:
-        """Whether the noise goes by the energies."""
+        """Whether the noise depends on the energies."""
         return self.members[0].needs_energies
 
     def mean_and_spread(self, windows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean of the members' translations without noise, and how they scatter.
+        """Mean and standard deviation of the members' noise-free translations.
 
-        The preparation puts a translation at a whole sample, so two members of nearly the
-        same response may differ by one sample.  That is no difference of shape: each
-        translation is moved, by its cubic spline, to the mean time at which the members'
-        reach half of their maximum.  The spread there is 0 but for what the slopes differ;
-        what a seed does to the delay is not in it, as a training knows no delay.
+        The preparation aligns a translation at a whole sample, so two members of nearly the
+        same response can differ by one sample, which is not a difference of shape.  Each
+        translation is therefore shifted, with its cubic spline, to the mean time at which
+        the members reach half of their maximum.  There the spread is 0 except for different
+        slopes.  The spread does not contain different delays, which a training cannot infer.
 
         Parameters
         ----------
@@ -91,8 +91,8 @@ class EnsembleREN(REN):
         Returns
         -------
         mean, spread
-            Float32, shape (n, samples): mean, and standard deviation over the members
-            (ddof = 1); rows of NaN where a member has no translation.
+            Mean and standard deviation over the members (ddof = 1), float32, shape
+            (n, samples); rows of NaN where a member has no translation.
         """
         mean, spread = np.empty_like(windows), np.empty_like(windows)
         for first in range(0, len(windows), BATCH):
@@ -104,7 +104,7 @@ class EnsembleREN(REN):
 
 
 class _Draw(Backend):
-    """One of several backends for each pulse, at random."""
+    """A random one of several backends for each pulse."""
 
     def __init__(self, backends: Sequence[Backend]) -> None:
         self.backends = backends
@@ -118,7 +118,7 @@ class _Draw(Backend):
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Share the pulses out, and translate each by its own."""
+        """Assign pulses to random backends and translate them."""
         device = self.device if generator is None else generator.device
         shape = (len(windows),)
         drawn = torch.randint(len(self.backends), shape, generator=generator, device=device)
@@ -136,10 +136,10 @@ class _Draw(Backend):
 
 
 def _at_their_mean_time(translations: Values) -> Values:
-    """Move translations, shape (members, n, samples), to their mean half maximum.
+    """Shift translations, shape (members, n, samples), to their mean time of half maximum.
 
-    What is moved in at an end is the end's value; rows of NaN where a pulse of any member has
-    no half maximum.
+    The ends are padded with the end values.  Rows are NaN where the pulse of any member does
+    not cross half maximum.
     """
     from scipy.interpolate import CubicSpline
 
@@ -174,7 +174,7 @@ def _at_their_mean_time(translations: Values) -> Values:
 
 
 def _last_below_half(pulses: Values) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Which pulses cross half of their maximum, and their last sample below it before that."""
+    """Mask of the pulses that cross half maximum, and their last sample below it."""
     samples = pulses.shape[1]
     finite = np.isfinite(pulses).all(axis=1)
     top = np.where(finite, pulses.argmax(axis=1), 0)

@@ -1,7 +1,8 @@
-"""A run's deterministic part as one file for other tools: ONNX, TorchScript or torch.export.
+"""Export the deterministic part of a run for other tools: ONNX, TorchScript or torch.export.
 
-Noise stays outside the graph: a network takes its latent draw as a second input, a readout
-chain's electronic noise is added to its records.  Preparation stays outside too.
+Noise is not part of the graph: a network takes its latent draw as a second input, and the
+electronic noise of a readout chain is added to its records.  The preparation is not part of
+the graph either.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from cpunet.translation.translator import Translator
 Format = Literal["onnx", "torchscript", "torch-export"]
 FORMATS: tuple[Format, ...] = ("onnx", "torchscript", "torch-export")
 OPSET = 18
-TOLERANCE = 1e-4  # of any sample of a pulse of height 1, between the file and the run
-CHECKED = (1, 3)  # pulses in a batch
+TOLERANCE = 1e-4  # maximum difference between file and run, for pulses of height 1
+CHECKED = (1, 3)  # batch sizes of the comparison
 TRACED = 2
 
 Arrays = list[npt.NDArray[np.float32]]
@@ -43,12 +44,12 @@ class NetworkGraph(PositionalUNet):
     """A Positional U-Net whose latent draw is an input."""
 
     def __init__(self, network: PositionalUNet) -> None:
-        nn.Module.__init__(self)  # all that the base would make is taken over
+        nn.Module.__init__(self)  # all attributes of the base are taken over
         self.__dict__.update(copy.deepcopy(network).__dict__)
 
     def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:  # type: ignore[override]
         """Windows (batch, samples) and epsilon (batch, channels, samples / 16) → windows."""
-        # what the base passes on to `_latent` as the source of the draw is the draw here
+        # the base passes its generator on to `_latent`; here this argument is the draw itself
         drawn = cast(torch.Generator, epsilon)
         return super().forward(windows[:, None], generator=drawn)[:, 0]
 
@@ -59,10 +60,10 @@ class NetworkGraph(PositionalUNet):
 
 
 class ChainGraph(nn.Module):
-    """A readout chain as the matrix that it is, and a trained residual if there is one.
+    """A readout chain as a matrix, with a trained residual if there is one.
 
-    The chain is linear, so that a product with what it makes of each sample alone gives the
-    same records as its Fourier transforms, which few formats know.
+    The chain is linear.  A product with its responses to single samples gives the same
+    records as its Fourier transforms, which few formats support.
     """
 
     matrix: Tensor
@@ -87,7 +88,7 @@ class ChainGraph(nn.Module):
 
 @dataclass(frozen=True)
 class Graph:
-    """What is exported: a module, its inputs and output by name, and inputs to check it."""
+    """A module to export, with the names of its inputs and output, and inputs for a check."""
 
     module: nn.Module
     inputs: tuple[str, ...]
@@ -102,9 +103,9 @@ def graph_of(translator: Translator) -> Graph:
     Returns
     -------
     Graph
-        Inputs ``windows`` (batch, samples), prepared; for a network also ``epsilon``, of
-        zeros for the latent mean, or drawn from N(0, 1).  Output ``windows`` of a network,
-        ``records`` of a readout chain, still to be prepared, ``pulses`` of its inverse.
+        Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either
+        zeros for the latent mean or drawn from N(0, 1).  Output: ``windows`` for a network,
+        unprepared ``records`` for a readout chain, ``pulses`` for its inverse.
     """
     length = translator.recipe.preparation.length
     windows = _windows(length)
@@ -118,7 +119,7 @@ def graph_of(translator: Translator) -> Graph:
             return windows(n), torch.randn(n, *shape, generator=draw)
 
         module = NetworkGraph(network).cpu().eval()
-        # a batch's draw is that of its generator
+        # the draw of a batch is that of its generator
         return Graph(
             module,
             ("windows", "epsilon"),
@@ -144,21 +145,22 @@ def graph_of(translator: Translator) -> Graph:
 
 
 def export(graph: Graph, path: Path, form: Format) -> float:
-    """Write a graph and compare what the file gives with the run.
+    """Write a graph and compare the output of the file with that of the run.
 
     Parameters
     ----------
     graph
-        Of `graph_of`.
+        Result of `graph_of`.
     path
         File to write.
     form
-        ``"onnx"`` (opset 18), ``"torchscript"`` or ``"torch-export"``; all take any batch.
+        Format: ``"onnx"`` (opset 18), ``"torchscript"`` or ``"torch-export"``, all with
+        variable batch size.
 
     Returns
     -------
     float
-        Largest difference of a sample.
+        Largest difference of any sample.
 
     Raises
     ------
@@ -173,7 +175,7 @@ def export(graph: Graph, path: Path, form: Format) -> float:
         "torch-export": (_write_export, _read_export),
     }[form]
     with torch.no_grad(), warnings.catch_warnings():
-        # exporters warn of their own future
+        # exporters warn of their own deprecations
         warnings.simplefilter("ignore")
         path.write_bytes(write(graph))
         run = read(path)
@@ -191,7 +193,7 @@ def export(graph: Graph, path: Path, form: Format) -> float:
 
 
 def _windows(length: int) -> Callable[[int], Tensor]:
-    """Edges of several widths and places, as prepared pulses have them."""
+    """Prepared pulses with edges of several widths and positions."""
 
     def windows(n: int) -> Tensor:
         rng = np.random.default_rng(n)
@@ -215,7 +217,7 @@ def _write_export(graph: Graph) -> bytes:
 
 
 def _read_export(path: Path) -> Callable[[Graph, Arrays], npt.NDArray[np.float32]]:
-    # by content: it would insist on a name that ends in .pt2
+    # read by content: torch would require a name that ends in .pt2
     module = torch.export.load(io.BytesIO(path.read_bytes())).module()
     return lambda _graph, given: module(*map(torch.from_numpy, given)).numpy()
 
@@ -237,7 +239,7 @@ def _write_onnx(graph: Graph) -> bytes:
         _needed(package)
     logger = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = logger.level
-    logger.setLevel(logging.ERROR)  # it tells each time that torchvision is not there
+    logger.setLevel(logging.ERROR)  # it reports missing torchvision every time
     try:
         program = torch.onnx.export(
             _program(graph),

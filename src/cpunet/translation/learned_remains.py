@@ -1,4 +1,4 @@
-"""Remains of earlier pulses as a run has learned them, or at a rate that is asked for."""
+"""Remains of earlier pulses as learned by a run, or at a given rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NONE, LEARNED = "none", "learned"
 
 
 def remains_of(info: Mapping[str, Any]) -> DrawnRemains | None:
-    """What ``run.json`` tells of remains; of rate 0 if the data surely have none."""
+    """Remains recorded in ``run.json``; with rate 0 if the data are known to have none."""
     told = (info.get("fit") or {}).get("remains") or {}
     if "drawn" not in told:
         return None
@@ -30,21 +30,21 @@ def remains_of(info: Mapping[str, Any]) -> DrawnRemains | None:
 def wanted_remains(
     translator: Translator, wanted: str | float, *, raw: bool = False
 ) -> DrawnRemains | None:
-    """Remains to be added to translations.
+    """Remains to add to translations.
 
     Parameters
     ----------
     translator
-        A trained run.
+        Trained run.
     wanted
-        ``"learned"``: as the data have them; ``"none"``; or a rate in kHz.
+        ``"learned"`` for the remains of the data, ``"none"``, or a rate in kHz.
     raw
-        For raw traces, which have not passed any cuts.
+        Whether the remains are for raw traces, which have not passed any cuts.
 
     Raises
     ------
     CpunetError
-        If it is none of these, or the run does not tell what it takes.
+        If `wanted` is invalid, or the run lacks the necessary information.
     """
     if wanted == NONE:
         return None

@@ -1,8 +1,8 @@
-"""Templates of a pulse-shape library, translated without noise and left in their place in time.
+"""Translate the templates of a pulse-shape library without noise or time shifts.
 
-A template is the charge pulse of one place in the detector; whoever uses the library adds
-templates up, weighted with energies.  So nothing may be aligned or normalised on the way,
-as `Translator.translate` does: a readout chain acts on the template as it stands.
+A template is the charge pulse of one position in the detector.  Users of the library sum
+templates weighted by energy.  Templates must therefore not be aligned or normalised, unlike in
+`Translator.translate`: a readout chain acts directly on the template.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import BATCH, REN
 
-EVENTS = 200  # summed to say how linear a translation is
-SITES = 3  # of each
-# A current amplitude is measured on a current that was averaged so often over so long.
+EVENTS = 200  # sums in the test of linearity
+SITES = 3  # templates per sum
+# Number and width of the moving averages of the current amplitude.
 WINDOW_NS, WINDOWS = 48.0, 3
-BEFORE_NS, AFTER_NS = 1000.0, 4000.0  # about the highest current
+BEFORE_NS, AFTER_NS = 1000.0, 4000.0  # around the maximum current
 
 
 @dataclass(frozen=True)
 class Linearity:
-    """How far the sum of translated templates is from the translated sum.
+    """Deviation of the sum of translated templates from the translated sum.
 
     Parameters
     ----------
     events
-        Sums of three templates that were compared.
+        Number of compared sums of three templates.
     largest, rms
-        Of the deviations of all samples, in units of the highest translated sample.
+        Maximum and RMS of the deviations of all samples, in units of the highest translated
+        sample.
     current_amplitude
-        Largest relative deviation of the steepest step from sample to sample.
+        Largest relative deviation of the steepest step between samples.
     """
 
     events: int
@@ -54,16 +55,17 @@ class Linearity:
 class TemplateTranslator:
     """Translates templates without noise; sample k of the result is at the time of sample k.
 
-    A readout chain responds to a template of any height: its poles and decays are times, so
-    the sampling may be another than that of the training.  A network knows only prepared
-    pulses of its own sampling: a template goes through it as one, is put back where it was
-    (sample of 99.9 % on sample of 99.9 %, since a network learns no delay) and multiplied by
-    its height.  Before the network's window stands 0, after it its last value.
+    A readout chain responds to a template of any height.  Its poles and decays are times, so
+    the sampling period can differ from that of the training.  A network accepts only prepared
+    pulses of its own sampling: a template is prepared, translated, shifted back to its
+    original time (99.9 % sample on 99.9 % sample, since a network learns no delay) and
+    multiplied by its height.  The window is padded with 0 before it and with its last value
+    after it.
 
     Parameters
     ----------
     ren
-        A trained run.
+        Trained run.
     dt_ns
         Sampling period of the templates in ns.
 
@@ -102,8 +104,8 @@ class TemplateTranslator:
         Returns
         -------
         FloatArray
-            Of the same shape: per unit of charge for a readout chain, in units of prepared
-            pulses (tail at 0.80) for a network.  Rows of NaN where it cannot be done.
+            Translated templates of the same shape, per unit charge for a readout chain, in
+            units of prepared pulses (tail at 0.80) for a network; rejected rows are NaN.
         Codes
             A `Rejection` for each row.
         """
@@ -111,7 +113,7 @@ class TemplateTranslator:
         codes = np.zeros(len(templates), np.uint8)
         unknown = np.isnan(templates).any(axis=1)
         results[unknown], codes[unknown] = np.nan, Rejection.NAN
-        # where no charge is seen there is no signal, and nothing to align
+        # templates without charge have no signal and nothing to align
         todo = np.flatnonzero(~unknown & templates.any(axis=1))
         act = self._through_network if self.chain is None else self._respond
         with torch.inference_mode():
@@ -142,7 +144,7 @@ class TemplateTranslator:
 def _put_back(
     windows: FloatArray, prepared: Prepared, samples_before: int, templates: FloatArray
 ) -> FloatArray:
-    """Windows at the places of their templates, shape (accepted, samples)."""
+    """Windows at the times of their templates, shape (accepted, samples)."""
     time = np.arange(templates.shape[1])
     source = time - prepared.align_sample[:, np.newaxis] + samples_before
     inside = source.clip(0, windows.shape[1] - 1)
@@ -153,21 +155,22 @@ def _put_back(
 def aligned_currents(
     charge: FloatArray, dt_ns: float
 ) -> tuple[FloatArray, npt.NDArray[np.float64]]:
-    """Currents of pulses, averaged as for a current amplitude, the highest sample in one place.
+    """Currents of pulses, averaged as for the current amplitude and aligned at their maximum.
 
     Parameters
     ----------
     charge
-        Translated templates, shape (n, samples); rows of NaN stay that.
+        Translated templates, shape (n, samples); rows of NaN remain NaN.
     dt_ns
         Sampling period in ns.
 
     Returns
     -------
     currents
-        In 1/ns, shape (n, samples from `BEFORE_NS` before to `AFTER_NS` after the highest).
+        Currents in 1/ns, shape (n, samples from `BEFORE_NS` before to `AFTER_NS` after the
+        maximum).
     times_ns
-        Time of the highest sample after the start of each template; NaN for rows of NaN.
+        Time of the maximum after the start of each template in ns; NaN for rows of NaN.
     """
     known = ~np.isnan(charge).any(axis=1)
     first = np.zeros_like(charge[:, :1])
@@ -193,11 +196,12 @@ def linearity(
     Parameters
     ----------
     translate
-        What to judge.
+        Translator to test.
     templates
-        Translatable ones, shape (n, samples); sums of three with random weights are made.
+        Translatable templates, shape (n, samples); sums of three with random weights are
+        compared.
     seed
-        Of templates and weights.
+        Seed of the choice of templates and of the weights.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""In which form translated pulses are given out: here as they come, normalised windows."""
+"""Output forms of translated pulses; this module defines normalised windows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cpunet.translation.translator import Translator
 
 @dataclass(frozen=True, eq=False)
 class Formed:
-    """Translated pulses in the form of the output, row by row those that were given.
+    """Translated pulses in the form of the output, with the rows of the input.
 
     Parameters
     ----------
@@ -26,9 +26,9 @@ class Formed:
     codes
         A `Rejection` for each row.
     saturated
-        Which rows reach an end of the digitiser's range, shape (n,).
+        Mask of the rows that reach an end of the digitiser's range, shape (n,).
     remains_kev
-        What earlier pulses have left under each, in keV, shape (n,); None for none at all.
+        Remains of earlier pulses under each pulse in keV, shape (n,); None without remains.
     """
 
     pulses: Pulses
@@ -38,16 +38,17 @@ class Formed:
 
 
 class OutputForm(Protocol):
-    """A form of output: translates pulses and says what its samples are.
+    """An output form: translates pulses and defines type and units of the samples.
 
     Attributes
     ----------
     samples : numpy dtype
-        Type in which samples are stored.
+        Data type of the stored samples.
     units : str
-        Of the samples.
+        Units of the samples.
     t0_ns : float
-        Time of the first sample; 0 is where a pulse reaches 99.9 % of its maximum.
+        Time of the first sample in ns, counted from where a pulse reaches 99.9 % of its
+        maximum.
     """
 
     samples: npt.DTypeLike
@@ -62,14 +63,14 @@ class OutputForm(Protocol):
 
 
 class Normalised:
-    """Prepared windows: baseline at 0, tail at 0.80; NaN for pulses that were rejected.
+    """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
 
     Parameters
     ----------
     translator
-        A trained run.
+        Trained run.
     remains
-        Of earlier pulses, to be drawn; None for none.
+        Distribution of the remains of earlier pulses; None for none.
     """
 
     samples: npt.DTypeLike = np.float32
@@ -93,7 +94,7 @@ class Normalised:
 def drawn_kev(
     remains: DrawnRemains | None, n: int, generator: torch.Generator | None
 ) -> npt.NDArray[np.float64] | None:
-    """Remains of `n` pulses in keV, from the generator that the noise comes from."""
+    """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
     if remains is None:
         return None
     device = "cpu" if generator is None else generator.device

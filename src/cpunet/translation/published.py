@@ -1,4 +1,4 @@
-"""The authors' published weights, by the names of their files, as networks of ours."""
+"""Load the authors' published weights, by their file names, into networks of this package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
 from cpunet.recipes.network_settings import GruConfig, PunetConfig
 
-# Their names → ours, of layers; the ninth positional map is never used.
+# Published layer names → names here; the ninth positional map is never used.
 LAYERS = (
     {"inc.double_conv": "inlet", "outc.conv.0": "outlet"}
     | {"fc_mean": "latent_mean", "fc_var": "latent_log_variance"}
@@ -20,7 +20,7 @@ LAYERS = (
     | {f"up{i}.conv.double_conv": f"up.{i - 1}" for i in range(1, 5)}
 )
 MAPS = [f"pe{i}.pe" for i in range(1, 10)]
-MAP_TOLERANCE = 1e-3  # theirs are computed in single precision
+MAP_TOLERANCE = 1e-3  # the published maps are computed in single precision
 
 DISCRIMINATOR_LAYERS = {
     "embedding": "embedding",
@@ -40,7 +40,7 @@ def load_state(path: Path) -> State:
     Raises
     ------
     CpunetError
-        If the file cannot be read or is anything but a mapping of names to tensors.
+        If the file cannot be read or is not a mapping of names to tensors.
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -64,15 +64,15 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
     Parameters
     ----------
     path
-        File of its state dict.
+        File of the state dict.
     length
-        Samples of a pulse.
+        Samples per pulse.
 
     Raises
     ------
     CpunetError
-        If it is no such file, or its tensors or positional maps are those of another
-        architecture: names what is missing, extra or of another shape.
+        If the file is not a published generator, or its tensors or positional maps belong to
+        another architecture; the message names missing, extra or differently shaped tensors.
     """
     state = load_state(path)
     first = state.get("inc.double_conv.0.weight")
@@ -95,15 +95,15 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
 
 
 def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
-    """Load a published discriminator's weights, ``fep_netD_A.pth`` or ``fep_netD_B.pth``.
+    """Load the weights of a published discriminator, ``fep_netD_A.pth`` or ``fep_netD_B.pth``.
 
-    They are kept by name: the published network never calls its attention matrix and batch
-    norm, so outputs of the network here differ from its own.
+    Weights are assigned by name.  The published network never calls its attention matrix
+    and batch norm, so outputs of the network here differ from its own.
 
     Raises
     ------
     CpunetError
-        As `read_generator`.
+        See `read_generator`.
     """
     state = load_state(path)
     table, hidden = state.get("embedding.weight"), state.get("RNNLayer.weight_hh_l0")
@@ -125,11 +125,11 @@ def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
 
 
 def _renamed(state: State, layers: dict[str, str]) -> State:
-    """Our names for the layers known, theirs for the others."""
+    """State dict with the names of this package for known layers, others unchanged."""
     named: State = {}
     for name, value in state.items():
         layer, _, rest = name.rpartition(".")
-        # batch norms and convolutions are numbered inside their block
+        # batch norms and convolutions are numbered within their block
         block, _, number = layer.rpartition(".")
         if layer in layers:
             named[f"{layers[layer]}.{rest}"] = value
@@ -158,7 +158,7 @@ def _require_same(path: Path, named: State, expected: State, absent: list[str]) 
 
 
 def _check_maps(path: Path, maps: State, width: int, length: int) -> None:
-    """The maps are no weights, but a network with others is another network."""
+    """Compare the positional maps, which are not weights but define the architecture."""
     m = width
     channels = (m, 2 * m, 4 * m, 8 * m, 8 * m, 4 * m, 2 * m, m)
     last = (1, 2, 4, 8, 16, 8, 4, 2)

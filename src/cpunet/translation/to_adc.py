@@ -1,10 +1,10 @@
-"""Translated pulses as raw traces in ADC counts: the preparation undone.
+"""Translated pulses as raw traces in ADC counts: the inverse of the preparation.
 
-``raw = baseline + scale * prepared``, with a scale in proportion to the energy.  A readout
-chain gives records of any length, with noise all along.  Its noise is added once and nothing
-is normalised afterwards, so that it does not change the height of a pulse.  A network knows
-windows of its own length alone: before them stands the baseline, after them the decay fitted
-to the end of each, both without noise.
+``raw = baseline + scale * prepared``, with a scale proportional to the energy.  A readout
+chain produces records of any length with noise throughout.  Its noise is added once and
+nothing is normalised afterwards, so it does not change the height of a pulse.  A network
+produces windows of fixed length.  They are padded with the baseline before them and with the
+decay fitted to their end after them, both without noise.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from cpunet.translation.translator import BATCH, REN
 
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_SAMPLES = 20  # of the pulse whose height defines the gain
-LEAST_ADC = 20.0  # a median scale below is none of raw traces
+LEAST_ADC = 20.0  # raw traces have a larger median scale
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class AdcScale:
-    """How prepared units become ADC counts.
+    """Conversion from prepared units to ADC counts.
 
     Parameters
     ----------
     per_kev
-        ADC counts of 1 in prepared units, per keV.
+        ADC counts per prepared unit and keV.
     baseline
-        In ADC counts.
+        Baseline in ADC counts.
     """
 
     per_kev: float
@@ -52,21 +52,21 @@ class AdcScale:
 def to_adc(
     windows: FloatArray, scale: npt.ArrayLike, baseline: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
-    """Undo ``prepared = (raw - baseline) / scale``, round, and keep to what 16 bits hold.
+    """Invert ``prepared = (raw - baseline) / scale``, round, and clip to 16 bits.
 
     Parameters
     ----------
     windows
         Prepared pulses, shape (n, samples); a row with NaN becomes a row of 0.
     scale, baseline
-        In ADC counts, for each row or for all.
+        Scale and baseline in ADC counts, per row or common.
 
     Returns
     -------
     traces
-        Of the same shape.
+        Raw traces in ADC counts, shape (n, samples).
     saturated
-        Which rows would have left the range, shape (n,).
+        Mask of the clipped rows, shape (n,).
 
     Examples
     --------
@@ -85,24 +85,24 @@ def to_adc(
 def adc_scale(
     run: Path, ren: REN, *, adc_per_kev: float | None, baseline: float | None
 ) -> AdcScale:
-    """Find gain and baseline: as given, else those of the data that the run was trained on.
+    """Gain and baseline: as given, or else those of the run's training data.
 
     Parameters
     ----------
     run
-        Folder of the run, whose ``run.json`` tells of the data.
+        Folder of the run, whose ``run.json`` describes the data.
     ren
-        The run, loaded.
+        The loaded run.
     adc_per_kev
-        Maximum over the baseline of a fast pulse in ADC counts per keV; the inverse of
-        what ``--kev-per-adc`` says of data.
+        Height of a fast pulse above the baseline in ADC counts per keV, the inverse of
+        ``--kev-per-adc`` of the data.
     baseline
-        In ADC counts.
+        Baseline in ADC counts.
 
     Raises
     ------
     CpunetError
-        If one is neither given nor known, or not a positive number.
+        If one of the two is neither given nor known, or is not a positive number.
     """
     for name, value in (("--adc-per-kev", adc_per_kev), ("--baseline", baseline)):
         if value is not None and not (np.isfinite(value) and value >= 0):
@@ -122,19 +122,20 @@ def adc_scale(
 
 
 class AdcForm:
-    """Raw traces in ADC counts, 0 for pulses that were rejected.
+    """Raw traces in ADC counts; 0 for rejected pulses.
 
     Parameters
     ----------
     ren
-        A trained run.
+        Trained run.
     scale
         Gain and baseline.
     length, n_pre
-        Samples of a trace, and those before a pulse reaches 99.9 % of its maximum (without
-        noise); the window's own if None.
+        Number of samples of a trace, and of those before the pulse without noise reaches
+        99.9 % of its maximum; the values of the prepared window if None.
     remains
-        Of earlier pulses, to be drawn: they lift the baseline at the beginning of a trace.
+        Distribution of the remains of earlier pulses, which raise the baseline at the start
+        of a trace; None for none.
 
     Raises
     ------
@@ -166,7 +167,7 @@ class AdcForm:
 
     @property
     def fills_in(self) -> bool:
-        """Whether parts of a trace are no translation, but baseline and decay without noise."""
+        """Whether traces are padded with baseline and decay without noise."""
         before = self.n_pre - self.config.samples_before
         after = self.length - self.n_pre - self.config.samples_after
         return not isinstance(self.ren.backend, ResponseBackend) and max(before, after) > 0
@@ -174,7 +175,7 @@ class AdcForm:
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
-        """Translate pulses, keeping their rows; those without energy are rejected."""
+        """Translate pulses, keeping their rows; pulses without energy are rejected."""
         backend, left = self.ren.backend, drawn_kev(self.remains, len(pulses), generator)
         if isinstance(backend, ResponseBackend):
             windows, codes = self._of_chain(backend, pulses, noise, generator)
@@ -194,7 +195,7 @@ class AdcForm:
         windows[codes != Rejection.ACCEPTED] = np.nan
         scale = np.where(unknown, 0.0, self.scale.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.scale.baseline)
-        # 16 bits are exact in single precision
+        # single precision represents 16-bit integers exactly
         return Formed(pulses.with_waveforms(traces.astype(np.float32)), codes, saturated, left)
 
     def _of_chain(
@@ -231,7 +232,7 @@ class AdcForm:
         config, dt_ns = self.config, self.ren.dt_ns
         before = max(0, self.n_pre - config.samples_before)
         after = max(0, self.length - self.n_pre - config.samples_after)
-        # before its window no charge has moved, after it all has been collected
+        # before the window no charge has moved, after it all charge has been collected
         long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
         with torch.inference_mode():
             records = backend.network(torch.from_numpy(long).to(backend.device)).cpu().numpy()
@@ -248,7 +249,7 @@ class AdcForm:
 
 
 def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:
-    """Gain (ADC of 1 in prepared units, per keV) and baseline of the data, if the run tells."""
+    """Gain (ADC counts per prepared unit and keV) and baseline of the data, if recorded."""
     info = read_info(run)
     cuts = (info.get("data") or {}).get("cuts") or {}
     amplitude = float(cuts.get("amplitude") or 0.0)
@@ -260,7 +261,7 @@ def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:
 
 
 def _height(ren: REN) -> float:
-    """Highest sample, in prepared units, of a fast pulse without noise."""
+    """Maximum, in prepared units, of a fast pulse without noise."""
     config = ren.recipe.preparation
     time = np.arange(config.length) - config.samples_before
     ramp = np.clip(time / RISE_SAMPLES + 1, 0, 1).astype(np.float32)

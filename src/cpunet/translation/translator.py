@@ -1,8 +1,8 @@
-"""REN and IREN: a trained run applied to pulses.
+"""REN and IREN: apply a trained run to pulses.
 
-``REN`` makes simulated pulses look measured; ``IREN`` goes the other way.  Pulses
-are prepared first (aligned and normalised as in the training; a prepared pulse is
-left as it is), so raw simulated pulses of any length can be given.
+``REN`` makes simulated pulses look measured; ``IREN`` does the reverse.  Pulses are
+prepared first, that is aligned and normalised as in the training, so raw simulated pulses
+of any length are accepted.  Preparation leaves prepared pulses unchanged.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from cpunet.translation.learned_remains import remains_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
-RESIDUAL = "residual"  # its weights lie beside those of the chain
+RESIDUAL = "residual"  # its weights are stored beside those of the chain
 # and beside those of a CycleGAN, what its translations need
 CHAIN, INVERSE, NOISE = "chain", "inverse", "noise"
-BATCH = 512  # pulses at a time: bounds the memory, hardly touches the speed
+BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
 
 class RejectionWarning(UserWarning):
@@ -55,12 +55,12 @@ class RejectionWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class Translated:
-    """Translated pulses, row by row those that were given.
+    """Translated pulses, with the rows of the input.
 
     Parameters
     ----------
     pulses
-        Windows of shape (n, samples); rows of NaN for pulses that were rejected.
+        Windows of shape (n, samples); rows of NaN for rejected pulses.
     codes
         A `Rejection` for each row.
     """
@@ -70,11 +70,11 @@ class Translated:
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
-        """Which rows were translated."""
+        """Mask of the translated rows."""
         return np.asarray(self.codes == Rejection.ACCEPTED)
 
     def reasons(self) -> str:
-        """Say how many rows were not translated, by reason."""
+        """Numbers of rejected rows by reason, as text."""
         counts = Counter(self.codes[~self.valid].tolist())
         labels = ((n, Rejection(code).label.replace("_", " ")) for code, n in counts.items())
         return ", ".join(f"{n} {label}" for n, label in labels)
@@ -96,12 +96,12 @@ class Translator:
 
     @classmethod
     def load(cls, run: str | Path, device: str = "cpu") -> Self:
-        """Load from the folder of a training run.
+        """Load a translator from the folder of a training run.
 
         Raises
         ------
         CpunetError
-            If the folder is no finished run, or its weights do not fit its recipe.
+            If the folder is not a finished run, or its weights do not match its recipe.
         """
         run = Path(run)
         info, recipe = read_info(run), read_recipe(run)
@@ -165,33 +165,34 @@ class Translator:
         Parameters
         ----------
         waveforms
-            Shape (n, samples), or (samples,) for a single pulse, sampled as in the
-            training.
+            Waveforms of shape (n, samples), or (samples,) for a single pulse, with the
+            sampling period of the training.
         energy_kev
-            Energy of each pulse, for electronic noise, which goes as 1/energy; a network's
-            latent noise needs none.
+            Energy of each pulse in keV, for electronic noise, which scales as 1/energy; the
+            latent noise of a network needs none.
         noise
-            Add noise; off, the same pulses come out every time.
+            Whether to add noise; without it the result is deterministic.
         seed
-            Of the noise; None for a fresh draw.
+            Seed of the noise; None for a random one.
         remains_kev
-            What earlier pulses have left under each pulse, in keV; `remains` draws some.
+            Remains of earlier pulses under each pulse in keV; `remains` can draw them.
 
         Returns
         -------
         array or tensor
-            Float32, as what was given, shape (n, window) or (window,).
+            Translated windows of the type of the input, float32, shape (n, window) or
+            (window,).
 
         Raises
         ------
         CpunetError
-            If energies are needed and not given, or a single pulse cannot be translated.
+            If required energies are missing, or a single pulse cannot be translated.
 
         Warns
         -----
         RejectionWarning
-            If pulses cannot be translated, with their number by reason: their rows are NaN.
-            `translate_pulses` has a code for each instead.
+            If pulses cannot be translated, with their numbers by reason; their rows are NaN.
+            `translate_pulses` returns a code for each instead.
         """
         if isinstance(waveforms, torch.Tensor):
             array = waveforms.detach().cpu().numpy()
@@ -210,21 +211,21 @@ class Translator:
         progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
     ) -> Translated:
-        """Translate a set, keeping its rows: those rejected become NaN and have a code.
+        """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
         Parameters
         ----------
         pulses
-            Raw or prepared pulses of the side that this translator takes.
+            Raw or prepared pulses of the side that this translator accepts.
         noise
-            Add noise; electronic noise is scaled by the pulses' own energies, and those
-            without one are rejected.
+            Whether to add noise; electronic noise is scaled by the energies of the pulses,
+            and pulses without energy are rejected.
         generator
-            Source of the noise.
+            Random generator of the noise.
         progress
-            Called with the number of pulses done since the last call.
+            Function called with the number of pulses completed since the last call.
         remains_kev
-            What earlier pulses have left under each of them, in keV, shape ``(n,)``.
+            Remains of earlier pulses under each pulse in keV, shape ``(n,)``.
 
         Raises
         ------
@@ -257,13 +258,13 @@ class Translator:
 
     @property
     def remains(self) -> DrawnRemains | None:
-        """Of earlier pulses, as the run has learned them; None if it does not tell of any."""
+        """Remains of earlier pulses as learned by the run; None if it has no information."""
         backend = self.backend
         return backend.chain.remains if isinstance(backend, ResponseBackend) else None
 
     @property
     def needs_energies(self) -> bool:
-        """Whether the noise goes by the energies."""
+        """Whether the noise depends on the energies."""
         return isinstance(self.backend, ResponseBackend | NoisyNetworkBackend)
 
     def apply(
@@ -276,7 +277,7 @@ class Translator:
         progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
     ) -> FloatArray:
-        """Translate prepared windows, shape (n, window); NaN where it cannot be done."""
+        """Translate prepared windows, shape (n, window); rejected rows are NaN."""
         result, _ = self.apply_with_codes(
             windows,
             energy_kev=energy_kev,
@@ -297,7 +298,7 @@ class Translator:
         progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """As `apply`, with a `Rejection` for each row."""
+        """Like `apply`, with a `Rejection` for each row."""
         result = np.empty_like(windows)
         codes = np.zeros(len(windows), np.uint8)
         with torch.inference_mode():
@@ -313,7 +314,7 @@ class Translator:
         return result, codes
 
     def seeded(self, seed: int | None) -> torch.Generator:
-        """Return a source of noise; fresh if the seed is None."""
+        """Return a random generator for the noise, randomly seeded if the seed is None."""
         generator = torch.Generator(device=self.backend.device)
         if seed is None:
             generator.seed()
@@ -356,7 +357,7 @@ class Translator:
 
 
 def _one_each(energy_kev: npt.ArrayLike, n: int) -> Energies:
-    """Energies of `n` pulses, given as that many or as one for all."""
+    """Energies of `n` pulses, from `n` values or one common value."""
     energies = np.asarray(energy_kev, float)
     if energies.shape not in ((), (n,)):
         raise CpunetError(

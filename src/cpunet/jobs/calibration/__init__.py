@@ -1,1 +1,1 @@
-"""Detector and electronics found together: a run, and the detector that goes with it."""
+"""Joint calibration of detector and electronics, which gives a run and its detector."""

@@ -1,4 +1,4 @@
-"""A simulation and a measurement in; calibrated physics and a run of that detector out."""
+"""Calibrate the physics of a simulation on a measurement, and write a run of the result."""
 
 from __future__ import annotations
 
@@ -58,30 +58,30 @@ PLAN = FolderKind(
     known_by="plan.json",
     own=r"plan\.json|plan\.png",
 )
-# Pulses of each side for which a plan tells the errors.
+# Numbers of pulses per side for which a plan gives the errors.
 PLANNED = (1000, 4000, 40_000)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration to be made or planned.
+    """A calibration to run or to plan.
 
     Parameters
     ----------
     start
-        What is simulated.
+        Simulation from which the calibration starts.
     data
         Measured pulses.
     recipe
-        With a response to be matched.
+        Recipe with a readout chain to fit.
     freedom
-        Which physics are free.
+        Free physical parameters.
     peak
-        Energies to calibrate on.
+        Energies used for the calibration.
     events
-        Simulated events, at most, that are drifted again and again.
+        Maximum number of simulated events, which are drifted repeatedly.
     seed
-        Of everything random.
+        Seed of all random numbers.
 
     Raises
     ------
@@ -106,7 +106,7 @@ class Calibration:
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
-        """What is read."""
+        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return (*self.start.files, *self.data.files)
 
     def run(
@@ -114,28 +114,28 @@ class Calibration:
     ) -> dict[str, Any]:
         """Calibrate detector and readout together, and write a run folder of the result.
 
-        The folder is a run as `cpunet.jobs.training.train.train_run` makes one, and holds
-        ``detector.yaml`` and ``settings.yaml`` (calibrated), ``sim.lh5`` (all events simulated
-        again with them), ``calibration.json`` (see `cpunet.calibration.result.described`) and
-        ``calibration.html``.
+        The folder is a run like those of `cpunet.jobs.training.train.train_run`, and contains
+        the calibrated ``detector.yaml`` and ``settings.yaml``, ``sim.lh5`` (all events,
+        simulated again with them), ``calibration.json`` (see
+        `cpunet.calibration.result.described`) and ``calibration.html``.
 
         Parameters
         ----------
         out
-            The folder; it appears when all is done.
+            Output folder; it appears when it is complete.
         force, monitor
-            As for `cpunet.jobs.training.train.train_run`.
+            See `cpunet.jobs.training.train.train_run`.
 
         Returns
         -------
         dict
-            The content of ``calibration.json``.
+            Content of ``calibration.json``.
 
         Raises
         ------
         CpunetError
-            If the inputs cannot be used, the detector cannot be simulated with any physics
-            that the data ask for, or the data are plainly of another detector.
+            If the inputs cannot be used, the detector cannot be simulated with the physics
+            that the data require, or the data are clearly from another detector.
         """
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
@@ -170,20 +170,20 @@ class Calibration:
     def plan(
         self, out: Path | None = None, *, force: bool = False, monitor: Monitor = QUIET
     ) -> dict[str, Any]:
-        """Tell what the pulses know of the physics, before any fit of it.
+        """Forecast how well the pulses constrain the physics, before any fit.
 
         Parameters
         ----------
         out
             Folder for ``plan.json`` and ``plan.png``; None for none.
         force, monitor
-            As for `run`.
+            See `run`.
 
         Returns
         -------
         dict
-            ``errors``: of each parameter, by number of pulses, alone and with all free;
-            ``directions``, by number of pulses.
+            ``errors`` of each parameter by number of pulses, alone and with all parameters
+            free; ``directions`` by number of pulses.
         """
         if out is None:
             with tempfile.TemporaryDirectory() as aside:
@@ -223,7 +223,7 @@ class Calibration:
         return read_sides(*inputs, folder, monitor)
 
     def _search(self, sides: Sides, monitor: Monitor, simulated: Callable[[], None]) -> Search:
-        """The search, ready to begin."""
+        """The search, ready to start."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
         preparation = self.recipe.preparation
         remains, _ = measured_remains(self.data, preparation)
@@ -276,7 +276,7 @@ class Calibration:
 def _simulate_calibrated(
     calibrated: Calibrated, sides: Sides, folder: Path, seed: int, monitor: Monitor
 ) -> None:
-    """Write the physics found, and all events simulated with them."""
+    """Write the calibrated physics, and all events simulated with it."""
     parameters = calibrated.problem.parameters
     detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
     _write_physics(folder, detector, settings)

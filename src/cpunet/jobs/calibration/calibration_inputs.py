@@ -1,4 +1,4 @@
-"""What a calibration starts from: a simulation with its hits, a measurement, and priors."""
+"""Inputs of a calibration: a simulation with its hits, a measurement, and priors."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from cpunet.simulation.superposition import solve
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
-# Of the tilt (1e10/cm4), for the derivative of the depletion voltage.
+# Step of the tilt (1e10/cm4) for the derivative of the depletion voltage.
 _TILT = 0.01
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which physics are free, and what is known of them.
+    """The free physical parameters, and prior knowledge of them.
 
     Parameters
     ----------
     free
-        Parameters; None for those that the data tell.
+        Free parameters; None for all those that the data constrain.
     fixed
-        Names of parameters that stay as simulated.
+        Names of parameters that keep their simulated values.
     priors
-        Value and error by name, also of ``"depletion_voltage"``.
+        Prior value and error by name, also of ``"depletion_voltage"``.
     """
 
     free: tuple[Nuisance, ...] | None = None
@@ -55,12 +55,12 @@ class Freedom:
 
     @classmethod
     def of(cls, free: str, fixed: str, given: Sequence[str]) -> Freedom:
-        """From what the command line gives.
+        """Parse the options of the command line.
 
         Raises
         ------
         CpunetError
-            If a parameter is not known, or a prior is no ``NAME=VALUE±ERROR``.
+            If a parameter is unknown, or a prior is not of the form ``NAME=VALUE±ERROR``.
 
         Examples
         --------
@@ -77,10 +77,10 @@ class Freedom:
 
     @property
     def looked_at(self) -> tuple[Nuisance, ...]:
-        """Parameters that may become free."""
+        """Parameters that can become free."""
         if self.free is not None:
             return self.free
-        # another lithium layer takes solutions of the fields: only if it is asked for
+        # another lithium layer requires new field solutions: only on request
         return tuple(
             n for n in NUISANCES if n.name not in self.fixed and n.name != "li_thickness_mm"
         )
@@ -88,18 +88,18 @@ class Freedom:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a calibration starts from: a simulation with its hits, or hits to simulate.
+    """Starting point of a calibration: a simulation with its hits, or hits to simulate.
 
     Parameters
     ----------
     sim
         Output of ``cpunet simulate`` or ``cpunet stand``; None with `hits`.
     hits
-        Of the events to be simulated; None with `sim`.
+        Hits of the events to simulate; None with `sim`.
     detector, settings
-        To simulate them with; with `sim`, None for those that it was made with.
+        Detector and settings of the simulation; with `sim`, None for those of its file.
     cluster_mm
-        Of `hits`, those nearer than this to each other are merged.
+        Distance in mm below which `hits` are merged.
     """
 
     sim: InputFile | None = None
@@ -116,28 +116,28 @@ class Start:
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
-        """What is read."""
+        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return (*(self.sim.files if self.sim else ()), self.hits.path if self.hits else None)
 
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Both sides, read and prepared, and the physics of the simulated one.
+    """Both sides, read and prepared, and the physics of the simulated side.
 
     Parameters
     ----------
     sim, data
-        Prepared pulses.
+        Prepared pulses of both sides.
     sim_path
-        File of the simulated ones, with their hits.
+        File of the simulated pulses with their hits.
     physics
-        As they are to be simulated at first; nothing is free yet.
+        Initial physics of the simulation; nothing is free yet.
     stored
         Hits, one event per pulse of the file.
     selection
-        Energies.
+        Selected energies.
     temporary
-        File that was only simulated to start from, or None.
+        File that was simulated only as a starting point, or None.
     """
 
     sim: InputSet
@@ -149,7 +149,7 @@ class Sides:
     temporary: Path | None
 
     def forget(self) -> None:
-        """Remove what was only simulated to start from."""
+        """Remove the file that was simulated only as a starting point."""
         if self.temporary is not None:
             self.temporary.unlink()
 
@@ -164,16 +164,16 @@ def read_sides(
     folder: Path,
     monitor: Monitor,
 ) -> Sides:
-    """Read and prepare both sides; simulate hits first, if that is what is given.
+    """Read and prepare both sides; if hits are given, simulate them first.
 
     Parameters
     ----------
     start, data_file, recipe, peak, events, seed
         See `cpunet.jobs.calibration.calibrate.Calibration`.
     folder
-        For pulses that are only simulated to start from.
+        Folder for pulses that are simulated only as a starting point.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def read_sides(
     require_same_sampling(simulated, data)
     for note in require_both_sides(simulated, data, selection):
         monitor.note(note)
-    # in an order of which any beginning is a fair part
+    # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
     settings = start.settings or stored.settings
@@ -205,7 +205,7 @@ def read_sides(
 
 
 def _simulated(start: Start, path: Path, dt_ns: float, monitor: Monitor) -> Path:
-    """Pulses of hits with the physics given."""
+    """Simulate the pulses of hits with the given physics."""
     assert start.hits is not None
     assert start.detector is not None
     settings = start.settings or SimulationSettings(dt_ns=dt_ns)
@@ -218,14 +218,14 @@ def _simulated(start: Start, path: Path, dt_ns: float, monitor: Monitor) -> Path
 def known_depletion(
     physics: Physics, measured: tuple[float, float] | None
 ) -> Callable[[Values], Values]:
-    """Deviation of the depletion voltage from what it was measured to be, if it was.
+    """Deviation of the depletion voltage from its measured value, in units of its error.
 
     Parameters
     ----------
     physics
-        Whose coordinates are given.
+        Physics to which the coordinates belong.
     measured
-        In V, and its error; None gives no deviation.
+        Measured voltage and its error in V; None gives no deviation.
     """
     if measured is None:
         return lambda _: np.empty(0)

@@ -1,1 +1,1 @@
-"""What every job uses: input files, devices, progress, memory, locks, noise and truth."""
+"""Common parts of all jobs: input files, devices, progress, memory, locks, noise, truth."""

@@ -1,4 +1,4 @@
-"""What a job computes on, and whether its memory suffices."""
+"""Devices of a job, and their memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cpunet.recipes.training_settings import MatchingConfig
 
 
 def resolve_device(device: str) -> str:
-    """Turn ``"auto"`` into a device; refuse one that is not there."""
+    """Resolve ``"auto"`` to a device; raise a `CpunetError` if a device is missing."""
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if device.startswith("cuda") and not torch.cuda.is_available():
@@ -27,19 +27,19 @@ def resolve_device(device: str) -> str:
 
 @contextmanager
 def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
-    """Turn an exhausted memory into a line that says which batch size to try.
+    """Context manager that reports exhausted memory in one line, with a batch size to try.
 
     Parameters
     ----------
     recipe
-        What is trained inside.
+        Recipe of the training.
     processes
-        How many share a batch.
+        Number of processes that share a batch.
     """
     try:
         yield
     except (torch.cuda.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        # the CPU's allocator has no error of its own
+        # the CPU allocator has no exception class of its own
         known = isinstance(error, torch.cuda.OutOfMemoryError | MemoryError)
         if not (known or "DefaultCPUAllocator" in str(error)):
             raise
@@ -53,7 +53,7 @@ def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
 
 
 def peak_memory_mb(device: str) -> dict[str, float]:
-    """The most memory of this process so far, and of its tensors on the GPU."""
+    """Peak memory of this process in MB, and of its tensors on the GPU."""
     unit = 2**20 if sys.platform == "darwin" else 2**10
     peak = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
     if device.startswith("cuda"):

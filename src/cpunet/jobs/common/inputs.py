@@ -1,4 +1,4 @@
-"""Files named on a command line become prepared sets."""
+"""Read and prepare the input files of a command."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from cpunet.recipes.schema import Recipe
 _READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
 Energies = npt.NDArray[np.float64]
 
-MOST_KEV, LEAST_KEV = 20_000.0, 20.0  # most energies of gammas lie between
-LOW_KEV = 300.0  # below, noise hides shapes
+MOST_KEV, LEAST_KEV = 20_000.0, 20.0  # typical range of gamma energies
+LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
 LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
@@ -36,7 +36,7 @@ LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured 
 class InputFile:
     """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`.
 
-    With `insist` it is what it is given as, simulated or measured, whatever it looks like.
+    With `insist` its pulses are accepted as simulated or measured, whatever they look like.
     """
 
     path: Path
@@ -48,24 +48,24 @@ class InputFile:
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
-        """What is read, for `cpunet.outputs.refuse_inputs`."""
+        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return self.path, self.energy
 
     @property
     def options(self) -> dict[str, Any]:
-        """What was said of how to read it."""
+        """The reading options given by the user."""
         given = {name: getattr(self, name) for name in _READ_AS}
         return {name: value for name, value in given.items() if value is not None}
 
     def as_before(self, run_info: Mapping[str, Any], side: str) -> InputFile:
-        """The same file, read as a run read it if nothing else is said.
+        """The same file, with the reading options of a run as defaults.
 
         Parameters
         ----------
         run_info
-            The content of ``run.json``.
+            Content of ``run.json``.
         side
-            ``"sim"`` or ``"data"``.
+            Side of the file, ``"sim"`` or ``"data"``.
         """
         told = run_info.get(side)
         if self.options or not isinstance(told, dict):
@@ -89,10 +89,10 @@ class InputFile:
 
 @dataclass(frozen=True, eq=False)
 class InputSet:
-    """What was made of a file: prepared pulses, and the cuts if it was measured.
+    """The prepared pulses of a file, with the quality cuts if they are measured.
 
-    ``energies_kev`` holds the known energies of all its pulses, selected or not; ``read_as``
-    how the file was read, see `InputFile.options`.
+    ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
+    ``read_as`` the reading options, see `InputFile.options`.
     """
 
     prepared: Prepared
@@ -132,17 +132,17 @@ def load_measured(
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
-    """Look for energies that one of the sides does not have.
+    """Check that both sides have pulses of every selected energy.
 
     Returns
     -------
     list of str
-        What is to be told of the selection: lines that it takes away from the test.
+        Remarks on the selection: gamma lines that are no longer available for the test.
 
     Raises
     ------
     CpunetError
-        If a line or range that was chosen has pulses of one side only.
+        If a selected line or range has pulses on one side only.
     """
     for part in selection.parts:
         counts = [
@@ -229,7 +229,7 @@ def _load(
 
 
 def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:
-    """What energies there are, if none is selected: to choose others, or to calibrate them."""
+    """Range of the energies in the file, as a hint if none of them is selected."""
     energies = np.concatenate(seen) if seen else np.empty(0)
     if not len(energies) or selection.select(energies).any():
         return ""
@@ -247,7 +247,7 @@ def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str
 
 
 def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
-    """The calibration that lines in the amplitudes ask for, if no energy is known."""
+    """The calibration suggested by lines in the amplitudes, if no energy is known."""
     if any(map(len, seen)):
         return ""
     found = suggested_calibration(
@@ -257,6 +257,6 @@ def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
 
 
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:
-    """Tell whether simulated pulses end below their maximum, as measured ones do."""
+    """Whether simulated pulses end below their maximum, as measured ones do."""
     end = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
     return bool(np.median(end) < LEAST_SIMULATED_END)

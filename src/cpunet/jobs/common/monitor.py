@@ -1,4 +1,4 @@
-"""How a long job tells what it is doing; the command line draws bars from it."""
+"""Progress reports of long jobs, which the command line shows as progress bars."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ Advance = Callable[[int], None]
 
 
 class Monitor:
-    """Told of each stage of a job and of its progress; this one keeps quiet."""
+    """Receiver of the stages and the progress of a job; this base class is silent."""
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Enter a stage of `total` steps (None if not known); call what it gives with steps."""
+        """Enter a stage of `total` steps (None if unknown); yield a function to count them."""
         yield lambda _steps: None
 
     def state(self, text: str) -> None:
-        """Take what is to be shown beside the progress of the stage, until there is news."""
+        """Set the text beside the progress of the stage."""
 
     def note(self, message: str) -> None:
-        """Take a line of information for the user."""
+        """Give the user a line of information."""

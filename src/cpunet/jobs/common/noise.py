@@ -1,4 +1,4 @@
-"""The noise of the measured side: from raw traces, or from what windows show of it."""
+"""Noise of the measured pulses, from raw traces or else from prepared windows."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
-NOISE_TRACES = 4096  # from whose baselines the noise is measured
-FEWEST_EMPTY = 200  # of them, if those with remains are to be left out
+NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
+FEWEST_EMPTY = 200  # minimum number of these if traces with remains are left out
 
 
 def measured_noise(
@@ -26,18 +26,18 @@ def measured_noise(
     Parameters
     ----------
     data_file
-        The file, of raw traces if possible.
+        File of measured pulses, preferably raw traces.
     windows
-        Its prepared pulses, used if its traces have no long baselines.
+        Prepared pulses of the file, used if its traces have no long baselines.
     config
-        How they were prepared.
+        Preparation of the pulses.
     remains
-        Of earlier pulses under the traces: baselines with them are no noise.
+        Remains of earlier pulses under the traces; baselines with remains are left out.
 
     Returns
     -------
     tuple
-        The noise, and what is to be said about it, if anything.
+        Noise, and a remark on it or None.
 
     Raises
     ------
@@ -57,12 +57,13 @@ def noise_of_traces(
 ) -> BaselineNoise:
     """Measure the noise from the raw samples before the pulses.
 
-    Where traces have remains of earlier pulses, from those that lie as low as empty baselines.
+    If traces have remains of earlier pulses, only those at the level of empty baselines are
+    used.
 
     Raises
     ------
     CpunetError
-        If there are too few, or they are too short.
+        If the baselines are too few or too short.
     """
     block = next(iter(data_file.open().blocks(NOISE_TRACES)), None)
     if block is None:

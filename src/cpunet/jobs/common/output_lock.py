@@ -1,4 +1,4 @@
-"""One process at a time writes an output."""
+"""A lock that lets one process at a time write an output."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from cpunet.files import remove_partial
 
 @contextmanager
 def only_writer(target: Path) -> Iterator[None]:
-    """Hold the right to write `target`, until the block or the process ends.
+    """Hold the lock of `target` until the block or the process ends.
 
-    What a process that was killed has left of it is removed first.
-    The lock is a hidden file beside `target`, see `cpunet.file_locks`; without locks the last
-    output to be moved into place stays.
+    Temporary files of killed processes are removed first.
+    The lock is a hidden file beside `target`, see `cpunet.file_locks`.  On file systems without
+    locks, the last output to be moved into place wins.
 
     Raises
     ------
     CpunetError
-        If another process is writing it, or the folder cannot be written to.
+        If another process is writing `target`, or the folder is not writable.
     """
     path = target.parent / f".{target.name}.lock"
     try:
@@ -34,7 +34,7 @@ def only_writer(target: Path) -> Iterator[None]:
     try:
         locked = _lock(handle, path, target)
         try:
-            if locked:  # nobody else is at work, so these are of the dead
+            if locked:  # no other process is writing, so these belong to killed ones
                 remove_partial(target)
             yield
         finally:
@@ -52,6 +52,6 @@ def _lock(handle: int, path: Path, target: Path) -> bool:
         same = os.fstat(handle).st_ino == path.stat().st_ino
     except FileNotFoundError:
         same = False
-    if not same:  # its holder was done and removed it while this one was opening it
+    if not same:  # its holder finished and removed it while this process opened it
         raise CpunetError(busy)
     return True

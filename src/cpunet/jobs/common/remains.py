@@ -15,8 +15,8 @@ from cpunet.networks.response import ROOM_BEFORE
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
-BLOCK = 4096  # traces read at a time
-MOST_BLOCKS = 16  # that are searched for traces that have passed the cuts
+BLOCK = 4096  # traces per block
+MOST_BLOCKS = 16  # blocks searched for traces that passed the cuts
 
 
 def measured_remains(
@@ -27,7 +27,7 @@ def measured_remains(
     Returns
     -------
     tuple
-        The remains, or None and why they cannot be told.
+        Remains and None, or None and the reason why they cannot be estimated.
     """
     try:
         return Remains.of_traces(data_file.open().blocks(BLOCK), config), None
@@ -38,16 +38,16 @@ def measured_remains(
 def drawn_like(
     remains: Remains, data_file: InputFile, data: InputSet, config: PreparationConfig
 ) -> DrawnRemains:
-    """Remains to be drawn like those of the data behind their quality cuts.
+    """Distribution of remains like that of the data after their quality cuts.
 
     Parameters
     ----------
     remains
-        Of the file.
+        Remains measured in the file.
     data_file, data
-        The file, and what has passed the cuts.
+        Measured file, and its pulses that passed the cuts.
     config
-        The preparation.
+        Preparation of the pulses.
     """
     windows = data.prepared.pulses.waveforms
     begins = float(np.median(data.prepared.align_sample)) - config.samples_before - ROOM_BEFORE
@@ -78,7 +78,7 @@ def _rows(data_file: InputFile, data: InputSet) -> Iterator[Pulses]:
 def told_of(
     remains: Remains | None, drawn: DrawnRemains | None, reason: str | None
 ) -> dict[str, Any]:
-    """What ``run.json`` says of them; `drawn` may be drawn from even if none are sure."""
+    """Entry of ``run.json`` on remains; `drawn` can exist even if no remains are certain."""
     if remains is None or drawn is None:
         return {"missing": reason}
     return remains.describe() | {"drawn": drawn.describe()}

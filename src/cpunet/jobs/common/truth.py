@@ -1,4 +1,4 @@
-"""The known answer of a test stand, made comparable with translated pulses."""
+"""The true pulses of a virtual test stand, prepared for comparison with translated pulses."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArr
     Parameters
     ----------
     path, sim
-        As for `Responses`.
+        See `Responses`.
     config
-        The preparation of the run.
+        Preparation of the run.
 
     Returns
     -------
     array
-        Shape (pulses in use, window); NaN where a response cannot be prepared.
+        Prepared responses, shape (pulses in use, window); NaN where a response cannot be
+        prepared.
 
     Raises
     ------
@@ -45,14 +46,14 @@ def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArr
 
 
 class Responses:
-    """The noise-free traces of the simulated pulses in use, read block by block.
+    """Noise-free traces of the simulated pulses in use, read block by block.
 
     Parameters
     ----------
     path
-        ``.npz`` with ``response``, shape (pulses of the simulation file, samples).
+        ``.npz`` file with ``response``, shape (pulses of the simulation file, samples).
     sim
-        The simulated pulses in use.
+        Simulated pulses in use.
 
     Raises
     ------
@@ -88,7 +89,7 @@ class Responses:
         self._shape, self._dtype = shape, dtype
 
     def blocks(self, size: int = BLOCK) -> Iterator[FloatArray]:
-        """Float32 traces of `size` pulses in use at a time, in their order.
+        """Float32 traces of the pulses in use, in order, `size` at a time.
 
         Raises
         ------

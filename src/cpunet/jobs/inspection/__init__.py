@@ -1,1 +1,1 @@
-"""Look at one thing: a file, a run's response, a detector's pulses by place."""
+"""Inspection of a file, of the response of a run, or of a detector's pulses by position."""

@@ -1,4 +1,4 @@
-"""Runs and a detector in; a page that shows the pulses of every place in the crystal out."""
+"""Make a page that shows the pulses of every position in a crystal."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from cpunet.training.run_folder import read_info
 from cpunet.translation.translator import REN
 
 QUIET = Monitor()
-POINTS = 400  # places in the crystal, about
-FEWEST, MOST = 20, 600  # more would not fit a page of 5 MB
-NEIGHBOURS = 3  # measured pulses shown beside each place
+POINTS = 400  # approximate number of grid points in the crystal
+FEWEST, MOST = 20, 600  # more points would exceed a page of 5 MB
+NEIGHBOURS = 3  # measured pulses shown for each grid point
 
 
 def explore_runs(
@@ -46,42 +46,42 @@ def explore_runs(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Write a page on which to click a place in the crystal and see its pulses.
+    """Write a page that shows the pulses of any selected position in the crystal.
 
-    For each place of a grid: the pulse of a single deposit there as it is simulated, its
-    translation without noise (of several runs the mean, and a band from the lowest to the
-    highest), and, with `data`, the measured pulses of the training's energies most
-    like it.
+    For each grid point, the page shows the simulated pulse of a single deposit there, its
+    noise-free translation (for several runs the mean, and a band from the lowest to the
+    highest), and, with `data`, the nearest measured pulses of the training's energies.
 
     Parameters
     ----------
     runs
-        Folders of training runs with one preparation, such as several seeds.
+        Folders of training runs with the same preparation, such as several seeds.
     detector
-        Geometry, impurities, bias and temperature.
+        Geometry, impurities, bias and temperature of the detector.
     out
-        HTML file to write; it appears when all is done.
+        HTML file to write; it appears when it is complete.
     data
         Measured pulses, prepared and cut as in the training.
     points
-        Places in the crystal, about; `FEWEST` to `MOST`.
+        Approximate number of grid points, `FEWEST` to `MOST`.
     settings
-        Of the simulation; ``dt_ns`` follows the runs unless it is set, and must be theirs.
+        Settings of the simulation; ``dt_ns`` must be that of the runs, which is the default.
     device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
-        ``places``; ``shown``, those with pulses; ``left_out``, the others by reason;
-        ``measured``, ``unaligned`` and ``drawn``, pulses of the data read, of these without
-        a whole edge, and on the page; ``bytes`` of the page.
+        ``places``, the number of grid points; ``shown``, those with pulses; ``left_out``,
+        the others by reason; ``measured``, ``unaligned`` and ``drawn``, the numbers of data
+        pulses read, of those without a complete edge, and of those on the page; ``bytes``,
+        the size of the page.
 
     Raises
     ------
     CpunetError
-        If the page exists, runs, settings or data do not go together, the detector is not
-        depleted, or no place has a pulse.
+        If the page exists, runs, settings or data are inconsistent, the detector is not
+        depleted, or no grid point has a pulse.
     """
     refuse_existing(out, *runs, *([] if data is None else data.files), force=force)
     if not FEWEST <= points <= MOST:
@@ -117,7 +117,7 @@ def explore_runs(
 def _translated(
     places: Places, translators: Sequence[REN], runs: Sequence[Path], monitor: Monitor
 ) -> tuple[Places, FloatArray]:
-    """Translate by every run; places that one of them cannot do become missing."""
+    """Translate by every run; grid points where any run fails become missing."""
     missing = np.array(places.missing, object)
     kept = np.flatnonzero(missing == "")
     results = []
@@ -144,7 +144,7 @@ def _translated(
 def _neighbours(
     data: InputFile | None, peak: str, ren: REN, translated: FloatArray, monitor: Monitor
 ) -> dict[str, Any]:
-    """The measured pulses and the nearest of them, as fields of an `Exploration`."""
+    """Measured pulses and the nearest ones, as fields of an `Exploration`."""
     if data is None:
         return {}
     selection = parse_selection(peak, ren.recipe.peaks)
@@ -162,7 +162,7 @@ def _neighbours(
 
 
 def _load(runs: Sequence[Path], device: str) -> list[REN]:
-    """The translators of runs whose pulses can be drawn together."""
+    """Translators of the runs, which must have the same preparation and sampling."""
     if not runs:
         raise CpunetError("no run was given; name the folder of at least one")
     translators = [REN.load(run, device) for run in runs]
@@ -216,7 +216,7 @@ def _told(shown: Exploration) -> dict[str, Any]:
 
 
 def _notes(told: dict[str, Any], data: InputFile | None, peak: str) -> tuple[str, ...]:
-    """What the page says of places and pulses that it leaves out."""
+    """Notes of the page on grid points and pulses that are left out."""
     reasons = "; ".join(f"{n} {why}" for why, n in told["left_out"].items())
     notes = [
         f"{told['shown']} of {told['places']} places have a pulse"

@@ -1,4 +1,4 @@
-"""What is in a file of pulses or in a run folder."""
+"""Describe the content of a file of pulses or of a run folder."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ def describe(
     without_remains: Path | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Say what a file of pulses or the folder of a training run holds.
+    """Describe the content of a file of pulses or of the folder of a training run.
 
-    A file is read through once, in blocks, so that memory does not grow with it.
+    A file is read once, in blocks, so memory does not grow with its size.
 
     Parameters
     ----------
     path
-        The file, or a folder with ``run.json``.
+        File of pulses, or folder with ``run.json``.
     table, energy, kev_per_adc, dt_ns
-        As for `cpunet.pulses.reading.open_pulses`.
+        See `cpunet.pulses.reading.open_pulses`.
     peaks
         Gamma lines whose pulses are counted.
     preparation
-        How measured traces are prepared: with it, remains of earlier pulses are told of.
+        Preparation of measured traces, with which remains of earlier pulses are estimated.
     without_remains
-        LH5 file to write: the traces less their remains, with ``remains_kev`` and
-        ``remains_error_kev`` as columns.
+        LH5 file to write: the traces after subtraction of their remains, with columns
+        ``remains_kev`` and ``remains_error_kev``.
     force
         Whether to replace that file.
 
@@ -70,21 +70,21 @@ def describe(
         For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``.
         For a file of hits, what `describe_hits` gives.
         For a file with several tables of which none was chosen, ``kind`` (``"tables"``),
-        ``path`` and ``tables``: by name what `PulseSource.describe` gives, or
-        why it cannot be read.
-        For a file, ``kind`` (``"pulses"``), ``path``, what
-        `PulseSource.describe` gives, and: ``n_pulses``; ``energy_kev`` (lowest and
-        highest, None if not known) and ``n_without_energy``; ``peaks`` (pulses by
-        line); ``amplitudes``, if no energy is known: what calibration they look like;
-        ``samples`` (lowest and highest, of traces all finite);
-        ``n_not_finite`` and ``n_constant`` traces; of measured traces with `preparation`,
-        ``remains``: what `Remains.describe` gives, or why there is none.
+        ``path`` and ``tables``: the result of `PulseSource.describe` by name, or the reason
+        why a table cannot be read.
+        For a file, ``kind`` (``"pulses"``), ``path``, the result of `PulseSource.describe`,
+        and: ``n_pulses``; ``energy_kev`` (lowest and highest, None if unknown) and
+        ``n_without_energy``; ``peaks`` (number of pulses by line); ``amplitudes``, a
+        suggested calibration if no energy is known; ``samples`` (lowest and highest of the
+        finite traces); the numbers ``n_not_finite`` and ``n_constant`` of traces; for
+        measured traces with `preparation`, ``remains``: the result of `Remains.describe`, or
+        the reason why there is none.
 
     Raises
     ------
     CpunetError
-        If there is no such file, it cannot be read, or remains are to be taken off that
-        cannot be told.
+        If the file does not exist or cannot be read, or remains are to be subtracted but
+        cannot be estimated.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def describe(
 
 
 def _told_of(path: Path, tables: list[str], dt_ns: float | None) -> dict[str, Any]:
-    """What each table of a file holds, without reading its traces; or why it cannot be read."""
+    """Description of each table without reading its traces, or why it cannot be read."""
     told: dict[str, Any] = {}
     for table in tables:
         try:
@@ -138,7 +138,7 @@ def _told_of(path: Path, tables: list[str], dt_ns: float | None) -> dict[str, An
 
 
 def _side(source: PulseSource) -> Kind | None:
-    """Measured or simulated, by what the file says or its pulses look like."""
+    """Measured or simulated, according to the file or to the shape of its pulses."""
     found = recorded_side(source)
     if found is None:
         first = next(iter(source.blocks(LOOKED_AT)), None)
@@ -148,7 +148,7 @@ def _side(source: PulseSource) -> Kind | None:
 
 
 def _write_without(source: PulseSource, remains: Remains, out: Path, *, force: bool) -> None:
-    """Write the traces less their remains, with these as columns."""
+    """Write the traces after subtraction of their remains, with the remains as columns."""
     attrs = {MADE_BY: f"cpunet info {cpunet.__version__}", SIDE: "measured"}
     with PulseWriter(
         out, table="geds/raw", waveform_units="ADC", attrs=attrs, force=force
@@ -184,7 +184,7 @@ class _Counts:
         for name, count in zip(names, counts, strict=True):
             if name:
                 self.peaks[str(name)] += int(count)
-        # A sum is NaN or infinite if one sample is, without a mask as large as the block.
+        # A sum is NaN or infinite if any sample is; this needs no mask as large as the block.
         with np.errstate(invalid="ignore", over="ignore"):
             finite = np.isfinite(block.waveforms.sum(axis=1, dtype=np.float64))
         self.n_not_finite += int((~finite).sum())
@@ -194,7 +194,7 @@ class _Counts:
         self.samples = _range([*self.samples, *_extremes(low), *_extremes(high)])
 
     def _likely_calibration(self) -> dict[str, str]:
-        """Where no energy is known, what the lines in the amplitudes look like."""
+        """Calibration suggested by lines in the amplitudes, if no energy is known."""
         if self.n_without_energy < self.n_pulses or not self.amplitudes:
             return {}
         found = suggested_calibration(np.concatenate(self.amplitudes))

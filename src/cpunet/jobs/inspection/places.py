@@ -1,4 +1,4 @@
-"""The ideal pulses of places all over a crystal."""
+"""Ideal pulses of deposits on a grid of positions in a crystal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import Signals, hit_signals
 
 QUIET = Monitor()
-# Of each deposit, that of a double-escape event; it matters to self-repulsion only.
+# Energy of each deposit, that of a double-escape event; it matters only for self-repulsion.
 ENERGY_KEV = 1592.5
 IN_CONTACT = "in a contact or its dead layer"
 NO_FIELD = "in germanium without a field"
@@ -29,16 +29,16 @@ _AREA_POINTS = 400  # along the longer side
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Places in the crystal on the half-plane y = 0, and the prepared ideal pulses there.
+    """Grid points in the crystal on the half-plane y = 0, with their prepared ideal pulses.
 
     Parameters
     ----------
     r_mm, z_mm
-        Of shape ``(places,)``, on a grid `step_mm` wide.
+        Coordinates in mm, shape ``(points,)``, on a grid with spacing `step_mm`.
     missing
-        Why there is no pulse, ``""`` where there is one.
+        Reason why a grid point has no pulse, ``""`` where it has one.
     windows
-        One for each place with a pulse.
+        Prepared window of each grid point with a pulse.
     """
 
     r_mm: Values
@@ -49,12 +49,12 @@ class Places:
 
 
 def settings_at(dt_ns: float, settings: SimulationSettings | None) -> SimulationSettings:
-    """Settings of a simulation sampled every `dt_ns`; what was not set keeps its default.
+    """Settings of a simulation with sampling period `dt_ns`; others keep their defaults.
 
     Raises
     ------
     CpunetError
-        If they set another ``dt_ns``, or a step that does not divide it.
+        If `settings` contain another ``dt_ns``, or a time step that does not divide it.
     """
     values = settings.model_dump(exclude_unset=True) if settings else {}
     if not np.isclose(values.get("dt_ns", dt_ns), dt_ns):
@@ -67,14 +67,14 @@ def settings_at(dt_ns: float, settings: SimulationSettings | None) -> Simulation
 
 
 def crystal_grid(detector: Detector, points: int) -> tuple[Values, Values, float]:
-    """Places inside the crystal on a square grid: r, z and its step, all in mm.
+    """Points of a square grid inside the crystal: r, z and the spacing, all in mm.
 
     Parameters
     ----------
     detector
-        Its lithium layer counts as crystal, its ditch and bore do not.
+        Detector; its lithium layer is part of the crystal, its ditch and bore are not.
     points
-        How many, about.
+        Approximate number of grid points.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def place_pulses(
     points: int,
     monitor: Monitor = QUIET,
 ) -> Places:
-    """Simulate and prepare the pulse of a single deposit at each place of a grid.
+    """Simulate and prepare the pulse of a single deposit at each grid point.
 
     Raises
     ------

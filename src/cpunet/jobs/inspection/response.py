@@ -1,4 +1,4 @@
-"""What the training of a readout chain has learned, in terms of physics, and how true it is."""
+"""Describe fitted readout chains by physical quantities, and compare them with the truth."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ RESPONSE = FolderKind(
 )
 
 _DPI = 150
-_LEAST_SLOW = 0.005  # share of the charge below which a mean time says nothing
+_LEAST_SLOW = 0.005  # share of the charge below which a mean time is meaningless
 _FOREVER_US = 1e9  # instead of a decay
-_LONG_DRIFT_NS = 1000.0  # by which a charge may come earlier than all at once
+_LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
 
 @dataclass(frozen=True, eq=False)
 class _Learned:
-    """A run: its chain, its parameters with their errors, and where it comes from."""
+    """A run: its chain, its parameters with their errors, and its origin."""
 
     path: Path
     info: Mapping[str, Any]
@@ -78,37 +78,37 @@ def describe_responses(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Say in terms of physics which readout chains trainings have learned.
+    """Describe the fitted readout chains of trainings by physical quantities.
 
     Parameters
     ----------
     runs
-        Folders of trainings of a response, all of the same sampling and preparation.
+        Folders of trainings of a readout chain, all with the same sampling and preparation.
     truth
-        The chain of the data, if it is known (`stand_electronics`).
+        True chain of the data, if known (`stand_electronics`).
     out
-        Folder to make, with ``response.json`` and ``response.png``; None for none.
+        Folder to create, with ``response.json`` and ``response.png``; None for none.
     force
-        Replace an existing folder.
+        Whether to replace an existing folder.
     monitor
-        Told of what is kept of it.
+        Receiver of notes about files kept from it.
 
     Returns
     -------
     dict
-        The content of ``response.json``.  ``runs``: for each its ``values`` by name, the unit
-        at the end (shares of the full charge have none), and ``errors`` of those that are
-        parameters of the fit, and of the noise; all ``parameters`` and their
-        ``parameter_errors``.  ``mean`` and ``spread`` (standard deviation) of several runs.
-        ``truth``: the same ``values`` of the true chain, ``difference`` from it of the run or
-        the mean of the runs, and ``sigma``: that in units of the error or the spread,
-        whichever is larger.  What has no error has no sigma: runs share their data, so that
-        their spread alone says how well they agree, not how far they may be off.
+        Content of ``response.json``.  ``runs``: for each run its ``values`` by name, with the
+        unit as suffix (shares of the full charge have none), ``errors`` of the fitted
+        quantities and of the noise, and all ``parameters`` with their ``parameter_errors``.
+        ``mean`` and ``spread`` (standard deviation) of several runs.  ``truth``: the same
+        ``values`` of the true chain, the ``difference`` of the run or of the mean of the runs
+        from it, and ``sigma``, the difference divided by the error or the spread, whichever
+        is larger.  A quantity without an error has no sigma: the runs share their data, so
+        their spread shows how well they agree, not how accurate they are.
 
     Raises
     ------
     CpunetError
-        If a run holds no response, or runs or truth do not fit each other.
+        If a run has no readout chain, or runs or truth are incompatible.
     """
     if out is not None:
         refuse_existing(out, *runs, force=force)
@@ -153,12 +153,12 @@ def chain_of(run: Path) -> Chain:
 
 
 def stand_electronics(stand: Path) -> Electronics:
-    """The true electronics of a test stand, from its ``stand.json``.
+    """The true electronics of a virtual test stand, from its ``stand.json``.
 
     Raises
     ------
     CpunetError
-        If the folder is no stand.
+        If the folder is not a virtual test stand.
     """
     path = Path(stand) / "stand.json"
     try:
@@ -173,7 +173,7 @@ def stand_electronics(stand: Path) -> Electronics:
 
 
 def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
-    """The closed form of a learned response: a sum of exponentials, as a true chain is."""
+    """The closed form of a fitted chain: a sum of exponentials, like a true chain."""
     poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
     slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     fast = dict(
@@ -196,7 +196,7 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
 
 
 def true_chain_of(electronics: Electronics) -> Chain:
-    """A true chain in the same terms; its non-linearity is left out."""
+    """The closed form of a true chain; its nonlinearity is left out."""
     endless = electronics.model_dump() | {"decays": [{"fraction": 1, "tau_us": _FOREVER_US}]}
     frequency = density = None
     spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
@@ -208,7 +208,7 @@ def true_chain_of(electronics: Electronics) -> Chain:
     return Chain(
         f"true response ({electronics.name})",
         electronics.transfer,
-        # made anew, since a copy would keep the transfer function that was cached
+        # constructed anew, since a copy would keep the cached transfer function
         Electronics.model_validate(endless).transfer,
         frequency,
         density,
@@ -263,7 +263,7 @@ def _described(
 def _shape_numbers(
     response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
 ) -> Numbers:
-    """Numbers of a response that are no parameters of it."""
+    """Derived numbers of a response, which are not parameters of the fit."""
     slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
     return _slow(slow) | numbers
@@ -272,9 +272,9 @@ def _shape_numbers(
 def _with_noise(
     chain: Chain, network: ResponseGenerator, preparation: PreparationConfig
 ) -> Chain:
-    """Add the noise, from the units of prepared pulses to keV."""
+    """Add the noise, converted from the units of prepared pulses to keV."""
     noise = network.noise
-    # a full charge has this height where its tail has the level of prepared pulses
+    # height of a full charge whose tail has the level of prepared pulses
     tail = preparation.samples_after - 0.5 * preparation.tail_samples
     tail_ns = align_ns(chain, preparation) + tail * noise.dt_ns
     height = preparation.tail_level / float(chain.whole.step(tail_ns))
@@ -284,7 +284,7 @@ def _with_noise(
         chain.whole,
         chain.undecayed,
         np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float),
-        # both signs of a frequency
+        # both signs of the frequency
         2 * dt_us * noise.density / height**2,
     )
 
@@ -337,7 +337,7 @@ def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) 
 
 
 def _slow(shares: Mapping[float, float]) -> Numbers:
-    """Total share of what arrives late, and its mean time, of shares by time in ns."""
+    """Total late share and its mean time, from shares by time in ns."""
     total = sum(shares.values())
     numbers = {"slow_share": total}
     if abs(total) >= _LEAST_SLOW:
@@ -365,7 +365,7 @@ def _told(run: _Learned) -> dict[str, Any]:
 
 
 def _noise_error(run: _Learned) -> Numbers:
-    """Error of the noise in keV: of the baselines, and of the height of a full charge."""
+    """Error of the noise in keV, from the baselines and the height of a full charge."""
     measured, chain = run.fit.get("noise") or {}, run.chain
     error, rms = measured.get("rms_error"), measured.get("rms")
     if not error or not rms or chain.noise_kev2_per_mhz is None:
@@ -379,7 +379,7 @@ def _noise_error(run: _Learned) -> Numbers:
 def _true_parameters(electronics: Electronics) -> Numbers:
     poles = sorted(electronics.bandwidth_poles_ns, reverse=True)
     numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
-    # an overshoot is a slow part that takes away
+    # an overshoot is a slow part of negative sign
     parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
     numbers |= _slow({part.tau_ns: sign * part.fraction for part, sign in parts if part})
     if ring := electronics.ringing:
@@ -404,7 +404,7 @@ def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
 
 
 def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
-    """Truth, and how far the run or the mean of the runs is from it."""
+    """Truth, and the difference of the run or of the mean of the runs from it."""
     runs = told["runs"]
     found: Numbers = told.get("mean", runs[0]["values"])
     spread: Numbers = told.get("spread", {})

@@ -1,8 +1,9 @@
-"""Errors of what follows from a response: rise, missing charge, effective decay.
+"""Errors of derived numbers of a response: rise time, missing charge, effective decay.
 
-Parameters trade places: of two nearly equal poles neither is known, nor is a long decay beside
-a fast one.  Their rise and their common decay are.  So errors of such numbers follow from the
-parameters' whole covariance, along each of its axes.
+Parameters can be degenerate: two nearly equal poles are individually unconstrained, as is a
+long decay beside a fast one, while their rise time and common decay are well known.  Errors of
+derived numbers are therefore propagated with the full covariance of the parameters, along each
+of its axes.
 """
 
 from __future__ import annotations
@@ -23,22 +24,26 @@ def propagated(
     covariance: Sequence[Sequence[float]],
     numbers: Callable[[ElectronicsResponse], Numbers],
 ) -> Numbers:
-    """Standard deviations of numbers of a response.
+    r"""Standard deviations of derived numbers of a response.
+
+    .. math:: \sigma_f^2 = \sum_k \left[ \tfrac{1}{2} \left(
+        f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right) \right]^2
+
+    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`.
 
     Parameters
     ----------
     response
-        As it was fitted.
+        Fitted response.
     covariance
-        Of its parameters, in the order of its vector.
+        Covariance of its parameters, in the order of its vector.
     numbers
-        What is wanted of a response.
+        Function that returns the derived numbers of a response by name.
 
     Returns
     -------
     dict
-        Of each number, half its difference between both ends of each axis of the error
-        ellipsoid, added in squares; empty if the covariance is not that of the parameters.
+        Standard deviation by name; empty if the covariance does not match the parameters.
     """
     moved = copy.deepcopy(response)
     parameters = Parameters(moved)

@@ -1,1 +1,1 @@
-"""Many runs: ensembles over seeds and searches over settings, in several processes."""
+"""Studies with many runs: ensembles over seeds and searches over settings."""

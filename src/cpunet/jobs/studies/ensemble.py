@@ -1,4 +1,4 @@
-"""One training per seed, several at once; a seed that fails does not stop the others."""
+"""One training per seed, several in parallel; a failed seed does not stop the others."""
 
 from __future__ import annotations
 
@@ -57,41 +57,41 @@ def train_ensemble(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Train the seeds 0 … N - 1, each into a run folder of its own, and score them.
+    """Train the seeds 0 … N - 1, each in its own run folder, and score them.
 
     Parameters
     ----------
     sim, data, recipe, peak, device
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
     out
-        Folder of the run folders; whatever stops the job, it can be gone on with.
+        Folder of the run folders; an interrupted job can be resumed.
     seeds
-        How many.
+        Number of seeds.
     jobs
-        Processes at a time; by default as many as cores, or one on a GPU.
+        Number of parallel processes; by default one per core, or one on a GPU.
     threads
-        CPU threads of each; by default its share of the cores.
+        CPU threads per process; by default its share of the cores.
     validate
-        Score each seed on all peaks, without rivals.
+        Whether to score each seed on all peaks, without baseline methods.
     truth
-        As for `cpunet.jobs.validation.validate.validate_run`.
+        See `cpunet.jobs.validation.validate.validate_run`.
     resume
-        Go on: finished seeds are kept, unfinished and failed ones are trained, and there may
-        be more of them; all else must be as it was.
+        Whether to resume: finished seeds are kept, unfinished and failed ones are trained.
+        The number of seeds can be increased; everything else must be unchanged.
     force
-        Without `resume`, replace an existing ensemble.
+        Whether to replace an existing ensemble, without `resume`.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------
     dict
-        The content of ``ensemble.json``.
+        Content of ``ensemble.json``.
 
     Raises
     ------
     CpunetError
-        If the input cannot be used, the folder is in the way or was begun otherwise, or
+        If the input cannot be used, the folder exists or was begun with other settings, or
         every seed failed.
     """
     if seeds < 1:
@@ -124,7 +124,7 @@ def train_ensemble(
 
 
 class _Ensemble:
-    """``ensemble.json``: what is known of each seed."""
+    """``ensemble.json``: state and results of each seed."""
 
     def __init__(self, folder: Path, begun_with: dict[str, Any]) -> None:
         self.folder, self.path = folder, folder / ENSEMBLE
@@ -132,12 +132,12 @@ class _Ensemble:
         require_same(content["begun_with"], begun_with)
         self.content = content
         for seed, entry in [*content["seeds"].items()]:
-            if entry["state"] == FAILED:  # is tried again
+            if entry["state"] == FAILED:  # failed seeds are retried
                 del content["seeds"][seed]
         self._write()
 
     def add(self, outcome: Outcome) -> None:
-        """Record what became of a seed."""
+        """Record the outcome of a seed."""
         entry = {"state": FAILED, "reason": outcome.failure}
         if outcome.failure is None:
             entry = {"state": TRAINED} | outcome.result
@@ -145,7 +145,7 @@ class _Ensemble:
         self._write()
 
     def finish(self) -> dict[str, Any]:
-        """Take the scores together; return all."""
+        """Combine the scores; return the content of ``ensemble.json``."""
         seeds: dict[str, Any] = self.content["seeds"]
         seeds = dict(sorted(seeds.items(), key=lambda item: int(item[0])))
         failed = {int(s): e["reason"] for s, e in seeds.items() if e["state"] == FAILED}
@@ -176,7 +176,7 @@ class _Ensemble:
 
 @dataclass(frozen=True)
 class _Member:
-    """What each process does with a seed: train it, and score it."""
+    """The work of each process: train and score a seed."""
 
     sim: InputFile
     data: InputFile
@@ -188,12 +188,12 @@ class _Member:
     device: str
 
     def is_done(self, seed: int) -> bool:
-        """Whether nothing is left to do for a seed."""
+        """Whether a seed is finished."""
         run = member_folder(self.folder, seed)
         return (run / INFO).is_file() and (not self.validate or (run / METRICS).is_file())
 
     def __call__(self, link: Link) -> Callable[[int], dict[str, Any]]:
-        """Give what does a seed; returns its times and scores."""
+        """Return a function that processes a seed and returns its times and scores."""
         return lambda seed: self._do(seed, link)
 
     def _do(self, seed: int, link: Link) -> dict[str, Any]:
@@ -222,7 +222,7 @@ class _Member:
             )
 
     def _score(self, run: Path) -> dict[str, Any]:
-        # seconds to import, for each process: only if needed
+        # takes seconds to import in each process: only if needed
         from cpunet.jobs.validation.evaluation import evaluate
 
         clock = time.perf_counter()
@@ -232,7 +232,7 @@ class _Member:
             self.data,
             truth=self.truth,
             rivals=False,
-            seed=0,  # the same noise and bootstraps for all: they differ in the training alone
+            seed=0,  # the same noise and bootstraps for all: they differ only in the training
             device=self.device,
             monitor=QUIET,
         ).metrics
@@ -247,18 +247,18 @@ class _Member:
 
 
 class _Forwarding(Monitor):
-    """Sends steps of a training and warnings to the parent."""
+    """Forwards steps of a training and warnings to the parent process."""
 
     def __init__(self, link: Link, seed: int) -> None:
         self._link, self._seed = link, seed
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Pass the iterations of a CycleGAN on."""
+        """Forward the iterations of a CycleGAN."""
         yield self._link.advance if title == "Training" else lambda _steps: None
 
     def note(self, message: str) -> None:
-        """Pass warnings on; the rest is the same for all seeds."""
+        """Forward warnings; all other notes are the same for all seeds."""
         if message.startswith("warning"):
             self._link.note(f"seed {self._seed}: {message}")
 
@@ -267,9 +267,9 @@ class _Forwarding(Monitor):
 def _stage(
     monitor: Monitor, title: str, seeds: int, recipe: Recipe
 ) -> Iterator[Callable[[Outcome | int], None]]:
-    """Count the iterations of a CycleGAN; a matching ends when it will, so count seeds.
+    """Count the iterations of a CycleGAN, or seeds for a fit, whose length is unknown.
 
-    A seed that ends with fewer iterations, or failed, is made up to all of its own.
+    A seed that ends early or fails counts as complete.
     """
     training = recipe.training
     each = training.iterations if isinstance(training, TrainingConfig) else 1
@@ -297,6 +297,6 @@ def _draw(path: Path, metrics: list[dict[str, Any]]) -> None:
 
 
 def _remove_leavings(folder: Path) -> None:
-    """Remove what processes that were killed have written aside."""
+    """Remove temporary files of killed processes."""
     for path in folder.glob(".seed_*"):
         shutil.rmtree(path, ignore_errors=True)

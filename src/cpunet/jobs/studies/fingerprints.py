@@ -1,4 +1,4 @@
-"""The input of jobs of many processes, looked at once before any of them starts."""
+"""Check the input of a parallel job once, before its processes start."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 
-_TOLD = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
+_TOLD = ("dt_ns", "used", "sha256")  # not the name: a file can be moved
 
 
 def fingerprints(
     sim: InputFile, data: InputFile, recipe: Recipe, peak: str, monitor: Monitor
 ) -> dict[str, Any]:
-    """What the pulses of both files are known by when a job goes on.
+    """Fingerprints of the pulses of both files, which identify them when a job is resumed.
 
-    Bad input is told of here, in a line.  What is compiled on first use is compiled here and
-    kept, so that the processes do not all compile it at once.
+    Bad input raises an error here.  Code that is compiled on first use is compiled and cached
+    here, so that the processes do not all compile it at once.
 
     Raises
     ------

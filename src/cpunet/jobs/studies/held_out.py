@@ -1,4 +1,4 @@
-"""Pulses of the training's energies that a training does not see, and what they say of it."""
+"""Held-out pulses of the training's energies, and the score of a training on them."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 
 SHARE = 0.3  # of the pulses of each side
-FEWEST = 20  # of each side, below which a distribution says nothing
-MOST_LOST = 0.01  # of the translations: pulses that cannot be prepared would flatter the rest
-REPORTS = 8  # of a CycleGAN on its way
+FEWEST = 20  # minimum per side for a distribution
+MOST_LOST = 0.01  # of the translations: losing bad pulses would improve the score of the rest
+REPORTS = 8  # intermediate scores of a CycleGAN
 
 Report = Callable[[int, float], None]  # iterations done, score
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Prepared pulses of both sides, to fit and held out.
+    """Prepared pulses of both sides, split into pulses to fit and held-out ones.
 
     Parameters
     ----------
     fit
-        To train on.
+        Pulses for the training.
     sim, data
-        Held out.
+        Held-out pulses.
     values, nulls
-        Of the held-out data: parameters, and the distance of each to itself.
+        Parameters of the held-out data, and the null distance of each.
     """
 
     fit: Sides
@@ -67,7 +67,7 @@ class HeldOut:
     def of(
         cls, sim: InputSet, data: InputSet, data_file: InputFile, recipe: Recipe, seed: int
     ) -> Self:
-        """Part both sides at random.
+        """Split both sides at random.
 
         Raises
         ------
@@ -94,9 +94,12 @@ class HeldOut:
         return cls(fit, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
-        """Distance of the translated held-out pulses to data: 1 is that of data to data.
+        r"""Distance of the translated held-out pulses from the data; 1 is that of data to data.
 
-        The mean over the parameters of the Wasserstein distance over its null.
+        .. math:: \frac{1}{n} \sum_{p=1}^{n} \frac{W_1(p)}{\langle W_1(p) \rangle_0}
+
+        over the pulse-shape parameters :math:`p`, with the mean of the null in the
+        denominator.
 
         Raises
         ------
@@ -123,14 +126,15 @@ class HeldOut:
         return score
 
     def train(self, recipe: Recipe, seed: int, device: str, report: Report) -> REN:
-        """Train on what is not held out.
+        """Train on the pulses that are not held out.
 
         Parameters
         ----------
         recipe, seed, device
-            As for `cpunet.jobs.training.train.train_run`.
+            See `cpunet.jobs.training.train.train_run`.
         report
-            Given the score of a CycleGAN now and then; what it raises ends the training.
+            Function called with intermediate scores of a CycleGAN; its exceptions end the
+            training.
 
         Raises
         ------
@@ -164,14 +168,14 @@ class HeldOut:
     def _watch(
         self, begun: NetworkStart, device: str, report: Report
     ) -> Callable[[State], None]:
-        """Score the generator that would be kept, each time its training gets so far."""
+        """Callback that scores the generator at regular stages of its training."""
         config = begun.recipe.cyclegan.training
         told = 0
 
         def watch(state: State) -> None:
             nonlocal told
             part = state["iteration"] * REPORTS // config.iterations
-            if part in (told, REPORTS):  # the end has its own score
+            if part in (told, REPORTS):  # the final state is scored separately
                 return
             told = part
             with _random_state_kept(device):
@@ -199,6 +203,6 @@ class HeldOut:
 
 
 def _random_state_kept(device: str) -> AbstractContextManager[None]:
-    """What is drawn inside must not change the training."""
+    """Context manager that restores the random state, so that scores do not affect training."""
     cuda = [torch.device(device)] if device.startswith("cuda") else []
     return torch.random.fork_rng(devices=cuda)

@@ -1,7 +1,7 @@
-"""Settings of a recipe searched for on held-out pulses of the training's energies.
+"""Search for settings of a recipe, scored on held-out pulses of the training's energies.
 
-Optuna proposes settings by Gaussian processes; the trials are kept in a journal in the folder,
-so that a search can be gone on with, and shared by several machines.
+Optuna proposes settings with Gaussian processes.  The trials are stored in a journal in the
+folder, so a search can be resumed and shared by several machines.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ TUNE_KIND = FolderKind(
     known_by=TUNE,
     own=r"tune\.json|best\.yaml|trials\.csv|journal\.log.*",
 )
-STARTS = 8  # drawn at random before the Gaussian processes have something to go by
+STARTS = 8  # random trials before the first Gaussian process
 
 
 def tune_recipe(
@@ -86,35 +86,35 @@ def tune_recipe(
     Parameters
     ----------
     sim, data, peak, device
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
     out
         Folder of the search: ``best.yaml`` (a recipe), ``trials.csv``, ``tune.json``.
     recipe
-        With its search space; its own values are the first trial.
+        Recipe with its search space; its own values are the first trial.
     trials
-        In all, those already done included.
+        Total number of trials, including completed ones.
     seed
-        Of the split into pulses to fit and held out, of all trainings, and of the search.
+        Seed of the split into fitted and held-out pulses, of all trainings, and of the search.
     jobs, threads
-        As for `cpunet.jobs.studies.ensemble.train_ensemble`.
+        See `cpunet.jobs.studies.ensemble.train_ensemble`.
     resume
-        Go on with a search, or join it from another machine; all else must be as it was.
+        Whether to resume a search, or join it from another machine; all else must be unchanged.
     force
-        Without `resume`, replace an existing search.
+        Whether to replace an existing search, without `resume`.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------
     dict
-        ``best`` (number, score, values), ``first`` (score of the recipe as it is, or None),
-        ``trials`` (of all: number, state, score, values, reason), ``importances``.
+        ``best`` (number, score, values), ``first`` (score of the unchanged recipe, or None),
+        ``trials`` (number, state, score, values and reason of each), ``importances``.
 
     Raises
     ------
     CpunetError
-        If optuna is missing, the search space or the input cannot be used, the folder is in the
-        way or was begun otherwise, or no trial has a score.
+        If optuna is missing, the search space or the input cannot be used, the folder exists
+        or was begun with other settings, or no trial has a score.
     """
     require_optuna()
     if trials < 1:
@@ -151,7 +151,7 @@ def tune_recipe(
 
 @dataclass(frozen=True)
 class _Tuner:
-    """What each process does: trial after trial."""
+    """The work of each process: one trial after the other."""
 
     sim: InputFile
     data: InputFile
@@ -163,7 +163,7 @@ class _Tuner:
     trials: int
 
     def __call__(self, link: Link) -> Callable[[int], None]:
-        """Read the pulses once; give what does a trial."""
+        """Read the pulses once; return a function that runs a trial."""
         del link
         recipe, quiet = self.recipe, Monitor()
         selection = parse_selection(self.peak, recipe.peaks)
@@ -181,7 +181,7 @@ class _Tuner:
         before = len(study.trials)
         if len(counted(study)) >= self.trials:
             return  # another machine was faster
-        # a seed for each: a search that goes on must not begin the same numbers again
+        # a seed per trial: a resumed search must not repeat the same random numbers
         mixed = np.random.SeedSequence([self.seed, before, number]).generate_state(1)
         study.sampler = GPSampler(
             seed=int(mixed[0]), n_startup_trials=STARTS, warn_independent_sampling=False

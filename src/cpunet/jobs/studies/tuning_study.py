@@ -1,4 +1,4 @@
-"""Trials in a journal: begun, lost, taken up again, and what they have found."""
+"""The journal of trials: starting, losing and repeating them, and their results."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 JOURNAL = "journal.log"
 STUDY = "cpunet"
-WARM_UP = 4  # part of a training before which its scores say nothing
-# user attributes: of a trial, and of the study with a trial's number
+WARM_UP = 4  # a training is not pruned in its first quarter
+# user attributes of a trial, and of the study with the number of a trial
 WORKER, REASON, SECONDS, LOST = "worker", "reason", "seconds", "lost"
 
 
 def require_optuna() -> Any:
-    """Optuna, told to keep quiet.
+    """Import optuna with its log messages silenced.
 
     Raises
     ------
     CpunetError
-        If it is not installed.
+        If optuna is not installed.
     """
     try:
         import optuna
@@ -44,7 +44,7 @@ def require_optuna() -> Any:
 
 
 def open_study(folder: Path, recipe: Recipe) -> Study:
-    """The study in a folder, a new one if there is none."""
+    """Open the study in a folder, or create a new one."""
     optuna = require_optuna()
     from optuna.storages.journal import JournalFileBackend
 
@@ -60,7 +60,7 @@ def open_study(folder: Path, recipe: Recipe) -> Study:
 
 
 def queue_first(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> None:
-    """Queue the recipe as it is, and what processes that are gone have left undone."""
+    """Queue the unchanged recipe and the unfinished trials of processes that have ended."""
     from optuna.trial import TrialState
 
     if not study.trials:
@@ -73,12 +73,12 @@ def queue_first(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig])
 
 
 def this_worker() -> str:
-    """Name of this process: machine and number."""
+    """Name of this process: machine and process number."""
     return f"{socket.gethostname()}:{os.getpid()}"
 
 
 def lose(study: Study, trial: FrozenTrial | Trial) -> None:
-    """Have a trial that was cut off done again."""
+    """Mark an interrupted trial as lost and queue it again."""
     from optuna.trial import TrialState
 
     study.set_user_attr(f"{LOST} {trial.number}", True)
@@ -88,7 +88,7 @@ def lose(study: Study, trial: FrozenTrial | Trial) -> None:
 
 
 def _is_gone(worker: str) -> bool:
-    """Whether a process of this machine has ended; of others, nothing is known."""
+    """Whether a process of this machine has ended; False for other machines."""
     host, _, pid = worker.rpartition(":")
     if host != socket.gethostname():
         return False
@@ -102,7 +102,7 @@ def _is_gone(worker: str) -> bool:
 
 
 def _is_zombie(pid: int) -> bool:
-    """Whether a process has ended, but nobody has asked how, as in many containers."""
+    """Whether a process has ended without being waited for, as in many containers."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (OSError, IndexError):
@@ -110,7 +110,7 @@ def _is_zombie(pid: int) -> bool:
 
 
 def counted(study: Study) -> list[FrozenTrial]:
-    """Trials that were begun and not lost."""
+    """Trials that were started and not lost."""
     from optuna.trial import TrialState
 
     begun = (t for t in study.trials if t.state != TrialState.WAITING)
@@ -119,7 +119,7 @@ def counted(study: Study) -> list[FrozenTrial]:
 
 
 def suggested(trial: Trial, key: str, recipe: Recipe, config: SearchConfig) -> Any:
-    """The value of a setting that a trial is to try."""
+    """The value of a setting proposed for a trial."""
     if config.choices is not None:
         labels = [json.dumps(choice) for choice in config.choices]
         return json.loads(str(trial.suggest_categorical(key, labels)))
@@ -132,7 +132,7 @@ def suggested(trial: Trial, key: str, recipe: Recipe, config: SearchConfig) -> A
 
 
 def _labelled(values: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
-    """Values as the journal has them: choices as text, since they may be lists."""
+    """Values in the form of the journal: choices as text, since they can be lists."""
     return {k: v if space[k].choices is None else json.dumps(v) for k, v in values.items()}
 
 
@@ -141,7 +141,7 @@ def _plain(params: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict
 
 
 def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> dict[str, Any]:
-    """What the trials have found, ready for JSON; see `cpunet.jobs.studies.tune.tune_recipe`.
+    """Results of the trials, ready for JSON; see `cpunet.jobs.studies.tune.tune_recipe`.
 
     Raises
     ------
@@ -159,14 +159,14 @@ def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> di
         }
         for trial in counted(study)
     ]
-    scored = [row for row in rows if row["state"] == "complete"]  # pruned ones have scores too
+    scored = [row for row in rows if row["state"] == "complete"]  # pruned ones also have scores
     if not scored:
         reason = next((row["reason"] for row in rows if row["reason"]), "none was ended")
         raise CpunetError(f"none of {len(rows)} trials has a score; the first: {reason}")
     own = {key: value_of(recipe, key) for key in space}
     optuna = require_optuna()
     importances: dict[str, float] = {}
-    with suppress(ValueError, RuntimeError):  # too few trials, or all alike
+    with suppress(ValueError, RuntimeError):  # too few trials, or all equal
         importances = optuna.importance.get_param_importances(
             study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
         )

@@ -1,8 +1,8 @@
-"""Several processes that work off a list, and are gone when it is done or given up.
+"""A pool of processes that work through a list and end when it is finished or abandoned.
 
 Processes are spawned, not forked: torch and CUDA do not survive a fork.  SIGTERM asks a worker
-to stop; one whose work can be stopped between two steps does so there, any other at once.  A
-worker whose parent is gone stops by itself.
+to stop, between two steps if its work supports that, otherwise at once.  A worker whose parent
+has ended stops by itself.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.training.loop import StoppedError
 
-PATIENCE_S = 60.0  # for a checkpoint to be stored, before a worker is ended the hard way
-LOST_AFTER_S = 10.0  # from when on a process that is to end at once does so the hard way
-TELL_EVERY_S = 0.5  # between two messages of progress
+PATIENCE_S = 60.0  # time to store a checkpoint before a worker is killed
+LOST_AFTER_S = 10.0  # time after which a process that should end at once is killed
+TELL_EVERY_S = 0.5  # interval of progress messages
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an item: a result, or the reason why there is none."""
+    """Outcome of an item: a result, or the reason why there is none."""
 
     item: Any
     result: Any = None
@@ -44,7 +44,7 @@ class Outcome:
 
 
 class Link:
-    """A worker's line to its parent."""
+    """Connection of a worker to its parent."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
@@ -52,23 +52,23 @@ class Link:
         self._steps, self._told = 0, 0.0
 
     def advance(self, steps: int) -> None:
-        """Tell of steps done."""
+        """Report completed steps."""
         self._steps += steps
         if time.monotonic() - self._told >= TELL_EVERY_S:
             self._send("steps", self._steps)
             self._steps, self._told = 0, time.monotonic()
 
     def note(self, message: str) -> None:
-        """Tell the user something."""
+        """Send a note to the user."""
         self._send("note", message)
 
     def _send(self, kind: str, content: Any) -> None:
-        with suppress(OSError):  # a parent that is gone ends us in its own way
+        with suppress(OSError):  # a worker whose parent has ended is stopped elsewhere
             self._pipe.send((kind, content))
 
     @contextmanager
     def stoppable(self) -> Iterator[Callable[[], bool]]:
-        """Give what says whether to stop; from when it is first asked, nothing else stops."""
+        """Yield a function that tells whether to stop; once called, it alone stops the work."""
 
         def stop() -> bool:
             self._asked = True
@@ -82,9 +82,9 @@ class Link:
             sys.exit(128 + signal.SIGTERM)
 
     def take_signal(self, number: int, _frame: FrameType | None) -> None:
-        """Remember a wish to stop, or stop at once if nobody asks for it."""
+        """Record a request to stop, or stop at once if the work does not check for it."""
         if not self._asked or self._wanted:
-            # an exit that is raised within an import or a callback may be lost
+            # an exit raised within an import or a callback can be lost
             _later(LOST_AFTER_S, lambda: os._exit(128 + number))
             sys.exit(128 + number)
         self._wanted = True
@@ -95,12 +95,12 @@ Begin = Callable[[Link], Work]
 
 
 def default_jobs(device: str) -> int:
-    """Processes if the user names no number: one per core, or one on a GPU."""
+    """Default number of processes: one per core, or one on a GPU."""
     return 1 if device.startswith("cuda") else cores()
 
 
 def cores() -> int:
-    """CPU cores that this process may use."""
+    """Number of CPU cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -109,28 +109,28 @@ def cores() -> int:
 def work_off(
     begin: Begin, items: Iterable[Any], *, jobs: int, threads: int, monitor: Monitor
 ) -> Generator[Outcome | int, None, None]:
-    """Do all items in some processes; give each outcome as it comes, and steps done between.
+    """Process all items in parallel; yield outcomes as they arrive, and steps in between.
 
     Close the iterator to end the processes (`contextlib.closing`).
 
     Parameters
     ----------
     begin
-        Called once in each process with its `Link`; gives what is called with each item.
-        It, items and results must be picklable.
+        Function called once in each process with its `Link`; returns the function that is
+        called with each item.  It, items and results must be picklable.
     items
-        What to do, in this order.
+        Items to process, in this order.
     jobs
-        Processes at a time.
+        Number of parallel processes.
     threads
-        CPU threads of each.
+        CPU threads per process.
     monitor
-        Told of notes, each once.
+        Receiver of notes, each only once.
 
     Yields
     ------
     Outcome or int
-        An item's outcome, or a number of steps (`Link.advance`).  An item fails if its work
+        Outcome of an item, or a number of steps (`Link.advance`).  An item fails if its work
         raises a `CpunetError` or an `OSError`, or its process ends.
     """
     waiting, workers = deque(items), _Workers(begin, threads)
@@ -155,7 +155,7 @@ def work_off(
 
 
 class _Workers:
-    """Processes, and what each is busy with."""
+    """The processes and their current items."""
 
     def __init__(self, begin: Begin, threads: int) -> None:
         self.busy: dict[Connection, Any] = {}
@@ -163,7 +163,7 @@ class _Workers:
         self._processes: dict[Connection, BaseProcess] = {}
 
     def give(self, item: Any) -> None:
-        """Give an item to an idle process, or to a new one."""
+        """Assign an item to an idle process or to a new one."""
         idle = next((pipe for pipe in self._processes if pipe not in self.busy), None)
         pipe = self._start() if idle is None else idle
         try:
@@ -175,7 +175,7 @@ class _Workers:
         self.busy[pipe] = item
 
     def hear(self, pipe: Connection) -> tuple[str, Any]:
-        """A message: its kind and content."""
+        """Receive a message: its kind and content."""
         try:
             kind, content = pipe.recv()
         except (EOFError, OSError):
@@ -183,7 +183,7 @@ class _Workers:
         return str(kind), content
 
     def end(self) -> None:
-        """End all processes, those that keep a state with it stored."""
+        """End all processes; those with a state store it first."""
         for process in self._processes.values():
             process.terminate()
         until = time.monotonic() + PATIENCE_S
@@ -225,7 +225,7 @@ def _ending(code: int | None) -> str:
 
 @contextmanager
 def _inherited(threads: int) -> Iterator[None]:
-    """Have a process start with its share of threads, and deaf to Ctrl-C: we hear it."""
+    """Start a process with its share of threads; the parent alone handles Ctrl-C."""
     before = {name: os.environ.get(name) for name in _THREADS}
     main = threading.current_thread() is threading.main_thread()
     heard = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
@@ -243,7 +243,7 @@ def _inherited(threads: int) -> Iterator[None]:
 
 
 def _serve(pipe: Connection, begin: Begin, threads: int) -> None:
-    """Work until the parent has nothing more, or is gone."""
+    """Work until the parent has no more items or has ended."""
     link = Link(pipe)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, link.take_signal)
@@ -276,7 +276,7 @@ def _later(seconds: float, act: Callable[[], None]) -> None:
 
 
 def _tell_unraisable(unraisable: Any) -> None:
-    """As Python does it, but say nothing of an exit that was lost."""
+    """Like Python's hook, but silent about a lost exit."""
     if not isinstance(unraisable.exc_value, SystemExit):
         sys.__unraisablehook__(unraisable)
 

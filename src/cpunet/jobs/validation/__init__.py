@@ -1,1 +1,1 @@
-"""How well a run does: scores, baseline methods, figures, reports, comparisons."""
+"""Validation of a run: scores, baseline methods, figures, reports, comparisons."""

@@ -1,4 +1,4 @@
-"""Reports of several validations read, and put beside each other."""
+"""Read the reports of several validations and compare them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MOST_BYTES, plain_json
 
-REPORT = "report"  # folder of a demonstration that holds the metrics
+REPORT = "report"  # folder of a demonstration that contains the metrics
 
 
 def compare_reports(
@@ -32,22 +32,22 @@ def compare_reports(
     reports
         Folders of `cpunet validate` or `cpunet demo`, or their ``metrics.json``.
     method
-        Whose scores.
+        Method that is scored.
     out
-        Page to write, if any.
+        HTML page to write; None for none.
     force
-        Replace an existing page.
+        Whether to replace an existing page.
 
     Returns
     -------
     SideBySide
-        The runs under the names of their folders, made unique.
+        Scores of the runs, which have the names of their folders, made unique.
 
     Raises
     ------
     CpunetError
         If a report cannot be read, none has a score of `method`, or `out` exists or
-        cannot be written to.
+        is not writable.
     """
     if out is not None:
         if out.is_dir():
@@ -68,7 +68,7 @@ def read_metrics(file: Path) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If it cannot be read, or holds no scores of a validation.
+        If the file cannot be read or does not contain the scores of a validation.
     """
     try:
         content = plain_json(read_text(file, MOST_BYTES))
@@ -83,7 +83,7 @@ def read_metrics(file: Path) -> dict[str, Any]:
 
 
 def _metrics_file(report: Path) -> Path:
-    """Find the metrics that a folder or file stands for."""
+    """Path of the metrics of a report, given as folder or file."""
     if report.is_dir():
         for file in (report / METRICS, report / REPORT / METRICS):
             if file.is_file():
@@ -97,7 +97,7 @@ def _metrics_file(report: Path) -> Path:
 
 
 def _names(reports: Sequence[Path]) -> list[str]:
-    """Call each report by its folder, with as many folders above as make it unique."""
+    """Name each report by its folder, with as many parent folders as make it unique."""
     given = [report.resolve() for report in reports]
     parts = [(path if path.is_dir() else path.parent).parts for path in given]
     longest = max(map(len, parts), default=1)
@@ -106,5 +106,5 @@ def _names(reports: Sequence[Path]) -> list[str]:
         names = [str(Path(*part[-depth:])) for part in parts]
         if len(set(names)) == len(names):
             return names
-    # what is still the same is the same report twice
+    # names that are still equal refer to the same report
     return [f"{Path(name).name} ({i})" for i, name in enumerate(names, start=1)]

@@ -1,4 +1,4 @@
-"""Energies of a validation: peaks, the sidebands beside them, and ranges of continuum."""
+"""Energy ranges of a validation: peaks, their sidebands, and ranges of the continuum."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from cpunet.recipes.schema import Recipe
 
 Range = tuple[float, float]
 
-CUT_PEAK = "DEP"  # by which A/E cuts are set
+CUT_PEAK = "DEP"  # defines the A/E cuts
 
 
 def validation_selection(
     names: Sequence[str], recipe: Recipe, more_kev: Sequence[Range] = ()
 ) -> EnergySelection:
-    """Select named peaks and ranges, and with them all sidebands and continua."""
+    """Select named peaks and ranges, together with all sidebands and continua."""
     chosen = parse_selection(",".join(names), recipe.peaks)
     more = [band for _, bands in _lines(recipe).values() for band in bands]
     more += [*recipe.scores.continuum_kev.values(), *more_kev]
@@ -39,23 +39,23 @@ def range_survivals(
     ae_survival: Mapping[str, Any],
     recipe: Recipe,
 ) -> dict[str, Any]:
-    """Survival of lines, less what their sidebands say is under them, and of continua.
+    """A/E survival of gamma lines, sideband-subtracted, and of continua.
 
     Parameters
     ----------
     sim, data
         Prepared pulses of all energies of `validation_selection`.
     made
-        What the methods make of the simulated ones.
+        Translations of the simulated pulses by all methods.
     ae_survival
         Cuts by method, see `cpunet.jobs.validation.pulse_tests.survivals`.
     recipe
-        With the ranges.
+        Recipe with the energy ranges.
 
     Returns
     -------
     dict
-        As `survival_by_range`, or ``missing`` and the reason.
+        Result of `survival_by_range`, or ``missing`` with the reason.
     """
     cuts = ae_survival.get(CUT_PEAK, {}).get("cut")
     if not cuts:

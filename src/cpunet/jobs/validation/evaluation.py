@@ -1,4 +1,4 @@
-"""A run applied to simulated and measured pulses, and all that is compared of them."""
+"""Apply a run to simulated pulses and compare them with measured ones."""
 
 from __future__ import annotations
 
@@ -40,26 +40,26 @@ from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
 from cpunet.translation.translator import IREN, REN
 
-PAIRS = 200  # of pulses whose sums are translated, in the test of linearity
+PAIRS = 200  # of pulses in the test of linearity
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What figures and report are made of.
+    """Results of a validation, from which figures and report are made.
 
     Parameters
     ----------
     ren, iren
-        The run's translators.
+        Translators of the run.
     info, losses
-        Its provenance and its training records.
+        Provenance and training records of the run.
     sim, data
         Prepared pulses of both sides.
     sets, values, details
-        By peak: pulses; parameters by method; further comparisons.  The latter two are
-        there for peaks that are scored.
+        Pulses, parameters by method, and further comparisons, each by peak.  The latter two
+        exist only for scored peaks.
     metrics
-        The content of ``metrics.json``.
+        Content of ``metrics.json``.
     """
 
     ren: REN
@@ -86,7 +86,7 @@ def evaluate(
     monitor: Monitor,
     ae_range_kev: Range | None = None,
 ) -> Evaluation:
-    """Translate, compare and judge; see `cpunet.jobs.validation.validate.validate_run`.
+    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def _load_both(
 def _compared(
     run: Path, info: Mapping[str, Any], sim: InputSet, data: InputSet
 ) -> dict[str, Any]:
-    """What a reader must know of the comparison before its scores."""
+    """Description of the compared inputs, shown before the scores."""
     fit = info.get("fit") or {}
     compared = {
         "simulation": str(sim.path),
@@ -207,7 +207,7 @@ def _compared(
 
 
 def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
-    """How far the translation of a sum is from the sum of translations."""
+    """Difference between the translation of a sum and the sum of the translations."""
     found = linearity_residual(
         lambda windows: ren.apply(windows, noise=False),
         peak.raw.waveforms,
@@ -219,7 +219,7 @@ def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
 
 
 def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:
-    """Size of the noise by method, without the spectrum."""
+    """RMS of the noise by method, without the spectrum."""
     sizes, judged = ("n", "samples", "rms", "rms_std"), ("rms_ratio", "sigma")
     shown = (*sizes, *judged, "worst_band_sigma", "spectrum_sigma", "missing")
     return {
@@ -230,6 +230,6 @@ def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _summary(metrics: Mapping[str, Any]) -> list[str]:
-    """What is said first: the translation, peak by peak."""
+    """First lines of the report: verdict on the translation by peak."""
     found = summaries(metrics)
     return [of_peak["ren"] for of_peak in found.values() if "ren" in of_peak]

@@ -1,4 +1,4 @@
-"""Single figures of a validation as files for a paper or a talk."""
+"""Write single figures of a validation to files for a paper or a talk."""
 
 from __future__ import annotations
 
@@ -38,37 +38,37 @@ def draw_figures(
 ) -> list[Path]:
     """Draw figures by name into a folder.
 
-    They are drawn of what a validation stored in its report.  Of a run without a report, the
-    pulses are scored once and the results stored in its folder for the next time.
+    They are drawn from the results that a validation stored in its report.  For a run without
+    a report, the pulses are scored once and the results are stored in its folder.
 
     Parameters
     ----------
     folder
         Report folder of a validation, or folder of a training run.
     names
-        As the report calls them, ``"SEP drift_time"`` or ``"SEP_drift_time"``, or a part of
-        that: ``"single pulse"`` draws that of all peaks.
+        Names as in the report, ``"SEP drift_time"`` or ``"SEP_drift_time"``, or parts of
+        them: ``"single pulse"`` draws the single pulses of all peaks.
     sim, data
-        Simulated and measured pulses, for a run; not needed where results of a run are stored,
-        and for its losses.
+        Simulated and measured pulses, for a run; not needed if results of the run are stored,
+        nor for its losses.
     out
-        Folder, made if need be.
+        Output folder, created if missing.
     suffix
-        ``.png``, ``.pdf`` or ``.svg``.
+        File format: ``.png``, ``.pdf`` or ``.svg``.
     truth, rivals, seed, device, monitor
-        As for `cpunet.jobs.validation.validate.validate_run`.
+        See `cpunet.jobs.validation.validate.validate_run`.
     force
-        Replace existing files.
+        Whether to replace existing files.
 
     Returns
     -------
     list of Path
-        The files written.
+        Paths of the files written.
 
     Raises
     ------
     CpunetError
-        If a name fits no figure (the message lists them), pulses are needed and not given,
+        If a name matches no figure (the message lists them), required pulses are missing,
         or a file exists.
     """
     if suffix not in FORMATS:
@@ -84,9 +84,9 @@ def draw_figures(
 
     found = _stored(folder, names, sim, data)
     if found is None:
-        assert sim is not None  # or `_stored` had raised
+        assert sim is not None  # otherwise `_stored` would have raised
         assert data is not None
-        files_of(_possible(folder))  # before a minute goes into scores
+        files_of(_possible(folder))  # before scoring, which takes a minute
         info = read_info(folder)
         sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
         given = _Given(folder, sim, data, truth, rivals, seed)
@@ -100,7 +100,7 @@ def draw_figures(
 
 @dataclass(frozen=True)
 class _Given:
-    """A run, and what it is to be scored on."""
+    """A run and the inputs of its scores."""
 
     run: Path
     sim: InputFile
@@ -110,7 +110,7 @@ class _Given:
     seed: int
 
     def drawings(self, device: str, monitor: Monitor) -> dict[str, Drawing]:
-        """Take figures stored in the run's folder, if of the same; else score, and store."""
+        """Load figures stored in the run folder if their inputs agree; else score and store."""
         how = self.truth, self.rivals, self.seed
         made = made_of(self.run, self.sim, self.data, *how)
         store = self.run / STORE
@@ -138,12 +138,12 @@ class _Given:
 
 
 def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
-    """Names of figures that are asked for, or have a name that is as a part.
+    """Names of the figures that match the given names in full or in part.
 
     Raises
     ------
     CpunetError
-        If one fits none; the message lists them.
+        If a name matches no figure; the message lists them.
 
     Examples
     --------
@@ -165,7 +165,7 @@ def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
 def _stored(
     folder: Path, names: list[str], sim: InputFile | None, data: InputFile | None
 ) -> dict[str, Drawing] | None:
-    """Figures that need no scoring; None if pulses are given to be scored."""
+    """Figures that need no scoring; None if pulses are given for scoring."""
     if made_here(folder, REPORT):
         if sim is not None or data is not None:
             raise CpunetError(
@@ -193,6 +193,6 @@ def _stored(
 
 
 def _possible(run: Path) -> list[str]:
-    """Names of the figures that a validation of a run may have."""
+    """Names of the figures that a validation of a run can have."""
     peaks = [*read_recipe(run).peaks, str(read_info(run)["peak"])]
     return figure_names(dict.fromkeys(peaks))

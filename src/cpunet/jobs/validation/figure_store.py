@@ -1,4 +1,4 @@
-"""Figures as numbers in a file, to be drawn again without scoring again."""
+"""Store the numbers behind figures in a file, to redraw figures without scoring again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cpunet.jobs.validation.figures import Drawing
 
 STORE = "figures.npz"
 _INDEX = "index"
-_ARRAY = "array"  # in the index, stands for an array of the file
+_ARRAY = "array"  # in the index: placeholder for an array of the file
 
 Made = dict[str, Any]
 
@@ -31,7 +31,7 @@ def made_of(
     rivals: bool,
     seed: int,
 ) -> Made:
-    """What figures depend on, for `write_drawings`."""
+    """Inputs of the figures, for `write_drawings`."""
     return {
         "run": run_print(run),
         "sim": source_print(sim),
@@ -43,7 +43,7 @@ def made_of(
 
 
 def write_drawings(file: Path, drawings: Mapping[str, Drawing], made: Made) -> None:
-    """Store figures by name, and what they were made of."""
+    """Store figures by name, with their inputs."""
     arrays: dict[str, npt.NDArray[Any]] = {}
     content = {
         name: {"kind": drawing.kind, "values": _told(drawing.values, arrays)}
@@ -55,7 +55,7 @@ def write_drawings(file: Path, drawings: Mapping[str, Drawing], made: Made) -> N
 
 
 def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
-    """Read stored figures by name, and what they were made of.
+    """Read stored figures by name, and their inputs.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
 
 
 def _told(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
-    """What JSON can hold of a value; its arrays are put aside."""
+    """JSON-ready form of a value; its arrays are moved to `arrays`."""
     if isinstance(value, Mapping):
         return {str(key): _told(part, arrays) for key, part in value.items()}
     if isinstance(value, list | tuple):

@@ -1,6 +1,6 @@
-"""The figures of a validation: what each is drawn of, and who draws it.
+"""The figures of a validation: their numbers, and the functions that draw them.
 
-A `Drawing` holds numbers and text alone, so that figures can be stored and drawn again without
+A `Drawing` contains only numbers and text, so figures can be stored and redrawn without
 scoring again, see `cpunet.jobs.validation.figure_store`.
 """
 
@@ -36,9 +36,9 @@ from cpunet.pulses.parameters import PARAMETERS
 from cpunet.training.loop import Record
 from cpunet.translation.translator import IREN, REN
 
-# methods in the figures; more lines could not be told apart
+# methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
-SINGLE = ("raw", "rc", "ren", "truth")  # in the figure of a single pulse
+SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
 CYCLES = ("forward cycle", "backward cycle")
@@ -60,21 +60,21 @@ class Drawing:
     Parameters
     ----------
     kind
-        Who draws it: a key of `_DRAW`.
+        Kind of figure, a key of `_DRAW`.
     values
-        Its arguments: numbers, text, arrays, and lists and mappings of these.
+        Arguments of its function: numbers, text, arrays, and lists and mappings of them.
     """
 
     kind: str
     values: Mapping[str, Any]
 
     def draw(self) -> Figure:
-        """Make the figure."""
+        """Draw the figure."""
         return _DRAW[self.kind](**self.values)
 
 
 def figure_names(peaks: Iterable[str]) -> list[str]:
-    """Names of all figures that a validation of these peaks may have."""
+    """Names of all figures that a validation of these peaks can have."""
     names = [f"{peak} {figure}" for peak in peaks for figure in (*CYCLES, *OF_PEAKS)]
     return [SPECTRUM, AE_ENERGY, *names, ROC, LOSSES]
 
@@ -148,14 +148,14 @@ def _histograms(
 
 def _mean_pulse(peak: PeakSets) -> Drawing:
     pulses = peak.by_method()
-    # one set of pulses at a time
+    # one dataset at a time
     sets = ((method, pulses[method].waveforms) for method in pulses if method in DRAWN)
     means = {method: MeanPulse.of(one)._asdict() for method, one in sets if len(one)}
     return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
 
 
 def _drawable(peak: PeakSets) -> int | None:
-    """The first simulated event that every method has, with an edge."""
+    """The first simulated event with an edge in every method."""
     for row in peak.known_to_all():
         windows = peak.without_noise(np.array([row])).values()
         edges = (align_half_maximum(w, 100, 150) for w in windows)

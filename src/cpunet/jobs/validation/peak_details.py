@@ -1,4 +1,4 @@
-"""What an analyst looks at beyond distributions: slices of rise time, A/E, two dimensions."""
+"""Comparisons beyond distributions: slices of rise time, A/E, two dimensions."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from cpunet.jobs.validation.scoring import ByMethod
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150
-# of the two-dimensional comparison, what tables show: counts are for the figure
+# entries of the two-dimensional comparison in tables; counts are only for the figure
 _TWO_DIMENSIONAL = ("iou", "iou_std", "missing")
 
 
 @dataclass(frozen=True, eq=False)
 class PeakDetails:
-    """Comparisons of one peak that have figures of their own.
+    """Further comparisons of one peak, each with a figure.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class PeakDetails:
         Superpulses by method; empty if they cannot be made.
     slice_table, ae_against_time, plane
         Results of `slice_table`, `ae_against_drift_time` and `two_dimensional`, or
-        ``missing`` and the reason.
+        ``missing`` with the reason.
     """
 
     slices: Mapping[str, Slices] = field(default_factory=dict)
@@ -53,12 +53,12 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     Parameters
     ----------
     peak
-        Its pulses.
+        Pulses of the peak.
     values
-        Their parameters by method, see `cpunet.jobs.validation.scoring.score_peak`; methods
+        Parameters by method, see `cpunet.jobs.validation.scoring.score_peak`; methods
         without noise are left out.
     bootstraps, seed
-        Of the errors.
+        Number and seed of the bootstraps for the errors.
     """
     noisy = {m: v for m, v in values.items() if not m.endswith(NO_NOISE)}
     amplitude = {m: v["current_amplitude"] for m, v in noisy.items()}

@@ -1,4 +1,4 @@
-"""The pulses of one peak by method, as a validation compares them."""
+"""The pulses of one peak by method, for a validation."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from cpunet.pulses.parameters import Values
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 
-FEWEST = 10  # pulses, below which a distribution says nothing
+FEWEST = 10  # minimum number of pulses of a distribution
 
 Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class PeakSets:
-    """The pulses of one peak: rows of the simulated and of the measured ones.
+    """The simulated and measured pulses of one peak, as rows of the whole datasets.
 
     Parameters
     ----------
     name
-        A peak of the recipe, or a range in keV.
+        Name of a peak of the recipe, or a range in keV.
     simulated, measured
         All prepared pulses of the two sides.
     sim_rows, data_rows
-        Those of the peak.
+        Rows of the pulses of the peak.
     made
-        What all methods make of the simulated pulses.
+        Translations of the simulated pulses by all methods.
     """
 
     name: str
@@ -63,9 +63,9 @@ class PeakSets:
         return self.simulated.dt_ns
 
     def by_method(self) -> WhenAsked[Pulses]:
-        """Pulses with noise, from the simplest method to the known answer, the data's first.
+        """Pulses with noise by method: the data, then from the simplest method to the truth.
 
-        They are copied from the whole set each time they are asked for.
+        They are copied from the whole dataset on every access.
         """
         makers: dict[str, Callable[[], Pulses]] = {
             "data": lambda: self.data,
@@ -78,7 +78,7 @@ class PeakSets:
         return WhenAsked(makers)
 
     def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
-        """Parameters of the rivals' and of the truth's pulses without noise."""
+        """Parameters of the noise-free pulses of the baseline methods and of the truth."""
         found = {}
         for name, kept in self.made.clean.items():
             rows = self._whole(kept.whole)
@@ -87,16 +87,16 @@ class PeakSets:
         return found
 
     def known_to_all(self) -> Rows:
-        """Places within the peak of the events that every method has without noise."""
+        """Indices within the peak of the events that all methods have without noise."""
         whole = [kept.whole[self.sim_rows] for kept in self.made.clean.values()]
         return np.flatnonzero(np.logical_and.reduce(whole))
 
     def without_noise(self, places: Rows) -> dict[str, FloatArray]:
-        """Windows by method of some events, the truth among them if it is known."""
+        """Noise-free windows of some events by method, with the truth if it is known."""
         return self.made.without_noise(self.sim_rows[places])
 
     def paired_scores(self) -> dict[str, PairedScores] | None:
-        """Scores of single pulses by method; None if the truth is not known."""
+        """Paired scores by method; None if the truth is unknown."""
         rows = self.sim_rows[self.known_to_all()]
         scores = {
             name: scores_of_squares(kept.squares[rows])
@@ -106,7 +106,7 @@ class PeakSets:
         return scores or None
 
     def not_prepared(self) -> dict[str, int]:
-        """How many translated pulses cannot be prepared as data are, by method."""
+        """Number of translated pulses that cannot be prepared like data, by method."""
         whole = dict(self.made.whole)
         for name, kept in self.made.clean.items():
             if name not in ("raw", "ren"):
@@ -115,7 +115,7 @@ class PeakSets:
         return {name: count for name, count in counts.items() if count}
 
     def missing(self) -> str | None:
-        """Say what keeps the peak from being scored, if anything does."""
+        """Reason why the peak cannot be scored; None if it can."""
         sides = (("simulated", self.sim_rows), ("measured", self.data_rows))
         few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < FEWEST]
         return f"{' and '.join(few)} pulses (at least {FEWEST} are needed)" if few else None
@@ -130,18 +130,18 @@ class PeakSets:
 def peak_sets(
     name: str, recipe: Recipe, sim_set: InputSet, data_set: InputSet, made: Translations
 ) -> PeakSets:
-    """Choose the pulses of one peak, or of a range of energies, from both sets.
+    """Select the pulses of one peak, or of a range of energies, from both datasets.
 
     Parameters
     ----------
     name
-        A peak of the recipe, or a range in keV.
+        Name of a peak of the recipe, or a range in keV.
     recipe
-        The run's settings.
+        Recipe of the run.
     sim_set, data_set
-        Prepared pulses.
+        Prepared pulses of both sides.
     made
-        What the methods make of the simulated ones.
+        Translations of the simulated pulses by all methods.
     """
     selection = parse_selection(name, recipe.peaks)
     sim, data = sim_set.prepared.pulses, data_set.prepared.pulses

@@ -1,4 +1,4 @@
-"""What a validation asks beyond distributions: told apart by a classifier, kept by A/E."""
+"""Tests of a validation beyond distributions: the classifier test and the A/E survival."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values
 
-TESTED = 1000  # pulses a side: resolves an AUC to 0.013
+TESTED = 1000  # pulses per side: resolves an AUC to 0.013
 
 ByMethod = Mapping[str, Mapping[str, Values]]
 
 
 def told_apart(pulses: Mapping[str, Pulses], values: ByMethod, seed: int) -> dict[str, Any]:
-    """Classifier test of each method's pulses against the data's, of one peak.
+    """Classifier test between each method and the data, for one peak.
 
     Parameters
     ----------
     pulses
-        Prepared pulses with noise by method, those of the ``"data"`` among them.
+        Prepared pulses with noise by method, including ``"data"``.
     values
-        Their pulse-shape parameters.
+        Pulse-shape parameters of the pulses.
     seed
-        Of the folds.
+        Seed of the folds.
 
     Returns
     -------
     dict
-        The fields of `cpunet.analysis.two_sample.TwoSample` by method, or ``missing`` and
-        the reason.
+        Fields of `cpunet.analysis.two_sample.TwoSample` by method, or ``missing`` with the
+        reason.
     """
     tested: dict[str, Any] = {}
     data = pulses["data"].waveforms
@@ -61,15 +61,15 @@ def survivals(values: Mapping[str, ByMethod], seed: int) -> dict[str, Any]:
     Parameters
     ----------
     values
-        Parameters by peak and method, ``"data"`` among them; peaks that are not scored are
-        empty.
+        Parameters by peak and method, including ``"data"``; empty for peaks that are not
+        scored.
     seed
-        Of the errors.
+        Seed of the bootstraps for the errors.
 
     Returns
     -------
     dict
-        As `cpunet.analysis.a_over_e.survival_table` gives it, or ``missing`` and the reason.
+        Result of `cpunet.analysis.a_over_e.survival_table`, or ``missing`` with the reason.
     """
     amplitudes = {
         peak: {method: v["current_amplitude"] for method, v in by_method.items()}

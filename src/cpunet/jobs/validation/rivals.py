@@ -1,4 +1,4 @@
-"""The rival methods of a validation: fitted to the training's peak."""
+"""The baseline methods of a validation, fitted to the peak of the training."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class FittedRivals:
-    """The rivals, and the noise that is added to what they and the truth say.
+    """The fitted baseline methods, and the noise that is added to them and to the truth.
 
     Parameters
     ----------
     methods
-        Fitted rivals by name.
+        Fitted baseline methods by name.
     noise
-        Drawn from the data's baselines, with remains of earlier pulses if these have some; None
-        if there are none to draw from.
+        Noise drawn from the baselines of the data, with remains of earlier pulses if the data
+        have any; None if there are no baselines.
     missing
-        Why a method, or the noise, is not there.
+        Reasons why methods or the noise are missing, by name.
     """
 
     methods: dict[str, Rival] = field(default_factory=dict)
@@ -52,32 +52,32 @@ def fit_rivals(
     fitted: bool,
     monitor: Monitor,
 ) -> FittedRivals:
-    """Fit every rival to unpaired pulses.
+    """Fit every baseline method to unpaired pulses.
 
     Parameters
     ----------
     sim, data
-        All prepared pulses.
+        All prepared pulses of both sides.
     data_file
-        The measured file, for its baselines.
+        Measured file, for its baselines.
     fit_on
-        Energies that the rivals are fitted to: those of the training.
+        Energies on which the methods are fitted: those of the training.
     recipe
-        The run's settings.
+        Recipe of the run.
     remains
-        Of earlier pulses, as the run has learned them.
+        Remains of earlier pulses as learned by the run.
     fitted
-        Whether there are to be any; there is noise in any case, for the truth.
+        Whether to fit the methods; the noise is measured in any case, for the truth.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------
     FittedRivals
-        A rival that cannot be fitted is missing, with its reason.
+        Methods that cannot be fitted are listed as missing, with the reason.
     """
     config, result = recipe.preparation, FittedRivals()
-    # all rivals here; the untranslated simulation stands in the scores anyway
+    # all but the untranslated simulation, which is scored anyway
     kinds = {name: kind for name, kind in RIVALS.items() if fitted and name != "raw"}
     there = remains is not None and remains.law.rate_khz > 0
     found = measured_remains(data_file, config)[0] if there else None
@@ -106,7 +106,7 @@ def fit_rivals(
 
 
 def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T | None:
-    """What is made, or None and the reason kept."""
+    """The result of `make`, or None, with the reason recorded in `missing`."""
     try:
         return make()
     except CpunetError as error:

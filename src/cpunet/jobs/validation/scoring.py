@@ -1,4 +1,4 @@
-"""Scores of one peak: distributions, single pulses, noise, and what tells them apart."""
+"""Scores of one peak: distributions, single pulses, noise and the classifier test."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     Parameters
     ----------
     peak
-        Its pulses.
+        Pulses of the peak.
     recipe
-        The run's settings.
+        Recipe of the run.
     seed
-        Of bootstraps and folds.
+        Seed of bootstraps and folds.
 
     Returns
     -------
     values
-        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, but only those
+        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, or only those
         of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
     scores
-        The peak's entry in ``metrics.json``, ready for JSON.
+        Entry of the peak in ``metrics.json``, ready for JSON.
     """
     scores: dict[str, Any] = {
         "n_sim": len(peak.sim_rows),

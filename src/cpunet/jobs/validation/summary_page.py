@@ -14,37 +14,37 @@ from cpunet.files import written_aside
 from cpunet.jobs.validation.compare import read_metrics
 from cpunet.outputs import refuse_existing
 
-REPORT = "report"  # name of a folder that says nothing about what is in it
+REPORT = "report"  # folder name that does not identify its content
 PAGE = "report.html"
 
 
 def summarise_reports(
     reports: Sequence[Path], out: Path, *, missing_ok: bool = False, force: bool = False
 ) -> list[Entry]:
-    """Write one page over the reports of many detectors and periods.
+    """Write a summary page of the reports of many detectors and periods.
 
     Parameters
     ----------
     reports
         Folders of `cpunet validate`, as ``DETECTOR/PERIOD/report`` or
-        ``DETECTOR/PERIOD``; the folders' names say whose they are.
+        ``DETECTOR/PERIOD``; the folder names identify detector and period.
     out
-        Page to write. It links to the reports.
+        Page to write, with links to the reports.
     missing_ok
-        List reports that are not there, or not finished, instead of raising.
+        Whether to list missing or unfinished reports instead of raising.
     force
-        Replace an existing page.
+        Whether to replace an existing page.
 
     Returns
     -------
     list of Entry
-        One for each report, in their order.
+        Entries of the reports, in their order.
 
     Raises
     ------
     CpunetError
-        If a report is missing or cannot be read, two are of the same detector and
-        period, none is there, or `out` exists or cannot be written to.
+        If a report is missing or cannot be read, two reports have the same detector and
+        period, no report exists, or `out` exists or is not writable.
     """
     if out.is_dir():
         raise CpunetError(f"{out}: is a folder; give the name of a page, as index.html")
@@ -69,7 +69,7 @@ def summarise_reports(
 
 
 def detector_and_period(report: Path) -> tuple[str, str]:
-    """Take the names of a detector and a period from a report's folder.
+    """Names of detector and period from the folder of a report.
 
     Examples
     --------
@@ -78,7 +78,7 @@ def detector_and_period(report: Path) -> tuple[str, str]:
     >>> detector_and_period(Path("results/V01/p03"))
     ('V01', 'p03')
     """
-    # not resolved: a link has the name that was given to it
+    # not resolved: the name of a link counts
     folders = Path(os.path.abspath(report)).parts  # noqa: PTH100 (takes out "..", too)
     if folders[-1] == REPORT:
         folders = folders[:-1]

@@ -1,7 +1,8 @@
-"""All simulated pulses through every method, once: windows with noise, numbers without.
+"""Translate all simulated pulses by every method once, with and without noise.
 
-Of pulses without noise a validation needs a few numbers each, and the samples of some twenty
-events.  Those are translated again where they are shown; to keep all would double the memory.
+Of noise-free pulses a validation needs only a few numbers each, and the samples of about
+twenty events.  These events are translated again for display; keeping all samples would
+double the memory.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class NoiseFree:
-    """What is kept of the pulses of one method without noise.
+    """Numbers of the noise-free pulses of one method.
 
     Parameters
     ----------
     parameters
-        Those of `pulse_parameters`, row by row; NaN where a pulse cannot be prepared.
+        Result of `pulse_parameters`, row by row; NaN where a pulse cannot be prepared.
     whole
-        Which pulses could be prepared.
+        Mask of the pulses that could be prepared.
     squares
-        Differences from the truth, see `pair_squares`; None if that is not known.
+        Squared differences from the truth, see `pair_squares`; None if it is unknown.
     """
 
     parameters: Mapping[str, Values]
@@ -50,19 +51,19 @@ class NoiseFree:
 
 @dataclass(frozen=True, eq=False)
 class Translations:
-    """What all methods make of the simulated pulses, row by row.
+    """Translations of the simulated pulses by all methods, row by row.
 
     Parameters
     ----------
     noisy
-        Windows by method, rivals, ``ren`` and ``truth``; rows that cannot be prepared are
-        NaN.  Without the data's noise ``ren`` only.
+        Windows with noise by method: baseline methods, ``ren`` and ``truth``, or only ``ren``
+        if the noise of the data is unknown.  Rows that cannot be prepared are NaN.
     whole
-        By the same names, which rows could be prepared.
+        Mask of the prepared rows, by method.
     clean
-        The same pulses without noise, and ``raw``.
+        Numbers of the same pulses without noise, and of ``raw``.
     truth
-        Windows of the noise-free truth, if it is known.
+        Windows of the noise-free truth, if known.
     """
 
     ren: REN
@@ -74,7 +75,7 @@ class Translations:
     truth: FloatArray | None = None
 
     def without_noise(self, rows: npt.NDArray[np.int64]) -> dict[str, FloatArray]:
-        """Windows of some pulses by method, the truth among them if it is known."""
+        """Noise-free windows of some pulses by method, with the truth if it is known."""
         pulses, config = self.simulated[rows], self.ren.recipe.preparation
         found = {"raw": pulses.waveforms}
         for name, rival in self.rivals.methods.items():
@@ -96,28 +97,28 @@ def translate_all(
     Parameters
     ----------
     ren, rivals
-        The methods.
+        REN and baseline methods.
     sim
-        Prepared pulses.
+        Prepared simulated pulses.
     responses
-        True noise-free records of these, if known.
+        True noise-free records of these pulses, if known.
     seed
-        Of the noise, the same for all methods.
+        Seed of the noise, common to all methods.
     monitor
-        Told of the progress.
+        Receiver of the progress.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
     others = [*rivals.methods, *(["truth"] if responses is not None else [])]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
-        for name in (*rivals.methods, "ren", "truth")  # from the simplest to the answer
+        for name in (*rivals.methods, "ren", "truth")  # from the simplest to the truth
         if name == "ren" or (name in others and rivals.noise is not None)
     }
     truth = None if responses is None else np.empty(shape, np.float32)
     true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
-    # as the data that they are compared with have them
+    # like the data with which they are compared
     remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
@@ -158,7 +159,7 @@ def _finished(
     recipe: Recipe,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Windows without noise, and with it if there is any."""
+    """Windows without noise, and with noise if it is known."""
     if rivals.noise is None:
         return finish(records, recipe.preparation, dt_ns=pulses.dt_ns), None
     return finish_both(
@@ -174,7 +175,7 @@ def _finished(
 def _numbers(
     clean: Mapping[str, FloatArray], recipe: Recipe, dt_ns: float
 ) -> dict[str, NoiseFree]:
-    """What is kept of one block."""
+    """Numbers of the noise-free pulses of one block."""
     squares: Mapping[str, Values] = {}
     if "truth" in clean:
         methods = {name: windows for name, windows in clean.items() if name != "truth"}

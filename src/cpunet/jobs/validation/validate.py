@@ -1,4 +1,4 @@
-"""How well a run translates: scores per peak, figures and a page to read."""
+"""Validate a run: scores per peak, figures and a report."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def validate_run(
 ) -> dict[str, Any]:
     """Score a run on simulated and measured pulses and write the report folder.
 
-    Every peak of the recipe is scored, and the energies of the training if they are
-    none of them. SEP and DEP are no part of the training: they are the test.
+    Every peak of the recipe is scored, and the energies of the training if they are not a
+    peak.  SEP and DEP are not used in the training: they are the test.
 
     Parameters
     ----------
@@ -49,23 +49,23 @@ def validate_run(
     sim, data
         Simulated and measured pulses.
     out
-        Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, of
-        which `cpunet.jobs.validation.figure_files.draw_figures` draws them again.
+        Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, from
+        which `cpunet.jobs.validation.figure_files.draw_figures` redraws the figures.
     truth
-        ``.npz`` with ``response``: the noise-free trace of each simulated pulse.
+        ``.npz`` file with ``response``: the noise-free trace of each simulated pulse.
     rivals
-        Fit the rival methods too, which takes most of the time.
+        Whether to fit the baseline methods, which takes most of the time.
     seed
-        Of noise and bootstraps.
+        Seed of noise and bootstraps.
     ae_range_kev
-        More energies to read on both sides, for A/E against energy: such as 900 to 2350.
+        Further energies to read on both sides for A/E against energy, such as 900 to 2350.
     device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
-        The content of ``metrics.json``.
+        Content of ``metrics.json``.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def validated(
 
 
 def _of_remains(info: Mapping[str, Any]) -> list[str]:
-    """What earlier pulses have left under the data, if anything surely."""
+    """Remarks on remains of earlier pulses under the data, if they are certain."""
     told = (info.get("fit") or {}).get("remains") or {}
     if not told.get("rate_khz"):
         return []
@@ -142,7 +142,7 @@ def _of_remains(info: Mapping[str, Any]) -> list[str]:
 
 
 def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
-    """Draw a figure, and tell of it."""
+    """Draw a figure and report progress."""
     figure = drawing.draw()
     advance(1)
     return figure

@@ -25,9 +25,9 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 
 def report_views(found: Evaluation) -> dict[str, Any]:
-    """Make the data of all charts, see `cpunet.analysis.views`."""
+    """Data of all charts, see `cpunet.analysis.views`."""
     scored = [peak for peak in found.sets if found.values[peak.name]]
-    # the noise-free are in the choice of single pulses, where they are seen best
+    # noise-free methods are shown with single pulses, where they are most informative
     values = {
         peak.name: {
             method: of_method
@@ -59,7 +59,7 @@ def report_views(found: Evaluation) -> dict[str, Any]:
 
 
 def _pulses(scored: Sequence[PeakSets], dt_ns: float) -> dict[str, Any]:
-    """Events by every method; only those that are shown are translated again."""
+    """Single events by every method; only displayed events are translated again."""
     chosen = {peak.name: spread(peak.known_to_all()) for peak in scored}
     views = pulse_views(
         {peak.name: peak.without_noise(chosen[peak.name]) for peak in scored},

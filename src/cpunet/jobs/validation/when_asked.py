@@ -1,4 +1,4 @@
-"""Large things by name, of which each is there only while it is used."""
+"""A mapping of large values that exist only while they are used."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ T = TypeVar("T")
 
 
 class WhenAsked(Mapping[str, T]):
-    """A mapping that makes each value anew whenever it is asked for.
+    """A mapping that computes a value on every access.
 
     Parameters
     ----------
     makers
-        What makes each value, by name.
+        Functions that compute the values, by name.
     """
 
     def __init__(self, makers: Mapping[str, Callable[[], T]]) -> None:

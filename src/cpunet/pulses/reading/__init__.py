@@ -1,4 +1,4 @@
-"""Any file of pulses, read block by block: `open_pulses` finds the format by itself."""
+"""Read files of pulses block by block; `open_pulses` detects the format."""
 
 from cpunet.pulses.reading.opening import open_pulses, tables_of
 from cpunet.pulses.reading.source import PulseSource

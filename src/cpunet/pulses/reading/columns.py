@@ -1,4 +1,4 @@
-"""What stands beside the waveforms: one value per event, with its units, read by rows."""
+"""Columns beside the waveforms: one value per event, with units, read by rows."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 
-# Factors to keV and ns.  A dictionary and not a units library: only these ever
-# stand beside waveforms, and anything else must be refused, not converted.
+# Factors to keV and ns.  A dictionary and not a units library: only these units occur
+# beside waveforms, and any other must be refused, not converted.
 ENERGY_UNITS = {"eV": 1e-3, "keV": 1.0, "MeV": 1e3}
 TIME_UNITS = {"ps": 1e-3, "ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9}
 
@@ -42,7 +42,7 @@ class Column(Protocol):
 
 @dataclass(frozen=True)
 class MemoryColumn:
-    """A column that was read already; a scalar holds for all events."""
+    """A column in memory; a scalar applies to all events."""
 
     values: npt.NDArray[Any]
     units: str = ""

@@ -1,4 +1,4 @@
-"""Which number is a pulse's energy in keV: a column, another file's, or the amplitude."""
+"""Energies of pulses in keV: from a column, another file, or the amplitude."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Energies:
         Factor from the column's values, or from the amplitude in ADC, to keV;
         None if energies are not known.
     column
-        Where the values are read; None to take the amplitude.
+        Column of the values; None to use the amplitude.
     """
 
     description: str
@@ -42,7 +42,7 @@ class Energies:
     column: Column | None = None
 
     def of(self, start: int, waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Energies in keV of the pulses from row `start` on; NaN where not known."""
+        """Energies in keV of the pulses from row `start` on; NaN where unknown."""
         if self.kev_per_unit is None:
             return np.full(len(waveforms), np.nan)
         if self.column is None:
@@ -52,7 +52,7 @@ class Energies:
 
 
 def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Maximum over the mean of the first twentieth (10 samples at least), per trace.
+    """Maximum above the mean of the first twentieth (at least 10 samples), per trace.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def resolve_energies(
     kev_per_adc: float | None,
     n_pulses: int | None,
 ) -> Energies:
-    """Choose the rule for a file's energies.
+    """Choose the source of a file's energies.
 
     Without `energy` the column ``energy_kev``, ``energy_keV`` or ``energy`` is
     taken if it is in energy units, or if `kev_per_adc` calibrates it; else the

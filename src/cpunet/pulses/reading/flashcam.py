@@ -23,9 +23,8 @@ _MOST_CHANNELS = 1 << 16
 class FlashCamSource(PulseSource):
     """The traces of one channel; `table` is its index where there are several.
 
-    Full and sparse events both count; an event without the channel is passed
-    over.  The energy of the digitiser's own filter is not an energy in keV and
-    not read.
+    Full and sparse events are both read; events without the channel are skipped.
+    The energy of the digitiser's own filter is not in keV and is not read.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -63,8 +62,8 @@ class FlashCamSource(PulseSource):
             yield Traces(np.stack(waveforms), np.asarray(numbers))
 
     def _events(self, stream: FCIO) -> Iterator[tuple[npt.NDArray[np.uint16], int]]:
-        # The last record of a cut-off file looks like an event: give each event
-        # only when the next record, or the regular end, has been met.
+        # The last record of a truncated file looks like an event: yield each event
+        # only after the next record, or the regular end, has been read.
         last: tuple[npt.NDArray[np.uint16], int] | None = None
         any_record = False
         while self._next(stream):
@@ -137,7 +136,7 @@ def _opened(path: Path) -> Iterator[FCIO]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Hide what the C library prints: a harmless warning about older files."""
+    """Hide the output of the C library: a harmless warning about older files."""
     kept = os.dup(2)
     sink = os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,4 +1,4 @@
-"""Columns of HDF5 files, and how these are opened."""
+"""Columns of HDF5 files, and how to open them."""
 
 from __future__ import annotations
 

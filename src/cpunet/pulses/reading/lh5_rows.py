@@ -1,7 +1,7 @@
 """Rows of LH5 objects, read only once their structure has been checked.
 
-The LH5 library decodes waveforms by compiled loops that trust what they are given: a length
-that is wrong by a bit would have them write beyond their arrays.
+The LH5 library decodes waveforms with compiled loops that trust their input: a length with
+one wrong bit would make them write beyond their arrays.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RADWARE, _VARLEN = "radware_sigcompress", "uleb128_zigzag_diff"
 
 
 def read_rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> Any:
-    """Rows of an LH5 object as the LH5 library gives them, waveforms decoded.
+    """Rows of an LH5 object, read with the LH5 library, with decoded waveforms.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def _check_vectors(item: h5py.Group | h5py.Dataset, start: int, n: int) -> None:
 
 
 def _check_lengths(vectors: h5py.Group, start: int, n: int) -> None:
-    """Check that the vectors of some rows rise within the values there are."""
+    """Check that the cumulative lengths of some rows increase within the stored values."""
     path, ends = Path(vectors.file.filename), vectors.get("cumulative_length")
     flat = vectors.get("flattened_data")
     while isinstance(flat, h5py.Group):  # vectors of vectors
@@ -107,16 +107,16 @@ def _check_encoded(path: Path, name: str, start: int, raw: Any) -> None:
 def first_bad_varlen(
     data: npt.NDArray[np.uint8], ends: npt.NDArray[np.int64], lengths: npt.NDArray[np.int64]
 ) -> int:
-    """First row that does not hold its number of integers of variable length; -1 if none.
+    """First row that does not contain its number of variable-length integers; -1 if none.
 
     Parameters
     ----------
     data
         Bytes of all rows.
     ends
-        Where in them each row ends.
+        End of each row in `data`.
     lengths
-        Samples of each.
+        Number of samples of each row.
     """
     first = 0
     for row in range(len(ends)):

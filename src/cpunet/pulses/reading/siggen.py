@@ -1,4 +1,4 @@
-"""Pulses as siggen and its users write them: ``.spe`` spectra and columns of text."""
+"""Pulses in the formats of siggen and its users: ``.spe`` spectra and columns of text."""
 
 from __future__ import annotations
 
