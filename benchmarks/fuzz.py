@@ -37,7 +37,7 @@ from mutations import NASTY, NASTY_TEXTS, mutate, pick
 
 from cpunet.cli.main import main as cpunet_main
 
-MOST_KB, MOST_S = 2_000_000, 30
+MAX_KB, MAX_S = 2_000_000, 30
 TINY = [
     "generator.width=2", "discriminator.embedding_rows=20", "discriminator.embedding_dim=2",
     "discriminator.hidden=2", "discriminator.samples_per_step=80", "training.iterations=2",
@@ -539,7 +539,7 @@ def run(case: Case, folder: Path, logs: Path) -> dict[str, object]:
         done, code, usage = os.wait4(pid, os.WNOHANG)
         if done:
             break
-        if time.monotonic() - begun > MOST_S:
+        if time.monotonic() - begun > MAX_S:
             late = True
             os.killpg(pid, signal.SIGKILL)
             _, code, usage = os.wait4(pid, 0)
@@ -582,7 +582,7 @@ def judged(case: Case, outcome: dict, before: dict, after: dict) -> list[str]:
         faults.append("wrong status")
     elif status and not 1 <= errors <= (3 if "files failed" in err else 1):
         faults.append("not one line")
-    if outcome["kb"] > MOST_KB:
+    if outcome["kb"] > MAX_KB:
         faults.append("over 2 GB")
     if status == 0 and case.must_fail:
         faults.append("wrong success")

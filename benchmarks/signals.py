@@ -20,7 +20,7 @@ from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings
 
 EXACT_HITS, LIBRARY_HITS, GAMMAS = 6000, 200_000, 100_000
-MOST_HITS_PER_EVENT = 5
+MAX_HITS_PER_EVENT = 5
 
 
 def random_events(fields: FieldMaps, n_hits: int, seed: int) -> Hits:
@@ -30,7 +30,7 @@ def random_events(fields: FieldMaps, n_hits: int, seed: int) -> Hits:
     phi = rng.uniform(0, 2 * np.pi, n_hits)
     z = rng.uniform(0, fields.z_mm[-1], n_hits)
     place = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
-    ends = np.cumsum(rng.integers(1, MOST_HITS_PER_EVENT + 1, n_hits))
+    ends = np.cumsum(rng.integers(1, MAX_HITS_PER_EVENT + 1, n_hits))
     offsets = np.concatenate([[0], ends[ends < n_hits], [n_hits]])
     return Hits.of(place, rng.uniform(50, 1000, n_hits), offsets)
 

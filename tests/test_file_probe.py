@@ -37,7 +37,7 @@ def test_what_would_hang_or_crash_is_refused(
     path = tmp_path / "damaged.lh5"
     h5py.File(path, "w").close()
     monkeypatch.setattr(file_probe, "_look_through", look)
-    monkeypatch.setattr(file_probe, "MOST_CPU_S", 1)
+    monkeypatch.setattr(file_probe, "MAX_CPU_S", 1)
     message = rf"damaged.lh5: is damaged \(the HDF5 library {told} on it\); copy or"
     with pytest.raises(CpunetError, match=message), opened(path):
         pass
@@ -50,7 +50,7 @@ def test_a_process_that_waits_for_ever_is_given_up(
     path = tmp_path / "whole.lh5"
     h5py.File(path, "w").close()
     monkeypatch.setattr(file_probe, "_look_through", lambda _of: signal.pause())
-    monkeypatch.setattr(file_probe, "MOST_WAIT_S", 0.1)
+    monkeypatch.setattr(file_probe, "MAX_WAIT_S", 0.1)
     with opened(path) as file:
         assert not list(file)
 

@@ -24,13 +24,13 @@ from cpunet.errors import CpunetError
 
 Kind = Literal["HDF5", "FlashCam"]
 
-MOST_CPU_S = 5
+MAX_CPU_S = 5
 # The forked process can deadlock on a lock that a thread of this one held at the fork.
-MOST_WAIT_S = 60.0
+MAX_WAIT_S = 60.0
 _FAILS = "fails"
-MOST_BYTES = 1 << 30
-_MOST_RECORDS = 1000
-_MOST_OBJECTS = 20_000
+MAX_BYTES = 1 << 30
+_MAX_RECORDS = 1000
+_MAX_OBJECTS = 20_000
 
 
 def require_survivable(path: Path, kind: Kind = "HDF5") -> None:
@@ -80,11 +80,11 @@ def _look_through_and_exit(path: str, kind: Kind) -> None:
         faulthandler.disable()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGXCPU, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, MOST_WAIT_S)
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S + 1))
+        signal.setitimer(signal.ITIMER_REAL, MAX_WAIT_S)
+        resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         in_use = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        most = in_use + MOST_BYTES
+        most = in_use + MAX_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         if kind == "HDF5":
             with h5py.File(path, "r", locking=False) as file:
@@ -100,7 +100,7 @@ def _look_through_and_exit(path: str, kind: Kind) -> None:
 def _look_through(file: h5py.File) -> None:
     ahead: list[Any] = [file]
     seen: set[int] = set()
-    while ahead and len(seen) < _MOST_OBJECTS:
+    while ahead and len(seen) < _MAX_OBJECTS:
         item = ahead.pop()
         with suppress(Exception):
             address = h5py.h5o.get_info(item.id).addr
@@ -126,7 +126,7 @@ def _look_at_records(path: str) -> None:
     from fcio import fcio_open
 
     stream = fcio_open(path)
-    for _ in range(_MOST_RECORDS):
+    for _ in range(_MAX_RECORDS):
         if not stream.get_record():
             break
 

@@ -19,7 +19,7 @@ from cpunet.file_probe import require_survivable
 from cpunet.regular_files import require_file
 
 _HERE = str(Path(__file__).parent)
-MOST_CHUNK_BYTES = 1 << 30
+MAX_CHUNK_BYTES = 1 << 30
 _LIBRARIES = re.compile(r"(^|[/\\])(h5py|lh5|lgdo|awkward|numpy)[/\\]")
 
 
@@ -85,7 +85,7 @@ def require_stored(path: Path, dataset: h5py.Dataset) -> None:
     A file of a few bytes could otherwise be read as any number of zeros.
     """
     n_bytes = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
-    if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MOST_CHUNK_BYTES:
+    if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MAX_CHUNK_BYTES:
         raise CpunetError(
             f"{path}: {dataset.name} is in chunks of {dataset.chunks}, which nobody can hold; "
             "copy or write it again"

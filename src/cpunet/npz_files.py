@@ -43,8 +43,8 @@ DAMAGED = (
     lzma.LZMAError,
 )
 # Largest possible compression ratio, the limit of deflate.
-_MOST_SHRINKAGE = 1100
-MOST_BYTES = 1 << 31  # of an array that is read at once
+_MAX_SHRINKAGE = 1100
+MAX_BYTES = 1 << 31  # of an array that is read at once
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,12 @@ def read_array(path: Path, key: str, header: Header) -> npt.NDArray[Any]:
     Raises
     ------
     ValueError
-        If the array contains objects, is larger than `MOST_BYTES`, or does not match its
+        If the array contains objects, is larger than `MAX_BYTES`, or does not match its
         header.
     """
     if header.dtype.hasobject:
         raise ValueError("objects instead of numbers")
-    if header.n_bytes > MOST_BYTES:
+    if header.n_bytes > MAX_BYTES:
         raise ValueError(f"an array of {header.n_bytes / 1e9:.0f} GB")
     with member(path, key) as file:
         values: npt.NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
@@ -164,9 +164,6 @@ def _size(path: Path, key: str) -> int:
         return total
     with zipfile.ZipFile(path) as archive:
         info = archive.getinfo(f"{key}.npy")
-    if (
-        info.compress_size > total
-        or info.file_size > _MOST_SHRINKAGE * info.compress_size + 512
-    ):
+    if info.compress_size > total or info.file_size > _MAX_SHRINKAGE * info.compress_size + 512:
         raise ValueError(f"array {key} claims {info.file_size} bytes in a file of {total}")
     return info.file_size

@@ -16,10 +16,10 @@ import yaml
 
 from cpunet.errors import CpunetError
 
-MOST_BYTES = 10_000_000  # of a settings file
-_MOST_DEPTH = 50
-_MOST_VALUES = 200_000  # every reference counts
-_MOST_NUMBER = 10**60  # larger integers are meaningless here
+MAX_BYTES = 10_000_000  # of a settings file
+_MAX_DEPTH = 50
+_MAX_VALUES = 200_000  # every reference counts
+_MAX_NUMBER = 10**60  # larger integers are meaningless here
 
 
 def yaml_names(folder: Traversable) -> list[str]:
@@ -73,8 +73,8 @@ def plain_json(text: str | bytes) -> Any:
     ValueError
         If the text is not JSON, is nested too deeply, or contains unreasonably large numbers.
     """
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"larger than {MOST_BYTES / 1e6:g} MB")
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"larger than {MAX_BYTES / 1e6:g} MB")
     try:
         found = json.loads(text)
     except RecursionError as error:
@@ -101,14 +101,14 @@ _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 
 
 def _yaml(text: str) -> Any:
-    if len(text) > MOST_BYTES:
-        raise yaml.YAMLError(f"larger than {MOST_BYTES / 1e6:g} MB")
+    if len(text) > MAX_BYTES:
+        raise yaml.YAMLError(f"larger than {MAX_BYTES / 1e6:g} MB")
     try:
         depth = 0
         for event in yaml.parse(text, _Loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _MOST_DEPTH:
+            if depth > _MAX_DEPTH:
                 raise ValueError("nested too deeply")
         found = yaml.load(text, _Loader)
         _require_plain(found)
@@ -125,11 +125,11 @@ def _require_plain(value: Any) -> None:
     while ahead:
         part, depth = ahead.pop()
         met += 1
-        if met > _MOST_VALUES:
+        if met > _MAX_VALUES:
             raise ValueError("too many values")
-        if depth > _MOST_DEPTH:
+        if depth > _MAX_DEPTH:
             raise ValueError("nested too deeply")
-        if isinstance(part, int) and abs(part) > _MOST_NUMBER:
+        if isinstance(part, int) and abs(part) > _MAX_NUMBER:
             raise ValueError("a whole number of more than 60 digits")
         if isinstance(part, Mapping):
             ahead += [(inner, depth + 1) for pair in part.items() for inner in pair]

@@ -23,12 +23,12 @@ from cpunet.analysis.resampling import (
 )
 
 DRAWS = 400
-WAYS = {"events": resampling.MOST_EVENTS, "bins": 0}  # what is drawn
+WAYS = {"events": resampling.MAX_EVENTS, "bins": 0}  # what is drawn
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
 def either_way(request, monkeypatch):
-    monkeypatch.setattr(resampling, "MOST_EVENTS", request.param)
+    monkeypatch.setattr(resampling, "MAX_EVENTS", request.param)
 
 
 @pytest.mark.parametrize("size", [2, 50])

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from cpunet.analysis.dot_panel import span, ticks
+from cpunet.analysis.forest_plot import span, ticks
 from cpunet.analysis.side_by_side import Cell
 from cpunet.analysis.summary_page import Entry, summary_page
 from cpunet.cli.main import main

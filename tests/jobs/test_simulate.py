@@ -93,7 +93,7 @@ def test_events_do_not_depend_on_threads_but_on_the_seed(ppc, monkeypatch):
 
     monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._ROUND_EVENTS", 10)
     many = numbers(gammas())
-    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._MOST_WORKERS", 1)
+    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._MAX_WORKERS", 1)
     assert numbers(gammas()) == many
     assert numbers(gammas(seed=5)) != many
 

@@ -11,8 +11,8 @@ from cpunet.electronics.chain import Electronics
 from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.response import linear_response
 from cpunet.networks.response import (
-    ROOM_AFTER,
-    ROOM_BEFORE,
+    PADDING_AFTER,
+    PADDING_BEFORE,
     ElectronicsResponse,
     fast_length,
 )
@@ -32,8 +32,8 @@ def electronics(poles: tuple[float, ...], ringing: dict | None = None) -> Electr
             "slow": {"fraction": 0.065, "tau_ns": 400.0},
             "ringing": ringing,
             "decays": [{"fraction": 0.96, "tau_us": 80.0}, {"fraction": 0.04, "tau_us": 4.0}],
-            "n_pre": ROOM_BEFORE,
-            "length": ROOM_BEFORE + SAMPLES + ROOM_AFTER,
+            "n_pre": PADDING_BEFORE,
+            "length": PADDING_BEFORE + SAMPLES + PADDING_AFTER,
         }
     )
 
@@ -86,7 +86,7 @@ def test_finely_simulated_pulses_come_out_as_from_the_exact_chain(poles, ringing
     # 16 ns / 2 / 80 µs. The rest is the spline between the samples: at worst for a single
     # pole, which passes most of what is beyond half the sampling rate, and an edge of 44 ns.
     np.testing.assert_allclose(got, wanted, atol=5e-4)
-    top = slice(ROOM_BEFORE + 400, ROOM_BEFORE + 700)
+    top = slice(PADDING_BEFORE + 400, PADDING_BEFORE + 700)
     np.testing.assert_allclose(got[:, top], wanted[:, top], atol=2e-4)
 
 
@@ -115,9 +115,9 @@ def test_the_decays_alone_are_sums_of_exponentials():
 def test_records_have_room_and_nothing_wraps_around():
     pulses = windows(fine_pulses(20))
     records = layer((40.0, 40.0))(pulses)
-    assert records.shape == (3, ROOM_BEFORE + SAMPLES + ROOM_AFTER)
+    assert records.shape == (3, PADDING_BEFORE + SAMPLES + PADDING_AFTER)
     assert records.dtype == torch.float32
-    assert float(records[:, :ROOM_BEFORE].abs().max()) < 2e-5
+    assert float(records[:, :PADDING_BEFORE].abs().max()) < 2e-5
 
 
 def test_pulses_of_any_height_and_time():

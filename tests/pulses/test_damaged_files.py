@@ -19,7 +19,7 @@ from lh5.compression import RadwareSigcompress, ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.reading.source import BLOCK_BYTES, MOST_SAMPLES
+from cpunet.pulses.reading.source import BLOCK_BYTES, MAX_SAMPLES
 
 N, LENGTH = 12, 64
 
@@ -192,10 +192,10 @@ def test_every_flipped_bit_of_encoded_waveforms_is_met_or_harmless(tmp_path):
 
 def test_long_traces_come_in_small_blocks(tmp_path):
     path = tmp_path / "long.npz"
-    np.savez(path, waveform=np.zeros((9, MOST_SAMPLES // 2), np.int8), dt_ns=16.0)
+    np.savez(path, waveform=np.zeros((9, MAX_SAMPLES // 2), np.int8), dt_ns=16.0)
     source = open_pulses(path)
     assert BLOCK_BYTES // (4 * source.length) == 128
-    np.savez(path, waveform=np.zeros((2, 10 * MOST_SAMPLES), np.int8), dt_ns=16.0)
+    np.savez(path, waveform=np.zeros((2, 10 * MAX_SAMPLES), np.int8), dt_ns=16.0)
     with pytest.raises(CpunetError, match="10485760 samples is no pulse"):
         open_pulses(path)
 

@@ -19,11 +19,11 @@ from cpunet.recipes import load_recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.loop import Keeping, train
+from cpunet.training.loop import CheckpointHooks, train
 from cpunet.training.outside import Outside
 from cpunet.training.pairs import learn_pairs
 from cpunet.training.run_folder import write_run
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
 from cpunet.translation.translator import IREN, REN
 
@@ -144,11 +144,11 @@ def test_a_training_moves_the_networks_and_not_the_chain(sim, data, surroundings
 
 def test_a_training_that_goes_on_ends_with_the_same_bits(sim, data, surroundings):
     states = []
-    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)))
+    hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)))
     sides = (sim.waveforms, data, RECIPE)
-    whole = train(*sides, seed=0, surroundings=surroundings, keeping=keeping).state_dict()
-    again = Keeping(lambda _state: None, start=states[0])
-    resumed = train(*sides, seed=0, surroundings=surroundings, keeping=again).state_dict()
+    whole = train(*sides, seed=0, surroundings=surroundings, hooks=hooks).state_dict()
+    again = CheckpointHooks(lambda _state: None, start=states[0])
+    resumed = train(*sides, seed=0, surroundings=surroundings, hooks=again).state_dict()
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
 
 
@@ -163,8 +163,8 @@ def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
     )
     model = CycleGan(recipe, surroundings).train()
     before = copy.deepcopy(model.ren.state_dict())
-    deck = Deck(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
-    learn_pairs(model, deck, recipe, surroundings, chain_step(model, surroundings))
+    sampler = EpochSampler(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
+    learn_pairs(model, sampler, recipe, surroundings, chain_step(model, surroundings))
     assert all(
         torch.equal(value, before[name]) for name, value in model.ren.state_dict().items()
     )

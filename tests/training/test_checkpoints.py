@@ -25,7 +25,7 @@ from cpunet.training.checkpoints import (
     require_same,
     write_checkpoint,
 )
-from cpunet.training.loop import Keeping, StoppedError, train
+from cpunet.training.loop import CheckpointHooks, StoppedError, train
 from cpunet.training.run_folder import LOSSES, WEIGHTS
 from cpunet.training.unfinished import MARKER, LossLog, UnfinishedRun, unfinished_folder
 
@@ -74,10 +74,10 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
     def save(state):
         write_checkpoint(folder, Checkpoint(state, {"done": len(records)}))
 
-    keeping = Keeping(save, stop=lambda: len(asked) >= iteration or bool(asked.append(0)))
+    hooks = CheckpointHooks(save, stop=lambda: len(asked) >= iteration or bool(asked.append(0)))
     asked = [0]
     with pytest.raises(StoppedError, match=f"^stopped after {iteration} of {N} iterations;"):
-        train(*sets, recipe, seed=3, listener=records.extend, keeping=keeping)
+        train(*sets, recipe, seed=3, listener=records.extend, hooks=hooks)
     return records
 
 
@@ -107,8 +107,8 @@ def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, varian
     (checkpoint, *_) = read_checkpoints(tmp_path)
     assert checkpoint.state["iteration"] == stop == checkpoint.facts["done"]
     torch.manual_seed(99)  # what happened in between does not matter
-    keeping = Keeping(lambda _state: None, start=checkpoint.state)
-    model = train(*sets, recipe, seed=3, listener=records.extend, keeping=keeping)
+    hooks = CheckpointHooks(lambda _state: None, start=checkpoint.state)
+    model = train(*sets, recipe, seed=3, listener=records.extend, hooks=hooks)
     assert weights(model) == expected
     assert records == expected_records
 
@@ -251,8 +251,8 @@ def work(sets, recipe, out: Path, notes: list, *, resume=False, die=None, disk=N
             with nearly_full_disk(disk if state["iteration"] == 4 and disk else 2**40):
                 run.save(state)
 
-        keeping = Keeping(save, start)
-        model = train(*sets, recipe, seed=seed, listener=listen, keeping=keeping)
+        hooks = CheckpointHooks(save, start)
+        model = train(*sets, recipe, seed=seed, listener=listen, hooks=hooks)
         run.finish()
         (folder / WEIGHTS).write_bytes(b"".join(weights(model).values()))
 

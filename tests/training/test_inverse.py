@@ -13,7 +13,7 @@ from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.linear_inverse import LinearInverse
-from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
@@ -142,7 +142,7 @@ def test_a_pulse_keeps_its_place(quiet, held_out):
     windows = ren(quiet.generator, held_out, None)
     with torch.no_grad():
         found = quiet.inverse(torch.from_numpy(windows)).numpy()
-    delay = half_time(records) - ROOM_BEFORE - half_time(held_out)
+    delay = half_time(records) - PADDING_BEFORE - half_time(held_out)
     assert np.quantile(np.abs(half_time(windows) - half_time(found) - delay), 0.95) < 0.02
     later = np.concatenate([windows[:, :1], windows[:, :-1]], axis=1)
     with torch.no_grad():

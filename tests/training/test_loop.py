@@ -10,7 +10,7 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.training.cyclegan import LOSS_NAMES
-from cpunet.training.loop import Keeping, StoppedError, train
+from cpunet.training.loop import CheckpointHooks, StoppedError, train
 
 
 def run(sets, recipe, seed=0):
@@ -156,10 +156,10 @@ def test_a_training_on_a_gpu(tiny, sets, penalty):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_training_on_a_gpu_goes_on(tiny, sets):
     states, recipe = [], tiny("training.checkpoint_interval=2")
-    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)))
-    whole = train(*sets, recipe, seed=0, device="cuda", keeping=keeping).state_dict()
-    keeping = Keeping(lambda _state: None, start=states[0])
-    again = train(*sets, recipe, seed=0, device="cuda", keeping=keeping).state_dict()
+    hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)))
+    whole = train(*sets, recipe, seed=0, device="cuda", hooks=hooks).state_dict()
+    hooks = CheckpointHooks(lambda _state: None, start=states[0])
+    again = train(*sets, recipe, seed=0, device="cuda", hooks=hooks).state_dict()
     # cuDNN's kernels may add in another order
     for name, value in whole.items():
         torch.testing.assert_close(again[name], value, rtol=1e-3, atol=1e-4)
@@ -173,7 +173,13 @@ def kept(sets, recipe, stop=lambda: False):
         states.append((state["iteration"], len(records)))
 
     try:
-        train(*sets, recipe, seed=0, listener=records.extend, keeping=Keeping(save, stop=stop))
+        train(
+            *sets,
+            recipe,
+            seed=0,
+            listener=records.extend,
+            hooks=CheckpointHooks(save, stop=stop),
+        )
     finally:
         assert [record["iteration"] for record in records] == [*range(len(records))]
     return states
@@ -188,11 +194,13 @@ def test_the_state_is_kept_at_its_interval_and_at_the_end(tiny, sets):
 def test_a_stop_is_kept(tiny, sets):
     asked = iter([False, False, True])
     states = []
-    keeping = Keeping(lambda state: states.append(state["iteration"]), stop=lambda: next(asked))
+    hooks = CheckpointHooks(
+        lambda state: states.append(state["iteration"]), stop=lambda: next(asked)
+    )
     with pytest.raises(
         StoppedError, match=r"^stopped after 3 of 4 iterations; go on with --res"
     ):
-        train(*sets, tiny(), seed=0, keeping=keeping)
+        train(*sets, tiny(), seed=0, hooks=hooks)
     assert states == [3]
 
 
@@ -214,9 +222,9 @@ def test_what_diverged_is_not_kept(tiny, sets, monkeypatch):
     monkeypatch.setattr(loop, "Step", Diverging)
     states = []
     recipe = tiny("training.iterations=20", "training.checkpoint_interval=2")
-    keeping = Keeping(lambda state: states.append(state["iteration"]))
+    hooks = CheckpointHooks(lambda state: states.append(state["iteration"]))
     with pytest.raises(
         CpunetError, match=r"diverged: .* is not finite after iteration 3 \(seed 8"
     ):
-        train(*sets, recipe, seed=8, keeping=keeping)
+        train(*sets, recipe, seed=8, hooks=hooks)
     assert states == [2]

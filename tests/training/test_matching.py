@@ -17,8 +17,8 @@ from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.response import linear_response
 from cpunet.errors import CpunetError
 from cpunet.networks.response import (
-    ROOM_AFTER,
-    ROOM_BEFORE,
+    PADDING_AFTER,
+    PADDING_BEFORE,
     ElectronicsResponse,
     record_length,
 )
@@ -326,10 +326,10 @@ def test_records_are_those_of_the_response(asked: ResponseProblem) -> None:
     moments = band.moments
     with torch.no_grad():
         records = response(torch.from_numpy(band.sim.sim)).numpy()
-    plateau = records[:, -ROOM_AFTER : -ROOM_AFTER + 100].mean(axis=1, keepdims=True)
+    plateau = records[:, -PADDING_AFTER : -PADDING_AFTER + 100].mean(axis=1, keepdims=True)
     records = records * (RECIPE.preparation.tail_level / plateau)
     records = band.sim.noise.add(np.float32(records), 0, 0)
-    last = ROOM_BEFORE + RECIPE.preparation.samples_before + translated.DELAY
+    last = PADDING_BEFORE + RECIPE.preparation.samples_before + translated.DELAY
     config, level = RECIPE.matching.training, RECIPE.preparation.tail_level
     aligned, _ = at_half_maximum(torch.from_numpy(records), moments.level, last, config, level)
     expected = (aligned - torch.from_numpy(moments.mean)) @ torch.from_numpy(moments.components)

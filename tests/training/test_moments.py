@@ -12,7 +12,7 @@ from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.moments import FEWEST, Moments
+from cpunet.training.moments import MIN_N, Moments
 
 RECIPE = load_recipe("fast")
 CONFIG, PREPARATION = RECIPE.matching.training, RECIPE.preparation
@@ -159,10 +159,10 @@ def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -
     )
 
 
-@pytest.mark.parametrize("n", [1, 50, FEWEST - 1])
+@pytest.mark.parametrize("n", [1, 50, MIN_N - 1])
 def test_too_few_pulses_are_refused(windows, n: int) -> None:
     with pytest.raises(
-        CpunetError, match=rf"^{n} measured pulses can be used; {FEWEST} or more"
+        CpunetError, match=rf"^{n} measured pulses can be used; {MIN_N} or more"
     ):
         Moments.of_data(windows[:n], CONFIG, PREPARATION)
 

@@ -8,7 +8,7 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import ROOM_BEFORE, with_room
+from cpunet.electronics.extension import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -83,7 +83,7 @@ def test_the_noise_is_that_of_the_seed():
 
 def test_what_cannot_be_prepared_is_cut_where_it_lies():
     found = as_measured(torch.zeros(2, 1400), CONFIG, DT_NS)
-    assert found.start.tolist() == [ROOM_BEFORE, ROOM_BEFORE]
+    assert found.start.tolist() == [PADDING_BEFORE, PADDING_BEFORE]
     assert bool(torch.isfinite(found.windows).all())
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cpunet.training import loop
 from cpunet.training.cyclegan import LOSS_NAMES, Step
 from cpunet.training.loop import train
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 
 
 def numbered(n: int, samples: int = 3) -> torch.Tensor:
@@ -26,46 +26,48 @@ def numbers(batch: torch.Tensor) -> list[int]:
 
 @given(n=st.integers(1, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_every_batch_is_full_and_holds_pulses_of_the_set(n, batch_size, seed):
-    deck = Deck(numbered(n), batch_size, seed)
+    sampler = EpochSampler(numbered(n), batch_size, seed)
     for _ in range(5):
-        batch = deck.deal()
+        batch = sampler.next_batch()
         assert batch.shape == (batch_size, 1, 3)
         assert set(numbers(batch)) <= set(range(n))
 
 
 @given(n=st.integers(2, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_between_two_shuffles_no_pulse_comes_twice(n, batch_size, seed):
-    deck = Deck(numbered(n), batch_size, seed)
+    sampler = EpochSampler(numbered(n), batch_size, seed)
     for _ in range(3):
-        dealt = [i for _ in range(n // batch_size) for i in numbers(deck.deal())]
+        dealt = [i for _ in range(n // batch_size) for i in numbers(sampler.next_batch())]
         assert len(set(dealt)) == len(dealt)
 
 
 @given(n=st.integers(1, 60), batch_size=st.integers(2, 20), seed=st.integers(0, 2**32))
 def test_every_pulse_is_used(n, batch_size, seed):
     # chance to miss one in a shuffle is below 1/2, with replacement below exp(-1) a batch
-    deck = Deck(numbered(n), batch_size, seed)
-    used = {i for _ in range(60 * max(1, n // batch_size)) for i in numbers(deck.deal())}
+    sampler = EpochSampler(numbered(n), batch_size, seed)
+    used = {
+        i for _ in range(60 * max(1, n // batch_size)) for i in numbers(sampler.next_batch())
+    }
     assert used == set(range(n))
 
 
 @given(n=st.integers(2, 40), seed=st.integers(0, 2**32))
 def test_the_same_seed_deals_the_same(n, seed):
-    decks = [Deck(numbered(n), 4, s) for s in (seed, seed)]
-    assert [numbers(decks[0].deal()) for _ in range(20)] == [
-        numbers(decks[1].deal()) for _ in range(20)
+    samplers = [EpochSampler(numbered(n), 4, s) for s in (seed, seed)]
+    assert [numbers(samplers[0].next_batch()) for _ in range(20)] == [
+        numbers(samplers[1].next_batch()) for _ in range(20)
     ]
 
 
 def test_another_seed_deals_otherwise():
-    decks = [Deck(numbered(40), 4, seed) for seed in (1, 2)]
-    assert numbers(decks[0].deal()) != numbers(decks[1].deal())
+    samplers = [EpochSampler(numbered(40), 4, seed) for seed in (1, 2)]
+    assert numbers(samplers[0].next_batch()) != numbers(samplers[1].next_batch())
 
 
 def test_pulses_are_dealt_equally_often():
-    deck = Deck(numbered(7), 3, seed=5)
-    counts = Counter(i for _ in range(2000) for i in numbers(deck.deal()))
-    # 6000 cards among 7: 857 each; the spread of a deck's counts is below sqrt(857)
+    sampler = EpochSampler(numbered(7), 3, seed=5)
+    counts = Counter(i for _ in range(2000) for i in numbers(sampler.next_batch()))
+    # 6000 cards among 7: 857 each; the spread of a sampler's counts is below sqrt(857)
     assert max(abs(c - 6000 / 7) for c in counts.values()) < 4 * np.sqrt(6000 / 7)
 
 

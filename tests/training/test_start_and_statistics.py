@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
 
@@ -60,12 +60,12 @@ def test_statistics_are_plain_averages_over_the_batches():
     with torch.no_grad():
         network[0].weight.fill_(1.7)
         network(torch.full((2, 1, 7), 99.0))
-    deck, same_deck = (Deck(pulses, 4, seed=3) for _ in range(2))
-    refresh_batch_statistics(network, deck, 3)
+    sampler, same_sampler = (EpochSampler(pulses, 4, seed=3) for _ in range(2))
+    refresh_batch_statistics(network, sampler, 3)
 
     means, variances = ([], []), ([], [])
     for _ in range(3):
-        x = same_deck.deal()
+        x = same_sampler.next_batch()
         means[0].append(x.mean())
         variances[0].append(x.var())
         centred = (x - x.mean()) / torch.sqrt(x.var(correction=0) + network[0].eps)
@@ -84,7 +84,7 @@ def test_all_else_is_left_as_it_was(training):
     network = nn.Sequential(nn.BatchNorm1d(1, momentum=0.3), nn.Conv1d(1, 1, 1))
     network.train(training)
     weights = [p.detach().clone() for p in network.parameters()]
-    refresh_batch_statistics(network, Deck(torch.randn(5, 1, 4), 2, seed=0), 2)
+    refresh_batch_statistics(network, EpochSampler(torch.randn(5, 1, 4), 2, seed=0), 2)
     assert network[0].momentum == 0.3
     assert all(module.training == training for module in network.modules())
     assert all(map(torch.equal, network.parameters(), weights))

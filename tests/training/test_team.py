@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import LOSS_NAMES, CycleGan, Step
-from cpunet.training.loop import Keeping, StoppedError, train
-from cpunet.training.sampling import Deck
+from cpunet.training.loop import CheckpointHooks, StoppedError, train
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.team import ALONE, Team, ToldElsewhereError, launch, meeting
 from cpunet.training.team_norm import TeamNorm, share_norms
 from cpunet.training.team_state import require_same_everywhere, share_state
@@ -122,13 +122,13 @@ def resumed_found(team: Team, overrides: list[str], sets) -> Found:
         asked.append(0)
         return team.rank == team.size - 1 and len(asked) == 1
 
-    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)), stop=stop)
+    hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)), stop=stop)
     with pytest.raises(StoppedError, match=r"^stopped after 1 of 3 iterations"):
-        train(*sets, recipe, seed=5, keeping=keeping, team=team)
+        train(*sets, recipe, seed=5, hooks=hooks, team=team)
     kept = len(states)
     start = share_state(team, states[-1] if states else None)
-    keeping = Keeping(lambda _state: None, start)
-    again = train(*sets, recipe, seed=5, keeping=keeping, team=team).state_dict()
+    hooks = CheckpointHooks(lambda _state: None, start)
+    again = train(*sets, recipe, seed=5, hooks=hooks, team=team).state_dict()
     return {"whole": whole, "again": again, "kept": kept, "random": start["random"]}
 
 
@@ -346,14 +346,16 @@ def test_a_resumed_team_ends_with_the_same_bits(found):
 def test_a_state_goes_on_in_a_team_of_another_size(found, job, sides):
     recipe = load_recipe("paper", job["resumed"])
     states: list[Any] = []
-    keeping = Keeping(lambda state: states.append(copy.deepcopy(state)), stop=lambda: True)
+    hooks = CheckpointHooks(
+        lambda state: states.append(copy.deepcopy(state)), stop=lambda: True
+    )
     with pytest.raises(StoppedError):
-        train(*sides, recipe, seed=5, keeping=keeping)
+        train(*sides, recipe, seed=5, hooks=hooks)
     (state,) = states
     assert len(state["random"]) == 1
     of_two = found[0]["resumed"]["random"]
-    keeping = Keeping(lambda _state: None, state | {"random": of_two})
-    model = train(*sides, recipe, seed=5, keeping=keeping)
+    hooks = CheckpointHooks(lambda _state: None, state | {"random": of_two})
+    model = train(*sides, recipe, seed=5, hooks=hooks)
     assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
 
 
@@ -388,15 +390,15 @@ def test_a_process_that_dies_ends_the_other(folder):
 def test_the_shares_of_a_deck_are_the_batch():
     pulses = torch.arange(20.0)[:, None, None]
     whole, *shares = (
-        Deck(pulses, 6, 1, team) for team in (ALONE, *(Team(r, 3) for r in range(3)))
+        EpochSampler(pulses, 6, 1, team) for team in (ALONE, *(Team(r, 3) for r in range(3)))
     )
     for _ in range(5):
-        batch = whole.deal()
-        assert torch.equal(torch.cat([share.deal() for share in shares]), batch)
+        batch = whole.next_batch()
+        assert torch.equal(torch.cat([share.next_batch() for share in shares]), batch)
     with pytest.raises(
         CpunetError, match=r"batch_size=6 cannot be shared equally by 4 proc.*multiple of 4"
     ):
-        Deck(pulses, 6, 1, Team(0, 4))
+        EpochSampler(pulses, 6, 1, Team(0, 4))
 
 
 @pytest.mark.parametrize("missing", ["MASTER_ADDR", "MASTER_PORT", "LOCAL_RANK"])

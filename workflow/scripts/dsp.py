@@ -16,7 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.response import describe_responses
 from cpunet.outputs import refuse_inputs
 from cpunet.regular_files import read_text
-from cpunet.yaml_files import MOST_BYTES, parsed
+from cpunet.yaml_files import MAX_BYTES, parsed
 
 
 def run_chain(
@@ -75,7 +75,7 @@ def run_chain(
 
 def _chain(config: Path) -> dict[str, Any]:
     try:
-        chain = parsed(read_text(config, MOST_BYTES))
+        chain = parsed(read_text(config, MAX_BYTES))
     except (OSError, yaml.YAMLError) as error:
         said = " ".join(str(error).split())
         raise CpunetError(f"{config}: cannot be read ({said[:200]}); correct it") from error

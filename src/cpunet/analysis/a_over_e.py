@@ -25,7 +25,7 @@ from cpunet.errors import CpunetError
 Values = npt.NDArray[np.float64]
 PeakTable = dict[str, dict[str, float | None]]
 
-FEWEST = 20  # events of the DEP: two below a cut at 90 %
+MIN_N = 20  # events of the DEP: two below a cut at 90 %
 BOOTSTRAPS = 300
 
 
@@ -124,10 +124,10 @@ def ae_survival(
     if bootstraps < 2:
         raise CpunetError(f"bootstraps is {bootstraps}; a spread needs 2 or more")
     dep = dep_ae[np.isfinite(dep_ae)]
-    if dep.size < FEWEST:
+    if dep.size < MIN_N:
         raise CpunetError(
             f"{dep.size} events of the double-escape peak have an A/E; "
-            f"a cut needs {FEWEST} or more"
+            f"a cut needs {MIN_N} or more"
         )
     rng = np.random.default_rng(seed)
     cut = _cut(dep, acceptance)
@@ -201,7 +201,7 @@ def survival_table(
     found: dict[str, Survival | None] = {}
     for method, peaks in sets.items():
         others = {name: peaks[name] for name in data if name != dep}
-        enough = np.isfinite(peaks[dep]).sum() >= FEWEST
+        enough = np.isfinite(peaks[dep]).sum() >= MIN_N
         found[method] = (
             ae_survival(peaks[dep], others, acceptance, bootstraps=bootstraps, seed=rng)
             if enough

@@ -23,7 +23,7 @@ Range = tuple[float, float]
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # of a line, that belong to no range of the continuum
-FEWEST = 60  # events about the peak of a range
+MIN_N = 60  # events about the peak of a range
 BELOW, ABOVE = 6.0, 4.0  # widths about the peak that are fitted
 REFERENCE_KEV = 1592.5  # where A/E is 1: the double-escape peak
 
@@ -151,7 +151,7 @@ def site_fit(
     centre, width = about
     x = (values - centre) / width
     x = x[(x > -BELOW) & (x < ABOVE)]
-    if len(x) < FEWEST:
+    if len(x) < MIN_N:
         return None
     start = np.array([0.0, 0.0, -0.5, 1.0])
     found = scipy.optimize.minimize(_nll, start, args=(x,), method="BFGS")
@@ -247,7 +247,7 @@ def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, An
 
 def _seen(values: Values) -> tuple[float, float] | None:
     """Place and width of the highest peak, as its upper side tells them."""
-    if len(values) < FEWEST:
+    if len(values) < MIN_N:
         return None
     centre = _densest(values)
     above = values[values > centre] - centre

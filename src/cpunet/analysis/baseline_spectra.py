@@ -26,12 +26,12 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-FEWEST = 10  # baselines for a spectrum with an error
+MIN_N = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
 # A pulse rises slowly before it crosses 1 %, its nominal start; padding in samples before that.
 MARGIN = 60
 EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are left out
-LEAST_SAMPLES = 32  # of the stretch
+MIN_SAMPLES = 32  # of the stretch
 
 
 def baseline_spectra(
@@ -81,17 +81,17 @@ def baseline_spectra(
         raise CpunetError("the measured pulses are missing; their noise is the reference")
     free = {method: _free(pulses, begins, method) for method, pulses in windows.items()}
     samples = min(samples, _stretch(free["data"]))
-    if samples < LEAST_SAMPLES:
+    if samples < MIN_SAMPLES:
         few = f"{max(samples, 0)} samples before measured pulses begin"
-        early = f"{few}; {LEAST_SAMPLES} are needed"
+        early = f"{few}; {MIN_SAMPLES} are needed"
         return {"frequency_mhz": []} | {method: {"missing": early} for method in windows}
     edges = _band_edges(samples)
     frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
     found: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
     for method, pulses in windows.items():
         power = _band_powers(pulses[free[method] >= samples, :samples], edges)
-        if len(power) < FEWEST:
-            found[method] = {"missing": f"{len(power)} baselines; {FEWEST} are needed"}
+        if len(power) < MIN_N:
+            found[method] = {"missing": f"{len(power)} baselines; {MIN_N} are needed"}
             continue
         found[method] = {"samples": samples} | _summary(power)
     data = found["data"]

@@ -11,7 +11,7 @@ from cpunet.analysis.style import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
 STD = "_std"  # suffix of the name of an error
-MOST_DIGITS = 9  # after the decimal point
+MAX_DIGITS = 9  # after the decimal point
 LONG = 12  # lists of this length or more are summarised
 BROAD = 6  # tables of this many columns or more are transposed if they have fewer rows
 
@@ -96,8 +96,8 @@ def with_std(value: Any, error: Any) -> str:
     """
     if value is None or error is None:
         return number(value)
-    digits = max(1 - math.floor(math.log10(error)), 0) if error > 0 else MOST_DIGITS
-    if digits >= MOST_DIGITS:
+    digits = max(1 - math.floor(math.log10(error)), 0) if error > 0 else MAX_DIGITS
+    if digits >= MAX_DIGITS:
         return f"{number(value)} ± {error:.2g}"
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 

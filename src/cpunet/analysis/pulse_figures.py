@@ -24,7 +24,7 @@ from cpunet.pulses.container import FloatArray
 Values = npt.NDArray[np.float64]
 
 BIN_KEV = 2.0
-MOST_BINS = 2000
+MAX_BINS = 2000
 BEFORE, AFTER = 100, 150  # samples around the crossing that define the nearest pulse
 LINEAR = 1.0  # percent of full charge, up to which the scale of differences is linear
 ZOOM_NS = (-600.0, 800.0)
@@ -60,7 +60,7 @@ def spectrum_figure(
     if not bin_kev > 0:
         raise CpunetError(f"bins of {bin_kev:g} keV; give more than 0")
     low, high = np.quantile(everything, [0, 1])
-    width = max(bin_kev, (high - low) / MOST_BINS)
+    width = max(bin_kev, (high - low) / MAX_BINS)
     edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
     palette = colours(finite)
     figure = Figure(figsize=(7.5, 4.0))

@@ -14,7 +14,7 @@ Draws = tuple["Resampled", "Resampled"]  # of the two datasets that are compared
 
 # Above this number of events, bin counts are drawn directly, in a time independent of the
 # number of events; below it, sums over drawn events are up to ten times faster.
-MOST_EVENTS = 16_384
+MAX_EVENTS = 16_384
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Resampled:
     def of(cls, events: int, size: int, draws: int, rng: np.random.Generator) -> Self:
         """Draw `size` of `events` events with replacement, `draws` times."""
         weights = None
-        if 0 < max(events, size) <= MOST_EVENTS and events:
+        if 0 < max(events, size) <= MAX_EVENTS and events:
             drawn = rng.integers(events, size=(size, draws), dtype=np.int32)
             drawn *= draws
             drawn += np.arange(draws, dtype=np.int32)

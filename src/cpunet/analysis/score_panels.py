@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from cpunet.analysis.dot_panel import dot_panel
+from cpunet.analysis.forest_plot import forest_plot
 from cpunet.analysis.side_by_side import Cell, Row
 from cpunet.analysis.style import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
@@ -28,7 +28,7 @@ def score_panels(peak: str, scores: Mapping[str, Any]) -> str:
     str
         HTML; empty if the peak is not scored.
     """
-    panels = [dot_panel(row, names) for row, names in _rows(peak, scores)]
+    panels = [forest_plot(row, names) for row, names in _rows(peak, scores)]
     return '<div class="panels">\n' + "\n".join(panels) + "\n</div>" if panels else ""
 
 

@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
 
 MARKED = "#D55E00"
-MOST_BARS = 30  # bars are 1 % wide, or wider if there would be more
+MAX_BARS = 30  # bars are 1 % wide, or wider if there would be more
 
 Scores = dict[str, dict[str, dict[str, Any]]]
 
@@ -129,7 +129,7 @@ def _panel(axes: Axes, row: Mapping[str, Any] | None, marked: float | None) -> N
         return
     iou = np.array(row["iou"])
     low, high = np.floor(iou.min()), np.floor(iou.max()) + 1
-    width = np.ceil((high - low) / MOST_BARS)
+    width = np.ceil((high - low) / MAX_BARS)
     counts, edges = np.histogram(iou, np.arange(low, high + width, width))
     axes.stairs(counts, edges, fill=True, facecolor=COLOURS["ren"], alpha=0.35)
     axes.plot(iou, np.zeros(len(iou)), "|", color=COLOURS["ren"], markersize=11, clip_on=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from html import escape
 from string import Template
 
-from cpunet.analysis.dot_panel import dot_panel
+from cpunet.analysis.forest_plot import forest_plot
 from cpunet.analysis.side_by_side import Row, SideBySide
 from cpunet.analysis.style import label
 
@@ -72,7 +72,7 @@ def side_by_side_page(table: SideBySide) -> str:
         notes="\n".join(f"<p><strong>Note:</strong> {escape(n)}</p>" for n in table.notes),
         head=head,
         rows="\n".join(_table_row(row) for row in table.rows),
-        panels="\n".join(dot_panel(row, table.names) for row in table.rows),
+        panels="\n".join(forest_plot(row, table.names) for row in table.rows),
     )
 
 

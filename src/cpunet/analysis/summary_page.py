@@ -12,7 +12,7 @@ from importlib.resources import files
 from string import Template
 from typing import Any
 
-from cpunet.analysis.dot_panel import dot_panel
+from cpunet.analysis.forest_plot import forest_plot
 from cpunet.analysis.side_by_side import Row, side_by_side
 from cpunet.analysis.verdicts import method_verdicts, part, summary
 
@@ -121,7 +121,7 @@ def _panels(rows: Sequence[Row], entries: Sequence[Entry]) -> list[str]:
     starts = [i for i, name in enumerate(detectors) if i and name != detectors[i - 1]]
     lines = []
     for peak in dict.fromkeys(row.peak for row in rows):
-        panels = [dot_panel(row, names, starts) for row in rows if row.peak == peak]
+        panels = [forest_plot(row, names, starts) for row in rows if row.peak == peak]
         lines.append(f'<h3>{escape(peak)}</h3>\n<div class="panels">')
         lines += [*panels, "</div>"]
     return lines

@@ -19,7 +19,7 @@ DENSITY, SLICES, COMPONENTS, AMPLITUDES = 24, 8, 6, 8
 FEW = 700
 # Widths in units of the spacing, and minimum widths: twice the effect of noise.
 NARROW, WIDE = 1.0, 0.8
-LEAST_DENSITY, LEAST_SLICE, LEAST_AMPLITUDE = 0.02, 0.05, 0.008
+MIN_DENSITY, MIN_SLICE, MIN_AMPLITUDE = 0.02, 0.05, 0.008
 
 
 class SlicedFunctions:
@@ -47,10 +47,10 @@ class SlicedFunctions:
         parts = 2 if len(moments.data) < FEW else 1
         self._components = min(COMPONENTS, moments.config.components - 1)
         # the density ends abruptly at the longest drift times
-        self._density = _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, LEAST_DENSITY)
-        self._slices = _points(drift, SLICES // parts, (0.03, 0.97), WIDE, LEAST_SLICE)
+        self._density = _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, MIN_DENSITY)
+        self._slices = _points(drift, SLICES // parts, (0.03, 0.97), WIDE, MIN_SLICE)
         self._amplitudes = _points(
-            amplitude, AMPLITUDES // parts, (0.05, 0.98), NARROW, LEAST_AMPLITUDE
+            amplitude, AMPLITUDES // parts, (0.05, 0.98), NARROW, MIN_AMPLITUDE
         )
 
     @property

@@ -36,7 +36,7 @@ SETTLED = 0.4
 FARTHEST, HALVINGS = 1.5, 4
 # Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
 # freed, and maximum number of such parameters.
-NEEDED, MOST_MORE = 25.0, 3
+NEEDED, MAX_MORE = 25.0, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class Search:
                 rings = self._ringing(problem)
                 may_ring = rings is None and not settled
                 response, settled = rings or response, settled and rings is None
-            added = self._needed(problem) if settled and more < MOST_MORE else None
+            added = self._needed(problem) if settled and more < MAX_MORE else None
             if settled and added is None:
                 break
             if added is not None:

@@ -31,7 +31,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import read_info
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,7 +58,7 @@ class CalibratedRun(Run):
         folder = Path(folder)
         info = read_info(folder)
         try:
-            content = plain_json(read_text(folder / CALIBRATION, MOST_BYTES))
+            content = plain_json(read_text(folder / CALIBRATION, MAX_BYTES))
         except (OSError, ValueError) as error:
             raise CpunetError(
                 f"{folder}: no calibrated run ({CALIBRATION} cannot be read); open it with "

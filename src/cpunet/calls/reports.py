@@ -27,7 +27,7 @@ from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.regular_files import read_text
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 _SHOWN = ("data", "raw", "ren", "truth")  # methods in a notebook's table
 _HISTOGRAMS = "histograms"
@@ -68,7 +68,7 @@ class Report:
         """
         file = Path(folder) / METRICS
         try:
-            metrics = plain_json(read_text(file, MOST_BYTES))
+            metrics = plain_json(read_text(file, MAX_BYTES))
         except (OSError, ValueError) as error:
             raise CpunetError(
                 f"{file}: cannot be read ({error}); give the folder of a report, or make one "

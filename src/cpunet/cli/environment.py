@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cpunet.trusted_folders import trusted
 
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 # Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
 # than most gaps between two operations and far shorter than others hold a core.
 SPIN_COUNT = "3000"
@@ -46,7 +46,7 @@ def drop_nonsense() -> list[str]:
             del os.environ[name]
             shown = ascii(value if len(value) <= 20 else f"{value[:17]}...")
             told.append(
-                f"{name}={shown} is no number of threads (1 to {MOST_THREADS}); it is ignored"
+                f"{name}={shown} is no number of threads (1 to {MAX_THREADS}); it is ignored"
             )
     code = os.environ.get("NUMBA_CACHE_DIR")
     if code and not _is_private(Path(code)):
@@ -67,7 +67,7 @@ def _is_count(text: str) -> bool:
         plain.isascii()
         and plain.isdigit()
         and len(plain) < 9
-        and 1 <= int(plain) <= MOST_THREADS
+        and 1 <= int(plain) <= MAX_THREADS
     )
 
 

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from cpunet.cli.environment import MOST_THREADS
+from cpunet.cli.environment import MAX_THREADS
 
 # Far beyond what anyone needs, and what a job can hold or live to see.
-MOST_SAMPLES = 1 << 20
-MOST_REALISATIONS = 10_000
+MAX_SAMPLES = 1 << 20
+MAX_REALISATIONS = 10_000
 
 
 def within(
@@ -49,7 +49,7 @@ Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random.")]
 Threads = Annotated[
     int | None,
-    typer.Option(min=1, max=MOST_THREADS, help="CPU threads; all cores by default."),
+    typer.Option(min=1, max=MAX_THREADS, help="CPU threads; all cores by default."),
 ]
 Device = Annotated[str, typer.Option(help="cpu, cuda, or auto: the GPU if there is one.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]

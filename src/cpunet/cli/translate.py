@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.environment import MOST_THREADS
+from cpunet.cli.environment import MAX_THREADS
 from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
 
@@ -50,7 +50,7 @@ Realisations = Annotated[
     int | None,
     typer.Option(
         min=1,
-        max=options.MOST_REALISATIONS,
+        max=options.MAX_REALISATIONS,
         help="Draw the noise so many times: rows repeated, and counted.",
     ),
 ]
@@ -64,7 +64,7 @@ Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to
 Jobs = Annotated[
     int,
     typer.Option(
-        min=1, max=MOST_THREADS, help="Processes, a file each at a time.", rich_help_panel=FILES
+        min=1, max=MAX_THREADS, help="Processes, a file each at a time.", rich_help_panel=FILES
     ),
 ]
 Resume = Annotated[
@@ -95,7 +95,7 @@ Length = Annotated[
     int | None,
     typer.Option(
         min=1,
-        max=options.MOST_SAMPLES,
+        max=options.MAX_SAMPLES,
         help="Samples of a trace; those of a window.",
         rich_help_panel=ADC,
     ),
@@ -104,7 +104,7 @@ NPre = Annotated[
     int | None,
     typer.Option(
         min=0,
-        max=options.MOST_SAMPLES,
+        max=options.MAX_SAMPLES,
         help="Samples before 99.9 % of the maximum; those of a window.",
         rich_help_panel=ADC,
     ),

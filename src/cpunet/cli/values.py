@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cpunet.recipes.schema import PeakConfig
 
 
-MOST_EVENTS = 1_000_000_000  # of a window; simulate more in several files
+MAX_EVENTS = 1_000_000_000  # of a window; simulate more in several files
 _LARGEST = 1e6
 
 
@@ -107,6 +107,6 @@ def event_count(text: str) -> int:
         raise CpunetError(
             f"--events: {shown(text)} is no number of events; give N or FEP=N,DEP=M"
         )
-    if len(digits) > len(str(MOST_EVENTS)) or int(digits) > MOST_EVENTS:
-        raise CpunetError(f"--events: {shown(text)} are too many; at most {MOST_EVENTS}")
+    if len(digits) > len(str(MAX_EVENTS)) or int(digits) > MAX_EVENTS:
+        raise CpunetError(f"--events: {shown(text)} are too many; at most {MAX_EVENTS}")
     return int(digits)

@@ -23,8 +23,8 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-LEAST_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
-FEWEST = 30  # minimum number of flat baselines
+MIN_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
+MIN_N = 30  # minimum number of flat baselines
 SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
 # Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
 START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
@@ -107,10 +107,10 @@ class BaselineNoise:
     @classmethod
     def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
         flat = baselines[_flat(baselines)] if len(baselines) else baselines
-        if len(flat) < FEWEST:
+        if len(flat) < MIN_N:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {n} traces; give more traces "
-                f"(at least {FEWEST} with known energy)"
+                f"(at least {MIN_N} with known energy)"
             )
         continuum, lines = spectrum(flat)
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
@@ -118,7 +118,7 @@ class BaselineNoise:
         counts = np.bincount(which)
         # kinds with few baselines take the common spectrum
         spectra = [
-            spectrum(flat[which == kind]) if counts[kind] >= FEWEST else (continuum, lines)
+            spectrum(flat[which == kind]) if counts[kind] >= MIN_N else (continuum, lines)
             for kind in range(len(counts))
         ]
         kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
@@ -263,7 +263,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     spread exceeds that of baselines drawn from the mean spectrum.
     """
     one = np.zeros(len(flat), np.intp)
-    if len(flat) < KINDS * FEWEST:
+    if len(flat) < KINDS * MIN_N:
         return one
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
@@ -293,17 +293,17 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
     """Samples before the pulse in prepared units times keV, the same number of each trace."""
     known = np.flatnonzero(np.isfinite(raw.energy_kev) & (raw.energy_kev > 0))
     prepared = prepare(raw[known], config, "measured")
-    if len(prepared) < FEWEST:
+    if len(prepared) < MIN_N:
         raise CpunetError(
             f"only {len(prepared)} of {len(raw)} traces have a known energy and can be "
-            f"prepared; give {FEWEST} or more to take the noise from"
+            f"prepared; give {MIN_N} or more to take the noise from"
         )
     free = samples_before_pulses(prepared, config)
     length = int(np.quantile(free, SHORTEST_SHARE))
-    if length < LEAST_SAMPLES:
+    if length < MIN_SAMPLES:
         raise CpunetError(
             f"the traces have {max(length, 0)} samples before the pulse; the noise needs "
-            f"{LEAST_SAMPLES} or more, so give traces with a longer baseline"
+            f"{MIN_SAMPLES} or more, so give traces with a longer baseline"
         )
     used = np.flatnonzero(free >= length)
     samples = raw.waveforms[known[prepared.index[used]], :length].astype(float)

@@ -26,7 +26,7 @@ from cpunet.recipes.schema import PreparationConfig
 
 # Remainders in keV at which the probability to pass the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
-TEMPLATES, FEWEST_TEMPLATES = 150, 20  # traces to which remainders are added
+TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which remainders are added
 
 
 class KnownDecay(NamedTuple):
@@ -184,7 +184,7 @@ def passing(
         templates += list(block.waveforms[empty])
         if len(templates) >= TEMPLATES:
             break
-    if len(templates) < FEWEST_TEMPLATES:
+    if len(templates) < MIN_TEMPLATES:
         return None
     raw = np.stack(templates[:TEMPLATES])
     time_us = np.arange(raw.shape[1]) * remains.dt_ns * 1e-3

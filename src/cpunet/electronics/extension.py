@@ -9,7 +9,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
 # Samples of room about a window: where noise moves the maximum, the window is cut there.
-ROOM_BEFORE, ROOM_AFTER = 200, 400
+PADDING_BEFORE, PADDING_AFTER = 200, 400
 
 
 def extended(
@@ -51,6 +51,6 @@ def extended(
 
 
 def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Records of prepared windows, shape (n, ROOM_BEFORE + config.length + ROOM_AFTER)."""
-    length = ROOM_BEFORE + config.length + ROOM_AFTER
-    return extended(windows, config, dt_ns, length, ROOM_BEFORE + config.samples_before)
+    """Records of prepared windows: PADDING_BEFORE + config.length + PADDING_AFTER samples."""
+    length = PADDING_BEFORE + config.length + PADDING_AFTER
+    return extended(windows, config, dt_ns, length, PADDING_BEFORE + config.samples_before)

@@ -15,10 +15,10 @@ from cpunet.pulses.reading.opening import open_pulses
 
 # Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
 # the record moves its level and the trace's end is independent of its beginning.
-_LEAST_SAMPLES = 8192
+_MIN_SAMPLES = 8192
 _TRACES_AT_A_TIME = 128
 # Measured traces kept for cutting; some tens of MB.
-_MOST_BASELINES = 2000
+_MAX_BASELINES = 2000
 
 
 def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatArray:
@@ -83,7 +83,7 @@ def coloured_noise(
     >>> bool(abs(noise.std() - 1) < 0.05)
     True
     """
-    n_long = max(_LEAST_SAMPLES, fft.next_fast_len(2 * length, real=True))
+    n_long = max(_MIN_SAMPLES, fft.next_fast_len(2 * length, real=True))
     power = noise_power(spectrum, dt_ns, n_long)
     # irfft divides by n_long, and each bin but the last represents both signs of frequency
     scale = n_long * np.sqrt(power / 4)
@@ -128,7 +128,7 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
                 f"{length}; lower length or give longer noise.baselines_file"
             )
         kept.append(block.waveforms - block.waveforms.mean(axis=1, keepdims=True))
-        if sum(map(len, kept)) >= _MOST_BASELINES:
+        if sum(map(len, kept)) >= _MAX_BASELINES:
             break
     baselines = np.concatenate(kept) if kept else np.zeros((0, length), np.float32)
     if not (np.isfinite(baselines).all() and baselines.std() > 0):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import (
-    FEWEST,
+    MIN_N,
     SHORTEST_SHARE,
     SIGMA_PER_MAD,
     samples_before_pulses,
@@ -31,10 +31,10 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-LEAST_SAMPLES = 64  # minimum length of a baseline
+MIN_SAMPLES = 64  # minimum length of a baseline
 MOST = 16384  # traces used in the fit of the law
 # Remainders used for the decay time: minimum height in errors, and minimum number of traces.
-LARGE, FEWEST_LARGE = 12.0, 20
+LARGE, MIN_LARGE = 12.0, 20
 # A baseline whose level differs by more than this factor from what its tilt implies is not
 # that of a remainder.
 COUPLED = 2.5
@@ -44,8 +44,8 @@ LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselin
 DISTURBED = 6.0
 # The rate is significant if it is SURE errors large and the log-likelihood gain is SURE_GAIN.
 SURE, SURE_GAIN = 4.0, 12.0
-MOST_FULL = 0.97  # maximum fraction of traces with a remainder larger than the error
-LEAST_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
+MAX_FULL = 0.97  # maximum fraction of traces with a remainder larger than the error
+MIN_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
 SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
 
 
@@ -282,8 +282,8 @@ def _gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) ->
 def _require_empty(fit: RateFit) -> None:
     """Raise a `CpunetError` if no baseline is empty, so that there is no reference level."""
     # no curvature despite a rate: the fit did not find the level of empty baselines
-    blind = fit.law.expected > LEAST_EXPECTED and not fit.rate_error_khz > 0
-    if blind or float(fit.law.share_above(fit.sigma_kev)) > MOST_FULL:
+    blind = fit.law.expected > MIN_EXPECTED and not fit.rate_error_khz > 0
+    if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
         raise CpunetError(
             "nearly all traces lie on remains of earlier pulses, so that the level of an empty "
             "baseline is not seen and nothing is told of them; measure at a lower rate"
@@ -292,18 +292,18 @@ def _require_empty(fit: RateFit) -> None:
 
 def _length(raw: Pulses, prepared: Prepared, config: PreparationConfig) -> int:
     """Number of initial samples that precede nearly all pulses."""
-    if len(prepared) < FEWEST:
+    if len(prepared) < MIN_N:
         raise CpunetError(
             f"only {len(prepared)} of {len(raw)} traces can be prepared "
-            f"({_reasons(prepared)}); {FEWEST} or more are needed to tell remains of earlier "
+            f"({_reasons(prepared)}); {MIN_N} or more are needed to tell remains of earlier "
             "pulses"
         )
     free = samples_before_pulses(prepared, config)
     length = int(np.quantile(free, SHORTEST_SHARE))
-    if length < LEAST_SAMPLES:
+    if length < MIN_SAMPLES:
         raise CpunetError(
             f"the traces have {max(length, 0)} samples before the pulse; remains of earlier "
-            f"pulses need {LEAST_SAMPLES} or more, so give traces with a longer baseline"
+            f"pulses need {MIN_SAMPLES} or more, so give traces with a longer baseline"
         )
     return length
 
@@ -317,9 +317,9 @@ def _reasons(prepared: Prepared) -> str:
 def _gain(ratios: FloatArray) -> float:
     """Gain in ADC counts per keV from the heights of the pulses."""
     known = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(known) < FEWEST:
+    if len(known) < MIN_N:
         raise CpunetError(
-            f"only {len(known)} traces have a known energy and can be prepared; {FEWEST} or "
+            f"only {len(known)} traces have a known energy and can be prepared; {MIN_N} or "
             "more are needed to tell remains of earlier pulses in keV"
         )
     return float(np.median(known))
@@ -385,7 +385,7 @@ def read_baselines(
 def _widest(width: FloatArray) -> float:
     """RMS beyond which a baseline holds another pulse."""
     finite = width[np.isfinite(width)]
-    if len(finite) < FEWEST:
+    if len(finite) < MIN_N:
         raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
     centre = float(np.median(finite))
     sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
@@ -412,7 +412,7 @@ def _lower_spread(values: FloatArray, centre: float) -> float:
 
 def _lifted(above: FloatArray, left: FloatArray) -> bool:
     """Whether tilted baselines are as high as their tilt implies, as with DC coupling."""
-    if len(above) < FEWEST_LARGE:
+    if len(above) < MIN_LARGE:
         return False
     ratio = float(np.median(above[:, : above.shape[1] // 4].mean(axis=1) / left))
     return 1 / COUPLED < ratio < COUPLED
@@ -424,7 +424,7 @@ def _own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None
     first, second = above[:, :half].mean(axis=1), above[:, half : 2 * half].mean(axis=1)
     whole = (first > 0) & (second > 0)
     fall = np.log(first[whole] / second[whole])
-    middle = float(np.median(fall)) if whole.sum() >= FEWEST_LARGE else 0.0
+    middle = float(np.median(fall)) if whole.sum() >= MIN_LARGE else 0.0
     if not middle > 0:
         return None
     error = 1.2533 * SIGMA_PER_MAD * float(np.median(np.abs(fall - middle)))

@@ -33,7 +33,7 @@ OUTLIERS = 2e-3  # fraction of traces that the law need not explain
 # Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
 WORTH = 5.0
 # Maximum fraction of the noise in its wings, and minimum number of traces to determine them.
-MOST_WINGS, FEWEST_BELOW = 0.5, 100
+MAX_WINGS, MIN_BELOW = 0.5, 100
 # Mean and width of the priors on the logarithms of the median energy and of the spectral width.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 
@@ -148,19 +148,19 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
 
     def cost(vector: FloatArray) -> float:
         sigma = np.exp(vector[0])
-        share, width = MOST_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
+        share, width = MAX_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
         core, wide = below / sigma, below / (width * sigma)
         density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
         return -float(np.log(density / sigma + 1e-30).sum())
 
-    if len(below) < FEWEST_BELOW:
+    if len(below) < MIN_BELOW:
         return 0.0, 1.0
     alone = _minimum(lambda v: cost(np.array([v[0], -50.0, 0.0])), (np.log(sigma_kev),))
     found = _minimum(cost, (np.log(sigma_kev), -1.0, 0.0))
     if float(found.fun) > float(alone.fun) - WORTH:
         return 0.0, 1.0
     _, share, width = found.x
-    return MOST_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
+    return MAX_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from cpunet.electronics.exponentials import FloatArray
 
 # After this many decay times the remainder is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
-_LEAST_KEV = 1e-3
+_MIN_KEV = 1e-3
 _ENERGIES = 64  # energies that represent a spectrum in sums over it
 
 
@@ -200,7 +200,7 @@ def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
 
     The spectrum is given by its quantiles, see `RemainsLaw`.
     """
-    logs = np.log(np.maximum(np.asarray(energies_kev, float), _LEAST_KEV))
+    logs = np.log(np.maximum(np.asarray(energies_kev, float), _MIN_KEV))
     at = np.linspace(0, 1, len(logs))
     return np.asarray(np.exp(np.interp(share, at, logs)), float)
 

@@ -15,7 +15,7 @@ from cpunet.outputs import Note, made_here, remove_own, require_replaceable, tol
 from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 # in the order they are made; and the file that each has when it is whole
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
@@ -91,7 +91,7 @@ def remove_parts(out: Path, note: Note) -> None:
 def _read_stand(stand: Path) -> dict[str, Any]:
     path = stand / MARKER
     try:
-        made = plain_json(read_text(path, MOST_BYTES))
+        made = plain_json(read_text(path, MAX_BYTES))
     except OSError as error:
         raise CpunetError(
             f"{stand}: is no stand ({MARKER} cannot be read); give another --out"

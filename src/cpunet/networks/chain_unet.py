@@ -17,7 +17,7 @@ from cpunet.networks.positional_unet import PositionalUNet
 
 RAMP = 24  # samples over which a correction goes to zero at either end
 TAIL = 100  # samples at the end of a stretch whose mean gives a record's height
-LEAST_HEIGHT = 1e-3
+MIN_HEIGHT = 1e-3
 
 
 class UNetCorrection(RecordCorrection):
@@ -58,7 +58,7 @@ class UNetCorrection(RecordCorrection):
             sample = half_sample(records, highest, at)
             inside = stretch(records, sample, -self.before, self.after)
             height = inside[:, -TAIL:].mean(dim=1, keepdim=True) / self.tail_level
-            height = height.clamp_min(LEAST_HEIGHT)
+            height = height.clamp_min(MIN_HEIGHT)
         # through the records themselves a cycle's gradient comes back
         inside = stretch(records, sample, -self.before, self.after) / height
         added = self.added(inside)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from cpunet.recipes.training_settings import MatchingConfig
 
 AFTER = 170  # samples from the half maximum: charge and slow response have come by then
-LEAST_LEVEL = 1e-3  # what is below is no pulse
+MIN_LEVEL = 1e-3  # what is below is no pulse
 
 
 class Sizes(NamedTuple):
@@ -123,7 +123,7 @@ class LinearInverse(nn.Module):
         """
         base, level = self.base_and_level(windows, sample)
         inside = stretch(windows, sample, -self.sizes.before, self.sizes.after)
-        return (inside - base[:, None]) / level.clamp_min(LEAST_LEVEL)[:, None]
+        return (inside - base[:, None]) / level.clamp_min(MIN_LEVEL)[:, None]
 
     def base_and_level(self, windows: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
         """Mean before each pulse, and how far above it the mean of its tail is."""

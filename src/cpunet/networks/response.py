@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from cpunet.recipes.network_settings import ResponseConfig
 
 # Samples of room around a window: what the response delays stays in the record.
-ROOM_BEFORE, ROOM_AFTER = 200, 400
+PADDING_BEFORE, PADDING_AFTER = 200, 400
 # Windows are zero before them and constant after them, but a decay outlasts the record: its
 # kernel is cut there, and the transform is long enough for nothing to wrap around.
-_LEAST_FACTOR = 1.6
+_MIN_FACTOR = 1.6
 IMAGES = 3  # on either side
 
 
@@ -81,12 +81,12 @@ class ElectronicsResponse(nn.Module):
         Returns
         -------
         Tensor
-            Shape (batch, ROOM_BEFORE + samples + ROOM_AFTER).
+            Shape (batch, PADDING_BEFORE + samples + PADDING_AFTER).
         """
         length = record_length(windows.shape[1])
         padded = padded_length(length)
         current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
-        current = nn.functional.pad(current, (ROOM_BEFORE, 0))
+        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
         spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
         signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
         return signal
@@ -107,7 +107,7 @@ class ElectronicsResponse(nn.Module):
         fast = (_spline(everywhere) * passed).sum(dim=0)
         time_us = torch.arange(padded, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
         step = self.decay(time_us)
-        kept = time_us < (padded / _LEAST_FACTOR - ROOM_BEFORE) * dt_ns * 1e-3
+        kept = time_us < (padded / _MIN_FACTOR - PADDING_BEFORE) * dt_ns * 1e-3
         whole: Tensor = fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
         return whole
 
@@ -186,12 +186,12 @@ def _spline(frequency: Tensor) -> Tensor:
 
 def record_length(samples: int) -> int:
     """Samples of the record that a window of so many becomes."""
-    return ROOM_BEFORE + samples + ROOM_AFTER
+    return PADDING_BEFORE + samples + PADDING_AFTER
 
 
 def padded_length(length: int) -> int:
     """Samples of the transform of a record of so many."""
-    return fast_length(math.ceil(_LEAST_FACTOR * length))
+    return fast_length(math.ceil(_MIN_FACTOR * length))
 
 
 def fast_length(least: int) -> int:

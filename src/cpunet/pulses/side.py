@@ -17,11 +17,11 @@ SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"  # attributes 
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 
 _LOOKED_AT = 256  # pulses
-_FEWEST_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
+_MIN_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
 _FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
 _TURNS = 3  # turning points of the baseline: noise has at least these, a charge signal fewer
 _SMALL = 1e-5  # of the height: rounding of a flat line
-_LEAST_END = 0.98  # of the height: without electronics a pulse ends at its maximum
+_MIN_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     """
     known = waveforms[np.isfinite(waveforms).all(axis=1)].astype(float)
     known = known[np.ptp(known, axis=1) > 0] if known.size else known
-    if not len(known) or known.shape[1] < _FEWEST_SAMPLES:
+    if not len(known) or known.shape[1] < _MIN_SAMPLES:
         return None
     height = np.ptp(known, axis=1)
     few = known.shape[1] // 10
@@ -134,7 +134,7 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
         why = "look measured (whole numbers with noise before the pulse)"
         return Recognised("measured", why, certain=False)
     end = (known[:, -few:].mean(axis=1) - known.min(axis=1)) / height
-    if max(before, after) < _TURNS and np.median(end) > _LEAST_END:
+    if max(before, after) < _TURNS and np.median(end) > _MIN_END:
         return Recognised("simulated", "look simulated (no noise, no decay)", certain=False)
     return None
 

@@ -12,7 +12,7 @@ Values = npt.NDArray[np.float64]
 
 WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
-FEWEST = 30  # minimum counts in the highest bins of a line
+MIN_N = 30  # minimum counts in the highest bins of a line
 ABOVE = 4.0  # ratio of a line's counts to those beside it
 WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
@@ -52,7 +52,7 @@ def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
     centre = 0.5 * (edges[1:] + edges[:-1])
     highest = np.flatnonzero(near == near.max())
     top = int(highest[np.abs(centre[highest] - expected_kev).argmin()])
-    if near[top] < FEWEST or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
+    if near[top] < MIN_N or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
         return None
     part = slice(max(top - WIDTH_BINS, 0), top + WIDTH_BINS + 1)
     return float(np.average(centre[part], weights=counts[part]))
@@ -68,7 +68,7 @@ SOURCES = {
 LOG_BIN = 0.002  # bin width in the logarithm of the amplitude
 BACKGROUND = 25  # bins to either side whose median is the background under a line
 HIGHEST = 12.0  # standard deviations that one line contributes at most
-CLEAR, FEWEST_LINES = 4.0, 3  # significance of a clear line; clear lines required
+CLEAR, MIN_LINES = 4.0, 3  # significance of a clear line; clear lines required
 
 
 class Suggestion(NamedTuple):
@@ -120,7 +120,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     """
     known = np.asarray(amplitudes, float)
     known = np.log(known[np.isfinite(known) & (known > 0)])
-    if len(known) < FEWEST:
+    if len(known) < MIN_N:
         return None
     edges = np.arange(known.min() - LOG_BIN, known.max() + 2 * LOG_BIN, LOG_BIN)
     excess = _excess(np.histogram(known, edges)[0])
@@ -160,7 +160,7 @@ def _shifted(
     clear = tuple(
         line for line, value in zip(lines_kev, values[best], strict=True) if value > limit
     )
-    if not np.isfinite(score[best]) or len(clear) < min(FEWEST_LINES, len(lines_kev)):
+    if not np.isfinite(score[best]) or len(clear) < min(MIN_LINES, len(lines_kev)):
         return None
     log_factor = float(places[0] * LOG_BIN - first - (best + 0.5) * LOG_BIN)
     return float(score[best]), log_factor, source, clear

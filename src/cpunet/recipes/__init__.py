@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import is_there, read_text
-from cpunet.yaml_files import MOST_BYTES, parsed, shown
+from cpunet.yaml_files import MAX_BYTES, parsed, shown
 
 
 def recipe_names() -> list[str]:
@@ -48,7 +48,7 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
         text = (files("cpunet.recipes") / f"{name}.yaml").read_text(encoding="utf-8")
     elif is_there(name):
         try:
-            text = read_text(name, MOST_BYTES)
+            text = read_text(name, MAX_BYTES)
         except OSError as error:
             raise CpunetError(f"recipe {name}: cannot be read as text ({error})") from error
     else:

@@ -15,7 +15,7 @@ from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
 # For quick pulses. Merging within 0.2 mm changes the effect of self-repulsion by 15 %.
 _QUICK_MERGING_MM, _QUICK_STRIDE = 0.1, 4
 # Maximum number of detector shapes (such as lithium thicknesses) whose potentials are kept.
-_MOST_SHAPES = 4
+_MAX_SHAPES = 4
 
 
 class SameHits:
@@ -103,7 +103,7 @@ class SameHits:
             distance = self._cluster_mm
             fine = merge_hits(self._hits, detector, distance)
             coarse = merge_hits(fine, detector, max(_QUICK_MERGING_MM, distance))
-            if len(self._shapes) == _MOST_SHAPES:
+            if len(self._shapes) == _MAX_SHAPES:
                 # keep the first, with which all others are compared
                 del self._shapes[list(self._shapes)[1]]
             repelling = (fine.edep_kev**2).sum() / max((coarse.edep_kev**2).sum(), 1e-9)

@@ -17,7 +17,7 @@ from cpunet.simulation.legend_crystal import impurity_values
 from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
-from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields, yaml_names
+from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
@@ -92,7 +92,7 @@ def read_detector(
 
 def _from_file(path: Path) -> dict[str, Any]:
     try:
-        text = read_text(path, MOST_BYTES)
+        text = read_text(path, MAX_BYTES)
     except FileNotFoundError as error:
         raise CpunetError(
             f"detector {path}: neither a file nor one of {', '.join(detector_names())}"
@@ -121,7 +121,7 @@ def _legend(
     if found is None:
         return values, hints
     try:
-        text = read_text(found, MOST_BYTES)
+        text = read_text(found, MAX_BYTES)
     except OSError as error:
         raise CpunetError(f"crystal {found}: cannot be read ({error.strerror})") from error
     content = _mapping(text, f"crystal {found}")

@@ -15,7 +15,7 @@ IntArray = npt.NDArray[np.int64]
 
 # Larger than any laboratory and any event. Compiled loops convert positions into indices and
 # would overflow beyond.
-FARTHEST_MM, MOST_KEV = 1e7, 1e9
+FARTHEST_MM, MAX_KEV = 1e7, 1e9
 
 
 @dataclass(frozen=True, eq=False)

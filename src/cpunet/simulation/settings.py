@@ -12,7 +12,7 @@ from cpunet.simulation.velocity import VelocityFactors
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
 _Nanoseconds = Annotated[float, Field(ge=0.01, le=1e6)]
 _Diffusion = Annotated[float, Field(gt=0, le=1000)]
-_MOST_STEPS = 2_000_000
+_MAX_STEPS = 2_000_000
 _PerUs = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -135,9 +135,9 @@ class SimulationSettings(Config):
             raise ValueError(f"dt_ns must be a multiple of {self.step_ns} ns")
         if self.length_ns < self.dt_ns:
             raise ValueError("length_ns must be at least dt_ns")
-        if self.n_steps > _MOST_STEPS:
+        if self.n_steps > _MAX_STEPS:
             raise ValueError(
-                f"length_ns has {self.n_steps} steps of step_ns; at most {_MOST_STEPS} are "
+                f"length_ns has {self.n_steps} steps of step_ns; at most {_MAX_STEPS} are "
                 "held at once"
             )
         return self

@@ -15,7 +15,7 @@ from cpunet.recipes.base import Config
 from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields
+from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -152,7 +152,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
 
 def _file_values(path: Path) -> Mapping[str, Any]:
     try:
-        text = read_text(path, MOST_BYTES)
+        text = read_text(path, MAX_BYTES)
     except OSError as error:
         raise CpunetError(
             f"shift {path}: cannot be read; give KEY=VALUE or a YAML file"

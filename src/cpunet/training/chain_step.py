@@ -14,12 +14,12 @@ from cpunet.networks.chain_unet import TAIL, InverseUNet, UNetCorrection
 from cpunet.networks.hybrid import half_sample
 from cpunet.networks.linear_inverse import LinearInverse, stretch
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.schema import Recipe
 from cpunet.training.compared import Compared, Judged
 from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.outside import LEAST_SCALE, Outside, of_height, tolerance
+from cpunet.training.outside import MIN_SCALE, Outside, of_height, tolerance
 
 LATEST = 60  # samples after the expected half maximum from which it is searched backward
 
@@ -60,7 +60,7 @@ class ChainStep:
         wanted_sim = self._moved(sim[:, 0], start + began)
         fake_sim, first = self.iren.located(data[:, 0])
         data_near = stretch(data[:, 0], first, 0, self.length)
-        sim_near = self._moved(sim[:, 0], self._near(sim[:, 0]) + ROOM_BEFORE)
+        sim_near = self._moved(sim[:, 0], self._near(sim[:, 0]) + PADDING_BEFORE)
         return Compared(
             identity_data=(data_near + self.correction.added(data_near), data_near),
             identity_sim=(self.iren.unet(sim_near[:, None])[:, 0], sim_near),
@@ -104,7 +104,7 @@ class ChainStep:
 
     def _moved(self, sim: Tensor, sample: Tensor) -> Tensor:
         """Simulated pulses from a sample of their records on."""
-        return stretch(sim, sample - ROOM_BEFORE, 0, self.length)
+        return stretch(sim, sample - PADDING_BEFORE, 0, self.length)
 
     def _near(self, sim: Tensor) -> Tensor:
         highest, at = sim.max(dim=1, keepdim=True)
@@ -115,6 +115,6 @@ class ChainStep:
         records: Tensor = self.correction(
             of_height(self.chain.response(pulses), self.preparation.tail_level)
         )
-        near = records[:, ROOM_BEFORE : ROOM_BEFORE + self.length]
-        level = near[:, -TAIL:].mean(dim=1, keepdim=True).clamp_min(LEAST_SCALE)
+        near = records[:, PADDING_BEFORE : PADDING_BEFORE + self.length]
+        level = near[:, -TAIL:].mean(dim=1, keepdim=True).clamp_min(MIN_SCALE)
         return near * (data_near[:, -TAIL:].mean(dim=1, keepdim=True) / level)

@@ -17,7 +17,7 @@ AS_MUCH = 0.3  # of the worst part: others are told beside it
 # An onset that is off by so much is not drawn off by a fit of what follows it.
 PHYSICS = 8.0
 # Shares of charge that arrive late; an overshoot makes them negative, by some percent.
-MOST_NEGATIVE, MOST_SLOW = -0.25, 0.5
+MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
 ONSET, TOP, TAIL = -8, 15, 84  # samples from the half maximum at which the parts end or begin
 _SAMPLES = re.compile(r"samples (-?\d+) to (-?\d+)")
 
@@ -123,12 +123,12 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
     ['70 % of the charge would arrive too early, which no readout does; see the fit']
     """
     slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
-    if slow < MOST_NEGATIVE:
+    if slow < MAX_NEGATIVE:
         return [
             f"{-100 * slow:.0f} % of the charge would arrive too early, which no readout does; "
             "see the fit"
         ]
-    if slow > MOST_SLOW:
+    if slow > MAX_SLOW:
         return [
             f"{100 * slow:.0f} % of the charge would arrive late, as of slower pulses than "
             "simulated; see the fit"

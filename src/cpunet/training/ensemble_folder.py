@@ -37,7 +37,7 @@ from cpunet.outputs import (
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import INFO, RUN
 from cpunet.training.unfinished import UNFINISHED
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 ENSEMBLE = "ensemble.json"
 _LOCK = ".lock"
@@ -152,7 +152,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
         If it cannot be read or is no mapping.
     """
     try:
-        content = plain_json(read_text(path, MOST_BYTES))
+        content = plain_json(read_text(path, MAX_BYTES))
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:

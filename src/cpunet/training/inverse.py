@@ -19,12 +19,12 @@ from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
-from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
-from cpunet.training.moments import FEWEST
+from cpunet.training.moments import MIN_N
 
 Values = npt.NDArray[np.float64]
 
@@ -88,9 +88,9 @@ def fit_inverse(
 
 
 def _check(sim: FloatArray, energy_kev: Values) -> None:
-    if len(sim) < FEWEST:
+    if len(sim) < MIN_N:
         raise CpunetError(
-            f"{len(sim)} simulated pulses for the inverse; {FEWEST} or more are needed: "
+            f"{len(sim)} simulated pulses for the inverse; {MIN_N} or more are needed: "
             "select more energies (--peak) or simulate more"
         )
     if energy_kev.shape != (len(sim),):
@@ -119,12 +119,12 @@ def _translated(
     config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
     dt_ns = float(generator.response.dt_ns)
     prepared = prepare(Pulses.of(records.numpy(), dt_ns=dt_ns), config, "measured")
-    if len(prepared) < FEWEST:
+    if len(prepared) < MIN_N:
         raise CpunetError(
             f"only {len(prepared)} of {len(sim)} translated pulses can be prepared, the "
-            f"inverse needs {FEWEST}: {prepared.rejections}; check the fit of the response"
+            f"inverse needs {MIN_N}: {prepared.rejections}; check the fit of the response"
         )
-    delay = prepared.align_sample - preparation.samples_before - ROOM_BEFORE
+    delay = prepared.align_sample - preparation.samples_before - PADDING_BEFORE
     return torch.from_numpy(prepared.pulses.waveforms), torch.from_numpy(delay), prepared.index
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from cpunet.training.loop import Record
 
 LAST = 0.25  # of the updates, over which accuracies are averaged
-FEWEST = 20  # updates
+MIN_N = 20  # updates
 WON, LOST = 0.95, 0.52
 
 
@@ -23,7 +23,7 @@ def judges_noted(records: Sequence[Record]) -> list[str]:
     """
     told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
     last = told[-max(1, round(LAST * len(told))) :]
-    if len(last) < FEWEST:
+    if len(last) < MIN_N:
         return []
     lines = []
     for side in last[0]:

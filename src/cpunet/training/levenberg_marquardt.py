@@ -18,7 +18,7 @@ FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
 # Fall of chi-square, in units of chi-square per moment, with which a fit ends: a few tenths
 # of a standard deviation along the worst-known direction.
 CONVERGED = 0.2
-DAMPING, HARDER, EASIER, TRIES = 0.01, 6.0, 6.0, 6
+DAMPING, DAMPING_UP, DAMPING_DOWN, TRIES = 0.01, 6.0, 6.0, 6
 UPDATES = 2  # steps with derivatives that were only updated
 
 
@@ -145,6 +145,6 @@ def _step(
         tried = vector + np.clip(move, -widths, widths)
         found = problem.residuals(tried)
         if found @ found < cost:
-            return tried, found, damping / EASIER
-        damping *= HARDER
+            return tried, found, damping / DAMPING_DOWN
+        damping *= DAMPING_UP
     return None

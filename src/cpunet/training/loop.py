@@ -19,7 +19,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.pairs import learn_pairs
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
 from cpunet.training.surroundings import NONE, Surroundings
@@ -37,7 +37,7 @@ class StoppedError(CpunetError):
 
 
 @dataclass(frozen=True)
-class Keeping:
+class CheckpointHooks:
     """How a training outlives its process.
 
     Parameters
@@ -57,7 +57,7 @@ class Keeping:
     stop: Callable[[], bool] = lambda: False
 
 
-NOTHING_KEPT = Keeping(lambda _state: None)
+NOTHING_KEPT = CheckpointHooks(lambda _state: None)
 
 
 def train(
@@ -70,7 +70,7 @@ def train(
     init: Callable[[CycleGan], None] | None = None,
     surroundings: Surroundings = NONE,
     listener: Listener | None = None,
-    keeping: Keeping = NOTHING_KEPT,
+    hooks: CheckpointHooks = NOTHING_KEPT,
     team: Team = ALONE,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
@@ -97,17 +97,17 @@ def train(
         Called every ``log_interval`` iterations, and before each state is kept, with the
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
         and ``"accuracy"`` of the judges where they were updated.
-    keeping
+    hooks
         Where the state goes and comes from, and whether to stop.
     team
-        Who trains; `listener` and ``keeping.save`` are called where it leads.
+        Who trains; `listener` and ``hooks.save`` are called where it leads.
 
     Raises
     ------
     CpunetError
         If a set is empty, a team cannot share the batches, or a loss becomes NaN or infinite.
     StoppedError
-        If `keeping` asked to stop.
+        If `hooks` asked to stop.
     """
     for name, pulses in (("simulated", sim), ("measured", data)):
         if not len(pulses):
@@ -118,22 +118,24 @@ def train(
         behind = None
         if surroundings.chain is not None:
             behind = ChainStep(*surroundings.chain, model.ren, model.iren, recipe)
-        decks = [
-            Deck(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team)
+        samplers = [
+            EpochSampler(
+                torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team
+            )
             for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
         ]
-        if keeping.start is None:
-            _begin(model, decks, recipe, surroundings, behind, init)
+        if hooks.start is None:
+            _begin(model, samplers, recipe, surroundings, behind, init)
         team.follow(model.state_dict().values())
         share_norms(model, team)
         step = Step(model, config, team=team, outside=surroundings.outside, chain=behind)
-        training = _Training(step, decks, device)
+        training = _Training(step, samplers, device)
         if team.size > 1:
             _reseed(seed, team.rank, 0)
-        if keeping.start is not None:
-            training.load_state_dict(keeping.start, seed)
+        if hooks.start is not None:
+            training.load_state_dict(hooks.start, seed)
         try:
-            _iterate(training, listener if team.leads else None, keeping)
+            _iterate(training, listener if team.leads else None, hooks)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
@@ -141,14 +143,14 @@ def train(
             ) from error
         training.take_averages()
         runs = (None, None) if behind is None else (behind.records, behind.iren)
-        for network, deck, run in zip((model.ren, model.iren), decks, runs, strict=True):
-            refresh_batch_statistics(network, deck, config.statistics_batches, run)
+        for network, sampler, run in zip((model.ren, model.iren), samplers, runs, strict=True):
+            refresh_batch_statistics(network, sampler, config.statistics_batches, run)
     return model.eval()
 
 
 def _begin(
     model: CycleGan,
-    decks: list[Deck],
+    samplers: list[EpochSampler],
     recipe: Recipe,
     surroundings: Surroundings,
     behind: ChainStep | None,
@@ -158,9 +160,9 @@ def _begin(
     if init is not None:
         init(model)
     elif behind is None:
-        sim, data = (deck.pulses for deck in decks)
+        sim, data = (sampler.pulses for sampler in samplers)
         match_skips(model, sim, data, recipe.preparation.samples_before)
-    learn_pairs(model, decks[0], recipe, surroundings, behind)
+    learn_pairs(model, samplers[0], recipe, surroundings, behind)
 
 
 class _DivergenceError(Exception):
@@ -170,8 +172,8 @@ class _DivergenceError(Exception):
 class _Training:
     """All that changes from iteration to iteration."""
 
-    def __init__(self, step: Step, decks: list[Deck], device: str) -> None:
-        self.step, self.decks = step, decks
+    def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
+        self.step, self.samplers = step, samplers
         self.model, self.config, self.team = step.model, step.config, step.team
         self.device = torch.device(device)
         model, config = self.model, self.config
@@ -183,8 +185,8 @@ class _Training:
     def advance(self) -> Entry:
         """Do an iteration; return its number, learning rate, losses and accuracies."""
         iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
-        batches = [deck.deal() for deck in self.decks]
-        rows = () if self.step.outside is None else (self.decks[0].dealt,)
+        batches = [sampler.next_batch() for sampler in self.samplers]
+        rows = () if self.step.outside is None else (self.samplers[0].last_rows,)
         losses = self.step(iteration, *batches, *rows)
         for averaged, network in zip(self.averages, self.generators, strict=True):
             averaged.update_parameters(network)
@@ -211,7 +213,7 @@ class _Training:
             "model": self.model.state_dict(),
             "averages": [averaged.state_dict() for averaged in self.averages],
             "step": self.step.state_dict(),
-            "decks": [deck.state_dict() for deck in self.decks],
+            "decks": [sampler.state_dict() for sampler in self.samplers],
             "random": random,
         }
 
@@ -222,8 +224,8 @@ class _Training:
         for averaged, own in zip(self.averages, state["averages"], strict=True):
             averaged.load_state_dict(own)
         self.step.load_state_dict(state["step"])
-        for deck, own in zip(self.decks, state["decks"], strict=True):
-            deck.load_state_dict(own)
+        for sampler, own in zip(self.samplers, state["decks"], strict=True):
+            sampler.load_state_dict(own)
         random = state["random"]
         rank = self.team.rank
         if rank >= len(random):  # of a larger team than before
@@ -234,14 +236,14 @@ class _Training:
             torch.cuda.set_rng_state(random[rank]["cuda"], self.device)
 
 
-def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -> None:
+def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHooks) -> None:
     config = training.config
     pending: list[Entry] = []
     while training.iteration < config.iterations:
         pending.append(training.advance())
         done = training.iteration
         last = done == config.iterations
-        stop = training.team.any(keeping.stop()) and not last
+        stop = training.team.any(hooks.stop()) and not last
         keep = last or stop or done % config.checkpoint_interval == 0
         # values are fetched in bunches: each fetch makes a GPU wait
         if keep or len(pending) == config.log_interval:
@@ -254,7 +256,7 @@ def _iterate(training: _Training, listener: Listener | None, keeping: Keeping) -
             _require_finite_weights(training)
             state = training.state_dict()
             if training.team.leads:
-                keeping.save(state)
+                hooks.save(state)
         if stop:
             raise StoppedError(
                 f"stopped after {done} of {config.iterations} iterations; go on with --resume"
@@ -293,7 +295,7 @@ def _require_finite_weights(training: _Training) -> None:
 
 
 def _deck_seeds(seed: int) -> Iterator[int]:
-    # far apart, so that neighbouring seeds share no deck
+    # far apart, so that neighbouring seeds share no sampler
     yield from (2 * seed + 1_000_003, 2 * seed + 2_000_004)
 
 

@@ -28,16 +28,16 @@ from cpunet.training._record_kernels import Window, project, read_records
 Values = npt.NDArray[np.float64]
 
 SIGMA_PER_MAD = 1.4826
-FEWEST = 200  # pulses for a covariance of about a hundred moments
+MIN_N = 200  # pulses for a covariance of about a hundred moments
 EDGE = 60  # samples to either side of the half maximum hold the steepest point
 # Up to this sample from the half maximum the physics of drift shape a pulse, later on the
 # electronics do; so many standard deviations off may the moments be where it is wrong.
 EARLY, WRONG, LATE = 30, 20.0, 2.0
-LEAST_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
+MIN_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
 QUIET = 0.05  # of the height: above it before the pulse, there is another one
 # Of translated pulses, beyond which the cut on the data's tails is no longer followed: the
 # response is still far off.
-MOST_CUT = 0.2
+MAX_CUT = 0.2
 # Measured pulses from which the functions are drawn up, and those read at a time.
 DRAWN, BLOCK = 8192, 512
 
@@ -122,12 +122,12 @@ class Moments:
         window = _window(config, preparation, level, preparation.samples_before + 1)
         aligned, slopes, log_amplitude = _read_windows(windows[some], window, preparation)
         usable = _usable(aligned, log_amplitude, config)
-        if usable.sum() < FEWEST:
+        if usable.sum() < MIN_N:
             raise CpunetError(
-                f"{int(usable.sum())} measured pulses can be used; {FEWEST} or more are "
+                f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
                 "needed: select more energies (--peak) or give more files"
             )
-        least = float(np.log(LEAST_SHARE) + np.median(log_amplitude[usable]))
+        least = float(np.log(MIN_SHARE) + np.median(log_amplitude[usable]))
         aligned, slopes, log_amplitude = aligned[usable], slopes[usable], log_amplitude[usable]
         mean, components = _principal_components(aligned, config.components)
         linear = _linear(aligned, slopes, mean, components, config)
@@ -194,7 +194,7 @@ class Moments:
         linear = (linear - self.centres) / self.spreads
         beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
         counts = np.isfinite(linear).all(axis=1) & np.isfinite(log_amplitude)
-        if cut and beyond.mean() < MOST_CUT:
+        if cut and beyond.mean() < MAX_CUT:
             counts &= ~beyond
         readings = Readings(
             linear, log_amplitude, np.ones(len(linear)) if weights is None else weights
@@ -296,7 +296,7 @@ def _usable(
     quiet = np.abs(aligned[:, : max(1, config.before // 4)].mean(axis=1)) < QUIET
     usable = np.isfinite(aligned).all(axis=1) & quiet
     if usable.any():
-        usable &= log_amplitude > np.log(LEAST_SHARE) + np.median(log_amplitude[usable])
+        usable &= log_amplitude > np.log(MIN_SHARE) + np.median(log_amplitude[usable])
     return np.asarray(usable)
 
 

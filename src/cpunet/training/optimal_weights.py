@@ -27,14 +27,14 @@ from cpunet.training.moments import BLOCK, Moments, Readings, Values
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 
 # Bins of the current amplitude are no narrower than twice its noise.
-LEAST_BIN = 0.006
+MIN_BIN = 0.006
 RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
 # A direction counts if pulses tell it this many times better than its prior.
-LEAST_TOLD = 10.0
+MIN_TOLD = 10.0
 # Passes over all pulses at most, the fall of the sum of squares with which they end, and the
 # factor of the damping.
-PASSES, CONVERGED, HARDER = 8, 0.1, 10.0
+PASSES, CONVERGED, DAMPING_UP = 8, 0.1, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +51,11 @@ class ConditionalFunctions:
         amplitudes = np.quantile(moments.data.log_amplitude, np.linspace(0.03, 0.995, bins))
         centres = [amplitudes[-1]]
         for amplitude in amplitudes[-2::-1]:
-            if centres[-1] - amplitude >= LEAST_BIN:
+            if centres[-1] - amplitude >= MIN_BIN:
                 centres.append(amplitude)
         found = np.array(centres[::-1])
         widths = np.diff(found, prepend=2 * found[0] - found[min(1, len(found) - 1)])
-        return cls(moments, found, np.maximum(widths, LEAST_BIN))
+        return cls(moments, found, np.maximum(widths, MIN_BIN))
 
     def __call__(self, readings: Readings) -> Values:
         """Functions of each pulse, shape (pulses, functions)."""
@@ -107,7 +107,7 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     widths = parameters.widths
     _, sizes, directions = np.linalg.svd(slopes * widths, full_matrices=False)
     # what is told well, in units of the priors' widths
-    told = directions[sizes > LEAST_TOLD].T * widths[:, np.newaxis]
+    told = directions[sizes > MIN_TOLD].T * widths[:, np.newaxis]
     columns = np.concatenate([slopes, np.diag(1 / widths)]) @ told
 
     def residuals(vector: Values) -> Values:
@@ -130,9 +130,9 @@ def _descend(
         found = residuals(tried)
         fall = left @ left - found @ found
         if fall <= 0:
-            damping = max(HARDER * damping, LEAST_TOLD**2)
+            damping = max(DAMPING_UP * damping, MIN_TOLD**2)
             continue
-        vector, left, damping = tried, found, damping / HARDER
+        vector, left, damping = tried, found, damping / DAMPING_UP
         if fall < CONVERGED:
             break
     return vector

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import ROOM_BEFORE, with_room
+from cpunet.electronics.extension import PADDING_BEFORE, with_room
 from cpunet.networks.linear_inverse import stretch
-from cpunet.networks.response import ROOM_AFTER as RESPONSE_ROOM
+from cpunet.networks.response import PADDING_AFTER as RESPONSE_ROOM
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-LEAST_SCALE = 1e-3
+MIN_SCALE = 1e-3
 PLATEAU = 100  # samples after the window whose mean gives the height of a record
 TOLERATED = 3.0  # standard deviations of a pulse's own baseline that no cycle is asked for
 
@@ -85,7 +85,7 @@ class Outside:
             windows[:, 0].detach().cpu().numpy(), self.preparation, self.noise.dt_ns
         )
         records = torch.from_numpy(room).to(windows)
-        inside = torch.arange(windows.shape[2], device=windows.device) + ROOM_BEFORE
+        inside = torch.arange(windows.shape[2], device=windows.device) + PADDING_BEFORE
         records = records.index_copy(1, inside, windows[:, 0])
         return self.dress(records, rows).windows
 
@@ -99,13 +99,13 @@ def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dre
     prepared = prepare(
         raw, config.model_copy(update={"saturation_run": raw.length}), "measured"
     )
-    align = np.full(len(records), ROOM_BEFORE + config.samples_before)
+    align = np.full(len(records), PADDING_BEFORE + config.samples_before)
     align[prepared.index] = prepared.align_sample
     start = torch.from_numpy(align - config.samples_before).to(records.device)
     windows = stretch(records, start, 0, config.length)
     windows = windows - windows[:, : config.baseline_samples].mean(dim=1, keepdim=True)
     level = windows[:, -config.tail_samples :].mean(dim=1, keepdim=True)
-    scale = (level / config.tail_level).clamp_min(LEAST_SCALE)
+    scale = (level / config.tail_level).clamp_min(MIN_SCALE)
     return Dressed((windows / scale)[:, None], start)
 
 
@@ -121,4 +121,4 @@ def tolerance(data: Tensor, config: PreparationConfig) -> Tensor:
 def of_height(records: Tensor, tail_level: float) -> Tensor:
     """Scale records of windows so that their first samples after the window have a level."""
     plateau = records[:, -RESPONSE_ROOM : PLATEAU - RESPONSE_ROOM].mean(dim=1, keepdim=True)
-    return records * (tail_level / plateau.clamp_min(LEAST_SCALE))
+    return records * (tail_level / plateau.clamp_min(MIN_SCALE))

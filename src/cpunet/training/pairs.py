@@ -19,13 +19,13 @@ from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.losses import weighted_l1, window_weights
 from cpunet.training.outside import Outside, as_measured, of_height
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import Surroundings
 
 
 def learn_pairs(
     model: CycleGan,
-    deck: Deck,
+    sampler: EpochSampler,
     recipe: Recipe,
     surroundings: Surroundings,
     behind: ChainStep | None,
@@ -36,7 +36,7 @@ def learn_pairs(
     ----------
     model
         Its generators learn; all else is left as it is.
-    deck
+    sampler
         Of simulated pulses.
     recipe
         Its ``training.pairs`` say how long and how fast.
@@ -54,17 +54,17 @@ def learn_pairs(
     if (behind is None or outside is None) and teacher is None:
         return
     config = recipe.cyclegan.training
-    weights = window_weights(config.losses).to(deck.pulses.device)
+    weights = window_weights(config.losses).to(sampler.pulses.device)
     learning = model.generator_parameters() if behind is None else [*model.iren.parameters()]
     optimiser = AdamW(learning, lr=config.pairs.rate, weight_decay=config.weight_decay)
     schedule = LambdaLR(optimiser, lambda done: 1 - done / config.pairs.iterations)
     for iteration in range(config.pairs.iterations):
-        sim = deck.deal()
+        sim = sampler.next_batch()
         if behind is not None and outside is not None:
-            loss = weighted_l1(*behind.pairs(sim, deck.dealt, outside), weights)
+            loss = weighted_l1(*behind.pairs(sim, sampler.last_rows, outside), weights)
         else:
             assert teacher is not None
-            loss = _of_teacher(model, sim, deck.dealt, *teacher, weights)
+            loss = _of_teacher(model, sim, sampler.last_rows, *teacher, weights)
         if not bool(torch.isfinite(loss)):
             raise CpunetError(
                 f"pairs: a loss is {float(loss)} in iteration {iteration}; lower "

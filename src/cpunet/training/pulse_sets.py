@@ -17,7 +17,7 @@ from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, Translated
 
 # Of a band at the least, where a set is thinned out.
-FEWEST_OF_BAND = 400
+MIN_OF_BAND = 400
 
 
 class PulseSets:
@@ -72,7 +72,7 @@ class PulseSets:
             chosen = []
             for order, n in ((sim_order, n_sim), (data_order, n_data)):
                 share = 1.0 if most is None else min(1.0, most / n)
-                kept = max(math.ceil(share * len(order)), min(FEWEST_OF_BAND, len(order)))
+                kept = max(math.ceil(share * len(order)), min(MIN_OF_BAND, len(order)))
                 chosen.append(np.sort(order[:kept]))
             some.append(self._band(band, *chosen))
         return some

@@ -21,7 +21,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import EdgeResidual
-from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.networks.response import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
@@ -35,7 +35,7 @@ Listener = Callable[[int, float], None]
 
 # Samples about the half maximum whose derivative is compared, and its principal components.
 SLOPE_BEFORE, SLOPE_AFTER, SLOPE_COMPONENTS = 60, 90, 16
-MOST_MIXED = 3  # features along one direction
+MAX_MIXED = 3  # features along one direction
 QUANTILES = 256
 JUDGED = 512  # directions along which the held-out sets are compared
 DRAWS = 4  # of the noise; while training, these are dealt anew to the pulses
@@ -104,7 +104,7 @@ class Features:
 
     def of_records(self, records: Tensor) -> tuple[Tensor, Tensor]:
         """The same of records with noise, of about the height of prepared ones."""
-        last = ROOM_BEFORE + self.preparation.samples_before + DELAY
+        last = PADDING_BEFORE + self.preparation.samples_before + DELAY
         return self._of(self._aligned(records, last))
 
     def _aligned(self, records: Tensor, last: int) -> Tensor:
@@ -173,8 +173,8 @@ def quantiles(values: Tensor) -> Tensor:
 
 
 def directions_of(n: int, features: int, generator: torch.Generator) -> Tensor:
-    """Random directions that mix one to `MOST_MIXED` features, shape (features, n)."""
-    mixed = torch.randint(1, MOST_MIXED + 1, (n,), generator=generator)
+    """Random directions that mix one to `MAX_MIXED` features, shape (features, n)."""
+    mixed = torch.randint(1, MAX_MIXED + 1, (n,), generator=generator)
     order = torch.rand((features, n), generator=generator).argsort(dim=0).argsort(dim=0)
     weights = torch.randn((features, n), generator=generator) * (order < mixed)
     directions: Tensor = weights / weights.norm(dim=0).clamp_min(1e-6)
@@ -267,7 +267,7 @@ def _records(generator: ResponseGenerator, sim: FloatArray, recipe: Recipe) -> T
             for first in range(0, len(sim), BLOCK)
         ]
     )
-    plateau = records[:, -ROOM_AFTER : -ROOM_AFTER + 100].mean(dim=1, keepdim=True)
+    plateau = records[:, -PADDING_AFTER : -PADDING_AFTER + 100].mean(dim=1, keepdim=True)
     scaled: Tensor = records * (recipe.preparation.tail_level / plateau)
     return scaled
 

@@ -28,12 +28,12 @@ HOPELESS_FIT = 20.0
 RINGS, PROMISES = 0.7, 0.9
 # Where a fast decay of free time may start, in us, and its share.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
-LEAST_SHARE, MOST_SHARE = 0.005, 0.2
+MIN_SHARE, MAX_SHARE = 0.005, 0.2
 # An overshoot of more than this is much like a fast decay, and would be a valley beside it.
 SLOWEST_NS = 800.0
 # The main decay that remains of earlier pulses tell is known no better than this: it is that of
 # one exponential, and a readout may have more.
-LEAST_DECAY_ERROR = 0.01
+MIN_DECAY_ERROR = 0.01
 
 
 def is_poor(problem: ResponseProblem, found: Minimum) -> bool:
@@ -150,7 +150,7 @@ def _decays(
         else:
             steeper = -problem.slope / (1e-3 * float(problem.response.dt_ns)) - 1 / decay.us
             share = steeper / _fast_slope(problem, us)
-            yield us, min(max(share, LEAST_SHARE), MOST_SHARE)
+            yield us, min(max(share, MIN_SHARE), MAX_SHARE)
 
 
 def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
@@ -215,6 +215,6 @@ def set_decay(
     """Take the data's own decay: that of remains if it is known, or else that of the tails."""
     if decay is not None:
         response.log_decay_us.data.fill_(math.log(decay.us))
-        response.decay_known = max(decay.relative_error, LEAST_DECAY_ERROR)
+        response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)
     elif slope < 0:
         response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))

@@ -34,7 +34,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import read_text, require_file
 from cpunet.training.loop import Record
 from cpunet.training.run_schema import FORMAT, problem
-from cpunet.yaml_files import MOST_BYTES, parsed, plain_json
+from cpunet.yaml_files import MAX_BYTES, parsed, plain_json
 
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
 RUN = FolderKind(
@@ -85,7 +85,7 @@ def read_info(run: Path) -> dict[str, Any]:
     """
     path = Path(run) / INFO
     try:
-        info = plain_json(read_text(path, MOST_BYTES))
+        info = plain_json(read_text(path, MAX_BYTES))
     except OSError as error:
         raise CpunetError(
             f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
@@ -103,7 +103,7 @@ def read_recipe(run: Path) -> Recipe:
     """Return the resolved recipe of a run."""
     path = Path(run) / RECIPE
     try:
-        settings = parsed(read_text(path, MOST_BYTES))
+        settings = parsed(read_text(path, MAX_BYTES))
         return recipe_from(_completed(settings), source=str(path))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error

@@ -8,10 +8,10 @@ from torch import Tensor
 from cpunet.training.team import ALONE, Team
 
 
-class Deck:
-    """Deal batches from a set of pulses like cards, reshuffled when too few are left.
+class EpochSampler:
+    """Batches of a set of pulses without replacement, reshuffled when too few are left.
 
-    Two decks with their own generators never meet in the same order twice, so no
+    Two samplers with their own generators never meet in the same order twice, so no
     simulated pulse is tied to one measured pulse, and the surplus of the larger
     set is not thrown away.
 
@@ -20,11 +20,11 @@ class Deck:
     pulses
         Shape (n, 1, samples), on the device of the training.
     batch_size
-        Pulses per batch; sets smaller than that are dealt with replacement.
+        Pulses per batch; smaller sets are drawn with replacement.
     seed
-        Of the order of the cards.
+        Seed of the order.
     team
-        Who trains: all deal the same batches, and each takes its share.
+        Process group: all draw the same batches, and each process takes its share.
 
     Raises
     ------
@@ -39,19 +39,19 @@ class Deck:
         self._own = slice(team.rank * share, (team.rank + 1) * share)
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
-        self.dealt = torch.empty(0, dtype=torch.long)
+        self.last_rows = torch.empty(0, dtype=torch.long)
         """Rows of the pulses of the last share."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the cards not yet dealt and the state of the random numbers."""
+        """Return the rows still to be drawn and the state of the random numbers."""
         return {"order": self._order.clone(), "random": self._random.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on dealing where a deck of the same pulses was."""
+        """Resume where a sampler of the same pulses was."""
         self._order = state["order"]
         self._random.set_state(state["random"])
 
-    def deal(self) -> Tensor:
+    def next_batch(self) -> Tensor:
         """Return the own share of the next batch, shape (share, 1, samples)."""
         n = len(self.pulses)
         if n < self.batch_size:
@@ -61,5 +61,5 @@ class Deck:
                 self._order = torch.randperm(n, generator=self._random)
             chosen = self._order[: self.batch_size]
             self._order = self._order[self.batch_size :]
-        self.dealt = chosen[self._own]
-        return self.pulses[self.dealt.to(self.pulses.device)]
+        self.last_rows = chosen[self._own]
+        return self.pulses[self.last_rows.to(self.pulses.device)]

@@ -14,12 +14,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 
 
 def refresh_batch_statistics(
     network: nn.Module,
-    deck: Deck,
+    sampler: EpochSampler,
     batches: int,
     run: Callable[[Tensor], object] | None = None,
 ) -> None:
@@ -29,7 +29,7 @@ def refresh_batch_statistics(
     ----------
     network
         A generator; its mode (training or evaluation) is left as it was.
-    deck
+    sampler
         Pulses of the side that it translates; in a team, that of the batch norms.
     batches
         How many batches to average over.
@@ -45,7 +45,7 @@ def refresh_batch_statistics(
     network.train()
     with torch.no_grad():
         for _ in range(batches):
-            pulses = deck.deal()
+            pulses = sampler.next_batch()
             network(pulses) if run is None else run(pulses[:, 0])
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum

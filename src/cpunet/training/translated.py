@@ -19,8 +19,8 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import (
-    ROOM_AFTER,
-    ROOM_BEFORE,
+    PADDING_AFTER,
+    PADDING_BEFORE,
     ElectronicsResponse,
     padded_length,
     record_length,
@@ -225,9 +225,11 @@ class Translated:
         spectrum = self._spectrum(first) * transfer
         padded = padded_length(self.length)
         records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
-        plateau = records[:, -ROOM_AFTER : PLATEAU - ROOM_AFTER].mean(axis=1, keepdims=True)
+        plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(
+            axis=1, keepdims=True
+        )
         records *= preparation.tail_level / plateau
-        last = ROOM_BEFORE + preparation.samples_before + DELAY
+        last = PADDING_BEFORE + preparation.samples_before + DELAY
         for draw in range(len(self.noise.factor))[:draws]:
             noisy = self.noise.add(records, draw, first)
             weights = self.weights[first : first + BLOCK]
@@ -239,8 +241,10 @@ class Translated:
         if (kept := self._spectra.get((first, len(sim)))) is not None:
             return kept
         current = np.zeros((len(sim), self.length), np.float32)
-        current[:, ROOM_BEFORE] = sim[:, 0]
-        np.subtract(sim[:, 1:], sim[:, :-1], out=current[:, ROOM_BEFORE + 1 : -ROOM_AFTER])
+        current[:, PADDING_BEFORE] = sim[:, 0]
+        np.subtract(
+            sim[:, 1:], sim[:, :-1], out=current[:, PADDING_BEFORE + 1 : -PADDING_AFTER]
+        )
         spectrum: npt.NDArray[np.complex64] = scipy.fft.rfft(
             current, padded_length(self.length)
         )

@@ -17,7 +17,7 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import HybridGenerator
-from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
@@ -125,7 +125,7 @@ class TemplateTranslator:
     def _respond(self, templates: FloatArray) -> tuple[FloatArray, Codes]:
         assert self.chain is not None
         records = self.chain(torch.from_numpy(templates).to(self.ren.backend.device))
-        inside = records[:, ROOM_BEFORE : ROOM_BEFORE + templates.shape[1]].cpu().numpy()
+        inside = records[:, PADDING_BEFORE : PADDING_BEFORE + templates.shape[1]].cpu().numpy()
         lost = ~np.isfinite(inside).all(axis=1)
         inside[lost] = np.nan
         return inside, np.where(lost, Rejection.NO_AMPLITUDE, Rejection.ACCEPTED).astype(

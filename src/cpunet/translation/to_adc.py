@@ -28,7 +28,7 @@ from cpunet.translation.translator import BATCH, REN
 
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_SAMPLES = 20  # of the pulse whose height defines the gain
-LEAST_ADC = 20.0  # raw traces have a larger median scale
+MIN_ADC = 20.0  # raw traces have a larger median scale
 
 Floats = npt.NDArray[np.float64]
 
@@ -253,7 +253,7 @@ def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:
     info = read_info(run)
     cuts = (info.get("data") or {}).get("cuts") or {}
     amplitude = float(cuts.get("amplitude") or 0.0)
-    if amplitude < LEAST_ADC:
+    if amplitude < MIN_ADC:
         return None, None
     centres = {window["name"]: float(window["centre"]) for window in cuts.get("windows", ())}
     peak = ren.recipe.peaks.get(info["peak"])

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.regular_files import read_text
-from cpunet.yaml_files import MOST_BYTES, shown, yaml_fields, yaml_names
+from cpunet.yaml_files import MAX_BYTES, shown, yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.electronics.presets")
 
@@ -65,7 +65,7 @@ def read_electronics(path: str | Path) -> Electronics:
 
 def _text(path: Path) -> str:
     try:
-        return read_text(path, MOST_BYTES)
+        return read_text(path, MAX_BYTES)
     except FileNotFoundError as error:
         raise CpunetError(
             f"electronics {path}: neither a file nor one of {', '.join(electronics_names())}"

@@ -13,7 +13,7 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-FEWEST = 50  # minimum number of pulses of either dataset for a fit
+MIN_N = 50  # minimum number of pulses of either dataset for a fit
 
 
 class Rival(Protocol):
@@ -63,9 +63,9 @@ def check_sets(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> N
     """Raise a `CpunetError` unless a response can be fitted to the two datasets."""
     for side, windows in (("simulated", sim), ("measured", data)):
         check_windows(windows, side)
-        if len(windows) < FEWEST:
+        if len(windows) < MIN_N:
             raise CpunetError(
-                f"{len(windows)} {side} pulses; give {FEWEST} or more to fit a response to"
+                f"{len(windows)} {side} pulses; give {MIN_N} or more to fit a response to"
             )
     if sim.shape[1] != data.shape[1]:
         raise CpunetError(

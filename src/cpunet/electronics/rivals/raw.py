@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from cpunet.electronics.rivals.base import check_sets, check_windows
-from cpunet.electronics.rivals.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.electronics.rivals.response import PADDING_AFTER, PADDING_BEFORE
 from cpunet.pulses.container import FloatArray
 
 
@@ -29,8 +29,8 @@ class Raw:
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Pad the windows to records, see `base.Rival.translate`."""
         check_windows(waveforms, "simulated")
-        before = np.zeros((len(waveforms), ROOM_BEFORE), np.float32)
-        after = np.repeat(waveforms[:, -1:], ROOM_AFTER, axis=1)
+        before = np.zeros((len(waveforms), PADDING_BEFORE), np.float32)
+        after = np.repeat(waveforms[:, -1:], PADDING_AFTER, axis=1)
         return np.concatenate([before, waveforms, after], axis=1, dtype=np.float32)
 
     def describe(self) -> Mapping[str, float]:

@@ -18,7 +18,7 @@ import scipy.signal
 from cpunet.electronics.finishing import blocks
 from cpunet.electronics.rivals.base import Values, check_sets, check_windows
 from cpunet.electronics.rivals.response import (
-    ROOM_BEFORE,
+    PADDING_BEFORE,
     currents,
     integrated,
     record_length,
@@ -68,7 +68,7 @@ class RC:
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
         wanted = most_frequent(current_amplitude(steps))
-        window = slice(ROOM_BEFORE, ROOM_BEFORE + sim.shape[1])
+        window = slice(PADDING_BEFORE, PADDING_BEFORE + sim.shape[1])
         current = currents(sim[:MOST])
 
         def excess(tau: float) -> float:

@@ -19,20 +19,20 @@ from cpunet.pulses.container import FloatArray
 Spectrum = npt.NDArray[np.complex128]
 
 # Samples of padding. A window of 800 becomes a record of 1400, a fast length of the FFT.
-ROOM_BEFORE = 200
-ROOM_AFTER = 400
+PADDING_BEFORE = 200
+PADDING_AFTER = 400
 
 
 def record_length(window: int) -> int:
     """Number of samples of the record that a window of `window` samples becomes."""
-    return ROOM_BEFORE + window + ROOM_AFTER
+    return PADDING_BEFORE + window + PADDING_AFTER
 
 
 def currents(windows: FloatArray) -> Values:
     """Charge collected per sample over the whole record, shape ``(n, record)``."""
     n, length = windows.shape
     record = np.zeros((n, record_length(length)))
-    record[:, ROOM_BEFORE : ROOM_BEFORE + length] = np.diff(
+    record[:, PADDING_BEFORE : PADDING_BEFORE + length] = np.diff(
         windows.astype(float), axis=1, prepend=0.0
     )
     return record

@@ -17,7 +17,7 @@ import scipy.fft
 
 from cpunet.electronics.rivals.base import Values, check_sets, check_windows
 from cpunet.electronics.rivals.response import (
-    ROOM_BEFORE,
+    PADDING_BEFORE,
     Spectrum,
     currents,
     record_length,
@@ -84,7 +84,7 @@ class Superpulse:
             kernel = _kernel(wanted, _superpulses(spectra, response), length)
         found = cls(dt_ns, kernel, slope)
         # the contribution of the kernel's late part to the tail slope is taken off the decay
-        windows = found.translate(sim[:MOST])[:, ROOM_BEFORE : ROOM_BEFORE + sim.shape[1]]
+        windows = found.translate(sim[:MOST])[:, PADDING_BEFORE : PADDING_BEFORE + sim.shape[1]]
         excess = fitted_tail_slope(windows, dt_ns, align) - slope
         return replace(found, tail_slope_per_ms=slope - excess)
 

@@ -27,9 +27,9 @@ from cpunet.recipes.schema import Recipe
 _READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
 Energies = npt.NDArray[np.float64]
 
-MOST_KEV, LEAST_KEV = 20_000.0, 20.0  # typical range of gamma energies
+MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
-LEAST_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
 @dataclass(frozen=True)
@@ -235,9 +235,9 @@ def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str
         return ""
     low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
-    if high > MOST_KEV:
+    if high > MAX_KEV:
         return f"{there}: if these are ADC counts, give --kev-per-adc"
-    if high < LEAST_KEV:
+    if high < MIN_KEV:
         return f"{there}: if these are MeV, give --kev-per-adc 1000"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
     n = int((energies >= from_kev).sum())
@@ -259,4 +259,4 @@ def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:
     """Whether simulated pulses end below their maximum, as measured ones do."""
     end = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
-    return bool(np.median(end) < LEAST_SIMULATED_END)
+    return bool(np.median(end) < MIN_SIMULATED_END)

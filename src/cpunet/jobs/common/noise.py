@@ -12,7 +12,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
-FEWEST_EMPTY = 200  # minimum number of these if traces with remains are left out
+MIN_EMPTY = 200  # minimum number of these if traces with remains are left out
 
 
 def measured_noise(
@@ -71,5 +71,5 @@ def noise_of_traces(
     known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
     if remains is not None and remains.law is not None:
         empty = known & remains.empty(block)
-        known = empty if empty.sum() >= FEWEST_EMPTY else known
+        known = empty if empty.sum() >= MIN_EMPTY else known
     return BaselineNoise.from_traces(block[known], config)

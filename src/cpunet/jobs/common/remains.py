@@ -11,12 +11,12 @@ from cpunet.electronics.drawn_remains import DrawnRemains, passing
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
-from cpunet.networks.response import ROOM_BEFORE
+from cpunet.networks.response import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 BLOCK = 4096  # traces per block
-MOST_BLOCKS = 16  # blocks searched for traces that passed the cuts
+MAX_BLOCKS = 16  # blocks searched for traces that passed the cuts
 
 
 def measured_remains(
@@ -50,7 +50,9 @@ def drawn_like(
         Preparation of the pulses.
     """
     windows = data.prepared.pulses.waveforms
-    begins = float(np.median(data.prepared.align_sample)) - config.samples_before - ROOM_BEFORE
+    begins = (
+        float(np.median(data.prepared.align_sample)) - config.samples_before - PADDING_BEFORE
+    )
     passed = None
     if data.cuts is not None and remains.law is not None:
         passed = passing(remains, _rows(data_file, data), config, data.cuts)
@@ -71,7 +73,7 @@ def _rows(data_file: InputFile, data: InputSet) -> Iterator[Pulses]:
         index = data.prepared.index
         yield block[index[(index >= first) & (index < first + len(block))] - first]
         first += len(block)
-        if number + 1 >= MOST_BLOCKS:
+        if number + 1 >= MAX_BLOCKS:
             return
 
 

@@ -17,7 +17,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import PreparationConfig
 
 _NAME = "response"
-_MOST_SAMPLES = 1 << 20
+_MAX_SAMPLES = 1 << 20
 
 
 def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
@@ -77,7 +77,7 @@ class Responses:
                 f"{path}: response has shape {shape}, but {sim.path} holds "
                 f"{sim.prepared.n_read} pulses; give the truth of that file"
             )
-        if dtype.kind not in "iuf" or not 2 <= shape[1] <= _MOST_SAMPLES:
+        if dtype.kind not in "iuf" or not 2 <= shape[1] <= _MAX_SAMPLES:
             raise CpunetError(
                 f"{path}: response is of {dtype}, {shape[1]} samples each; give traces"
             )

@@ -30,7 +30,7 @@ from cpunet.translation.translator import REN
 
 QUIET = Monitor()
 POINTS = 400  # approximate number of grid points in the crystal
-FEWEST, MOST = 20, 600  # more points would exceed a page of 5 MB
+MIN_N, MOST = 20, 600  # more points would exceed a page of 5 MB
 NEIGHBOURS = 3  # measured pulses shown for each grid point
 
 
@@ -63,7 +63,7 @@ def explore_runs(
     data
         Measured pulses, prepared and cut as in the training.
     points
-        Approximate number of grid points, `FEWEST` to `MOST`.
+        Approximate number of grid points, `MIN_N` to `MOST`.
     settings
         Settings of the simulation; ``dt_ns`` must be that of the runs, which is the default.
     device, force, monitor
@@ -84,8 +84,8 @@ def explore_runs(
         depleted, or no grid point has a pulse.
     """
     refuse_existing(out, *runs, *([] if data is None else data.files), force=force)
-    if not FEWEST <= points <= MOST:
-        raise CpunetError(f"--points {points}: give from {FEWEST} to {MOST} places")
+    if not MIN_N <= points <= MOST:
+        raise CpunetError(f"--points {points}: give from {MIN_N} to {MOST} places")
     translators = _load(runs, resolve_device(device))
     peak = _peak(runs) if data is not None else ""
     ren = translators[0]

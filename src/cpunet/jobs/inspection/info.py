@@ -26,7 +26,7 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, PreparationConfig
 from cpunet.regular_files import read_text
 from cpunet.simulation.hit_readers import holds_hits
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 _RUN_FILE = "run.json"
 LOOKED_AT, REMAINS_BLOCK = 256, 4096  # traces read at a time
@@ -228,7 +228,7 @@ def _run(folder: Path) -> dict[str, Any]:
             f"{folder}: a folder without {_RUN_FILE}; give the folder of a run, or a file"
         )
     try:
-        content = plain_json(read_text(file, MOST_BYTES))
+        content = plain_json(read_text(file, MAX_BYTES))
     except (OSError, ValueError) as error:
         raise CpunetError(
             f"{file}: cannot be read ({error}); the run is damaged, train it again"

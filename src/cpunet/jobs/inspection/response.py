@@ -36,7 +36,7 @@ from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import load_network, read_info, read_recipe
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 MARKER = "response.json"
@@ -48,7 +48,7 @@ RESPONSE = FolderKind(
 )
 
 _DPI = 150
-_LEAST_SLOW = 0.005  # share of the charge below which a mean time is meaningless
+_MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
 _FOREVER_US = 1e9  # instead of a decay
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
@@ -162,7 +162,7 @@ def stand_electronics(stand: Path) -> Electronics:
     """
     path = Path(stand) / "stand.json"
     try:
-        text = read_text(path, MOST_BYTES)
+        text = read_text(path, MAX_BYTES)
         return Electronics.model_validate(plain_json(text)["electronics"])
     except OSError as error:
         raise CpunetError(
@@ -340,7 +340,7 @@ def _slow(shares: Mapping[float, float]) -> Numbers:
     """Total late share and its mean time, from shares by time in ns."""
     total = sum(shares.values())
     numbers = {"slow_share": total}
-    if abs(total) >= _LEAST_SLOW:
+    if abs(total) >= _MIN_SLOW:
         numbers["slow_time_ns"] = sum(tau * w for tau, w in shares.items()) / total
     return numbers
 

@@ -27,7 +27,7 @@ BLOCK_EVENTS = 2000
 _ROUND_EVENTS = 1000
 _GAMMAS_PER_EVENT = 100_000
 # Each round under way holds some ten MB of hits.
-_MOST_WORKERS = 8
+_MAX_WORKERS = 8
 # Shares of hits outside the crystal: up to the first, rounding at its surface may be the
 # reason; beyond the second, these are no hits of this detector.
 _STRAY, _MISPLACED = 1e-3, 0.9
@@ -236,7 +236,7 @@ class GammaSource:
         Each round has a seed of its own, so that the events do not depend on the cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
-        workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS, rounds)
+        workers = min(len(os.sched_getaffinity(0)), _MAX_WORKERS, rounds)
         waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0

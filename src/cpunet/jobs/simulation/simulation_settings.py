@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.regular_files import read_text
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import MOST_BYTES, parsed, shown, yaml_fields
+from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields
 
 
 def load_settings(
@@ -80,7 +80,7 @@ def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]
 
 def _mapping(path: Path) -> dict[str, Any]:
     try:
-        text = read_text(path, MOST_BYTES)
+        text = read_text(path, MAX_BYTES)
     except OSError as error:
         reason = error.strerror or error
         raise CpunetError(f"{path}: cannot be read ({reason}); give a YAML file") from error

@@ -26,17 +26,17 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.loop import Keeping, State, train
+from cpunet.training.loop import CheckpointHooks, State, train
 from cpunet.training.run_folder import write_run
-from cpunet.training.sampling import Deck
+from cpunet.training.sampling import EpochSampler
 from cpunet.training.statistics import refresh_batch_statistics
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 
 SHARE = 0.3  # of the pulses of each side
-FEWEST = 20  # minimum per side for a distribution
-MOST_LOST = 0.01  # of the translations: losing bad pulses would improve the score of the rest
+MIN_N = 20  # minimum per side for a distribution
+MAX_LOST = 0.01  # of the translations: losing bad pulses would improve the score of the rest
 REPORTS = 8  # intermediate scores of a CycleGAN
 
 Report = Callable[[int, float], None]  # iterations done, score
@@ -79,10 +79,10 @@ class HeldOut:
         for side in (sim, data):
             pulses = side.prepared.pulses
             rows, n = rng.permutation(len(pulses)), int(SHARE * len(pulses))
-            if n < FEWEST:
+            if n < MIN_N:
                 raise CpunetError(
                     f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
-                    f"and {FEWEST} are needed; select more energies (--peak) or give more"
+                    f"and {MIN_N} are needed; select more energies (--peak) or give more"
                 )
             parts.append((pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]))
         (fit_sim, held_sim), (fit_data, held_data) = parts
@@ -115,7 +115,7 @@ class HeldOut:
             remains_kev=drawn_kev(remains, len(self.sim), generator),
         )
         whole = np.isfinite(windows).all(axis=1)
-        if (lost := 1 - whole.mean()) > MOST_LOST:
+        if (lost := 1 - whole.mean()) > MAX_LOST:
             raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
         pulses = Pulses.of(windows[whole], dt_ns=self.sim.dt_ns)
         values = pulse_parameters(pulses, ren.recipe.preparation, ren.recipe.scores)
@@ -154,7 +154,7 @@ class HeldOut:
                 seed=seed,
                 device=device,
                 surroundings=begun.surroundings,
-                keeping=Keeping(self._watch(begun, device, report)),
+                hooks=CheckpointHooks(self._watch(begun, device, report)),
             )
         return self._loaded(model, recipe, seed, device)
 
@@ -193,12 +193,12 @@ class HeldOut:
             {k.removeprefix(prefix): v for k, v in averages if k.startswith(prefix)}
         )
         pulses = torch.from_numpy(self.fit.sim.waveforms)[:, None].to(device)
-        deck = Deck(pulses, config.batch_size, seed=self.seed)
+        sampler = EpochSampler(pulses, config.batch_size, seed=self.seed)
         chain = begun.surroundings.chain
         run = None
         if chain is not None:
             run = ChainStep(*chain, model.ren, model.iren, recipe).records
-        refresh_batch_statistics(model.ren, deck, config.statistics_batches, run)
+        refresh_batch_statistics(model.ren, sampler, config.statistics_batches, run)
         return self._loaded(model, recipe, self.seed, device)
 
 

@@ -36,7 +36,7 @@ from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes.schema import Recipe
 
-FEWEST, FEW = 200, 1000  # pulses of a side: below, a fit is refused or knows little
+MIN_N, FEW = 200, 1000  # pulses of a side: below, a fit is refused or knows little
 # Ratios beyond which the detector is another one, by more than a calibration of it finds
 SPREAD_RATIO, SHARPER = 1.2, 1.08
 # Differences that rounding to a sampling period and, in standard deviations, chance make; these
@@ -179,7 +179,7 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
         return findings
     for one, side in ((sim, "simulated"), (data, "measured")):
         findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
-    if min(len(sim.prepared), len(data.prepared)) < FEWEST:
+    if min(len(sim.prepared), len(data.prepared)) < MIN_N:
         return findings  # the shapes of so few say nothing
     findings.append(_spread(sim, data))
     findings.append(_amplitude(sim, data))
@@ -210,7 +210,7 @@ def _count(one: InputSet, side: str) -> Finding:
     text = f"{one.path.name}: {n} {side} pulses of {one.prepared.n_read} can be used"
     if n >= FEW:
         return Finding("counts", Level.FINE, text)
-    level = Level.ERROR if n < FEWEST else Level.WARNING
+    level = Level.ERROR if n < MIN_N else Level.WARNING
     remedy = f"{FEW} or more are better: more files, or more energies (--peak)"
     return Finding("counts", level, text, remedy)
 

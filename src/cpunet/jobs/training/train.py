@@ -37,7 +37,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.judges import judges_noted
-from cpunet.training.loop import Keeping, Listener, Record, train
+from cpunet.training.loop import CheckpointHooks, Listener, Record, train
 from cpunet.training.run_folder import (
     RUN,
     append_losses,
@@ -251,7 +251,7 @@ class TrainingJob:
                 show(records)
                 advance(len(records))
 
-            model = self._trained(begun, Keeping(run.save, start, stop), listen)
+            model = self._trained(begun, CheckpointHooks(run.save, start, stop), listen)
         run.finish()
         for line in judges_noted(read_losses(self.folder)):
             self.monitor.note(f"warning: {line}")
@@ -263,7 +263,9 @@ class TrainingJob:
         """Train with the process that leads, which keeps all."""
         require_same_everywhere(self.team, self._fingerprint())
         start = share_state(self.team, None)
-        self._trained(self._network_start(), Keeping(lambda _state: None, start, stop), None)
+        self._trained(
+            self._network_start(), CheckpointHooks(lambda _state: None, start, stop), None
+        )
 
     def _network_start(self) -> NetworkStart:
         sides = Sides(
@@ -272,7 +274,7 @@ class TrainingJob:
         return network_start(sides, self.recipe, self.seed, self.init, self.monitor)
 
     def _trained(
-        self, begun: NetworkStart, keeping: Keeping, listener: Listener | None
+        self, begun: NetworkStart, hooks: CheckpointHooks, listener: Listener | None
     ) -> nn.Module:
         return train(
             self.sim.prepared.pulses.waveforms,
@@ -283,7 +285,7 @@ class TrainingJob:
             init=begun.fill,
             surroundings=begun.surroundings,
             listener=listener,
-            keeping=keeping,
+            hooks=hooks,
             team=self.team,
         )
 

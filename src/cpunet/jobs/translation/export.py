@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.response import describe_responses
-from cpunet.networks.response import ROOM_AFTER, ROOM_BEFORE
+from cpunet.networks.response import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.regular_files import read_text
@@ -28,7 +28,7 @@ from cpunet.translation.backends import (
 )
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
 from cpunet.translation.translator import IREN, REN, Translator
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 _LANGUAGES = {
@@ -130,7 +130,7 @@ def _write_noise(path: Path, noise: BaselineNoise) -> None:
 def _scores(report: Path) -> Mapping[str, Any]:
     path = report / "metrics.json"
     try:
-        peaks = plain_json(read_text(path, MOST_BYTES))["peaks"]
+        peaks = plain_json(read_text(path, MAX_BYTES))["peaks"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CpunetError(
             f"{path}: no scores; give the folder that `cpunet validate` made"
@@ -232,8 +232,9 @@ def _interface(translator: Translator) -> list[str]:
         )
     elif forward:
         lines.append(
-            f"* out: `records`, float32 (batch, {ROOM_BEFORE + n + ROOM_AFTER}): noise-free, "
-            f"per unit of charge; sample {ROOM_BEFORE} belongs to the window's first.\n\n"
+            f"* out: `records`, float32 (batch, {PADDING_BEFORE + n + PADDING_AFTER}): "
+            f"noise-free, per unit of charge; sample {PADDING_BEFORE} belongs to the window's "
+            "first.\n\n"
             f"Afterwards records are prepared as measured traces: {measured}."
             "\n"
         )

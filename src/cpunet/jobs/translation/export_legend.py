@@ -36,7 +36,7 @@ from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 WHOLE = "cpunet.yaml"
@@ -162,7 +162,7 @@ def _chain(run: Path) -> Any:
 def _against_energy(report: Path, info: Mapping[str, Any]) -> dict[str, Any]:
     path = report / "metrics.json"
     try:
-        metrics = plain_json(read_text(path, MOST_BYTES))
+        metrics = plain_json(read_text(path, MAX_BYTES))
         training, found = metrics["training"], metrics["ae_energy"]
         other = [key for key in SAME if training[key] != info[key]]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -11,7 +11,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, require_stored, text_attribute
 from cpunet.pulses.reading.columns import TIME_UNITS
-from cpunet.pulses.reading.source import MOST_SAMPLES
+from cpunet.pulses.reading.source import MAX_SAMPLES
 
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 
@@ -64,7 +64,7 @@ def n_templates(file: h5py.File, path: str, source: Path) -> int:
         expected = (len(library["r"]), len(library["z"]))
         if library[name].dtype.kind not in "iuf":
             raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
-        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MOST_SAMPLES:
+        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MAX_SAMPLES:
             raise CpunetError(
                 f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
                 "(r, z, samples)"

@@ -21,7 +21,7 @@ from cpunet.jobs.translation.library_file import (
 )
 from cpunet.regular_files import read_text
 from cpunet.translation.ring_padding import padded_axis
-from cpunet.yaml_files import MOST_BYTES, parsed, plain_json
+from cpunet.yaml_files import MAX_BYTES, parsed, plain_json
 
 PERIOD_NS = 1.0
 PULSES = "geds/sim"  # of an output of `cpunet simulate`, which tells how it was made
@@ -153,7 +153,7 @@ def chosen_libraries(
 def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
     """Name of the detector whose simulation a run was trained with, if that can be found."""
     try:
-        described = parsed(read_text(Path(run) / "detector.yaml", MOST_BYTES))
+        described = parsed(read_text(Path(run) / "detector.yaml", MAX_BYTES))
         name = described.get("name") if isinstance(described, dict) else None
     except (OSError, ValueError, CpunetError):
         name = None

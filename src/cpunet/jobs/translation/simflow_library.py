@@ -48,7 +48,7 @@ QUIET = Monitor()
 ROWS = 16  # of r that are translated at once
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of the step of charge that tells the chain's delay
 # A template of charge ends near its highest value; one of current, or aligned at it, does not.
-LEAST_END = 0.5
+MIN_END = 0.5
 
 Floats = npt.NDArray[np.float32]
 
@@ -168,7 +168,7 @@ def _look(
                 mask[first : first + len(block)] = there
                 ends = np.abs(templates[good])
                 moving += len(ends)
-                not_ending += int((ends[:, -1] < LEAST_END * ends.max(axis=1)).sum())
+                not_ending += int((ends[:, -1] < MIN_END * ends.max(axis=1)).sum())
                 amplitudes.append(heights(currents[good]))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
                 advance(block.shape[0] * block.shape[1])

@@ -36,7 +36,7 @@ QUIET = Monitor()
 TEMPLATES_AT_A_TIME = 1024
 KEPT = 256  # templates to measure the linearity with
 # A template of charge ends near its highest value; one of current, or aligned at it, does not.
-LEAST_END = 0.5
+MIN_END = 0.5
 
 
 @dataclass
@@ -62,7 +62,7 @@ class _Tally:
         good = np.flatnonzero(moving & (codes == Rejection.ACCEPTED))
         self.counts["translated"] += int((known & (codes == Rejection.ACCEPTED)).sum())
         highest = np.abs(templates[good]).max(axis=1)
-        self.not_ending += int((np.abs(templates[good, -1]) < LEAST_END * highest).sum())
+        self.not_ending += int((np.abs(templates[good, -1]) < MIN_END * highest).sum())
         self.counts["moving"] += len(good)
         few = np.random.default_rng(seed).permutation(good)[:8]
         self.kept.append(np.asarray(templates[few], np.float32))

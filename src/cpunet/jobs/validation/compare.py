@@ -13,7 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.outputs import refuse_existing
 from cpunet.regular_files import read_text
-from cpunet.yaml_files import MOST_BYTES, plain_json
+from cpunet.yaml_files import MAX_BYTES, plain_json
 
 REPORT = "report"  # folder of a demonstration that contains the metrics
 
@@ -71,7 +71,7 @@ def read_metrics(file: Path) -> dict[str, Any]:
         If the file cannot be read or does not contain the scores of a validation.
     """
     try:
-        content = plain_json(read_text(file, MOST_BYTES))
+        content = plain_json(read_text(file, MAX_BYTES))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise CpunetError(

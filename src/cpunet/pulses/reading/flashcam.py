@@ -17,7 +17,7 @@ from cpunet.file_probe import require_survivable
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
-_MOST_CHANNELS = 1 << 16
+_MAX_CHANNELS = 1 << 16
 
 
 class FlashCamSource(PulseSource):
@@ -35,7 +35,7 @@ class FlashCamSource(PulseSource):
             n_channels = int(config.adcs)
             length = int(config.eventsamples)
             period_ns = np.asarray(float(config.sampling_period_ns))
-        if not 0 < n_channels <= _MOST_CHANNELS:
+        if not 0 < n_channels <= _MAX_CHANNELS:
             raise CpunetError(f"{options.path}: {n_channels} channels; copy the file again")
         self._channel = _channel(options, n_channels)
         layout = Layout(

@@ -19,7 +19,7 @@ from lh5.compression import decode
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import text_attribute
 from cpunet.kernels import kernel
-from cpunet.pulses.reading.source import MOST_SAMPLES
+from cpunet.pulses.reading.source import MAX_SAMPLES
 
 _RADWARE, _VARLEN = "radware_sigcompress", "uleb128_zigzag_diff"
 
@@ -91,7 +91,7 @@ def _check_encoded(path: Path, name: str, start: int, raw: Any) -> None:
     codec = str(raw.attrs.get("codec", ""))
     if codec not in (_RADWARE, _VARLEN):
         raise CpunetError(f"{path}: {name} is encoded by {codec or 'nothing known'}; decode it")
-    bad = (lengths < 1) | (lengths > MOST_SAMPLES)
+    bad = (lengths < 1) | (lengths > MAX_SAMPLES)
     if bad.any():
         row = int(bad.argmax())
     else:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.source import (
-    MOST_SAMPLES,
+    MAX_SAMPLES,
     Layout,
     PulseSource,
     ReadOptions,
@@ -27,7 +27,7 @@ from cpunet.pulses.reading.source import (
 )
 from cpunet.restricted_unpickler import TruncatedError, load_all
 
-_MOST_NUMBER = 2**62
+_MAX_NUMBER = 2**62
 _PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
 _NUMBERS = ("tp0", "energy", "dc_label")  # beside the samples
 _CONVERT = "convert it with `cpunet import pulses`, which leaves such out and counts them"
@@ -85,9 +85,9 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
                 numbers[name] = float(value)
     except (TypeError, ValueError, OverflowError):
         return None, "no_numbers"
-    if abs(event) > _MOST_NUMBER:
+    if abs(event) > _MAX_NUMBER:
         return None, "no_numbers"
-    if samples.ndim != 1 or not 0 < len(samples) <= MOST_SAMPLES:
+    if samples.ndim != 1 or not 0 < len(samples) <= MAX_SAMPLES:
         return None, "no_trace"
     return PickledPulse(samples, numbers, event), ""
 
@@ -95,7 +95,7 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
 def _samples(trace: Any) -> npt.NDArray[np.float32]:
     """A trace as an array; of nested lists, which may refer to each other, there is none."""
     if isinstance(trace, list | tuple):
-        if len(trace) > MOST_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
+        if len(trace) > MAX_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
             return np.empty((0, 0), np.float32)
     elif not isinstance(trace, np.ndarray):
         raise TypeError

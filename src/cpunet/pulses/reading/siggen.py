@@ -19,7 +19,7 @@ from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Trace
 # (8 of title, channels, rows, two unused), then one of float32, each between its lengths.
 _SPE = struct.Struct("<i8siiiiii")
 
-_FEWEST = 16  # samples: shorter lines are some other table
+_MIN_N = 16  # samples: shorter lines are some other table
 _PRINTED = "signal:"  # the line before the numbers which siggen's `psig` prints
 _UNEVEN = 0.1  # of a step: times are printed with few digits
 
@@ -80,7 +80,7 @@ class TextSource(PulseSource):
             if len(first.values) == 2:
                 period = MemoryColumn(_spacing(path, columns[:, 0]), "ns")
         length = len(first.values) if self._pulse is None else len(self._pulse)
-        if length < _FEWEST:
+        if length < _MIN_N:
             raise CpunetError(
                 f"{path}: {length} numbers are no pulse; give time (ns) and value, "
                 "or one pulse a line"

@@ -17,9 +17,9 @@ from cpunet.pulses.reading.columns import Column, require_length
 from cpunet.pulses.reading.energies import resolve_energies
 from cpunet.pulses.reading.sampling import resolve_sampling
 
-MOST_SAMPLES = 1 << 20  # of a trace: 17 ms at 16 ns
+MAX_SAMPLES = 1 << 20  # of a trace: 17 ms at 16 ns
 BLOCK_BYTES = 1 << 28  # of a block of traces in single precision
-_MOST_NUMBER = 2.0**62
+_MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
 
 
@@ -105,10 +105,10 @@ class PulseSource(ABC):
                 f"{options.path}: {layout.table or layout.format} holds no pulses; "
                 "give a file with events"
             )
-        if not 0 < layout.length <= MOST_SAMPLES:
+        if not 0 < layout.length <= MAX_SAMPLES:
             raise CpunetError(
                 f"{options.path}: a trace of {layout.length} samples is no pulse (at most "
-                f"{MOST_SAMPLES}); cut the traces"
+                f"{MAX_SAMPLES}); cut the traces"
             )
         self.path = options.path
         self.n_pulses = layout.n_pulses
@@ -212,7 +212,7 @@ class PulseSource(ABC):
         if numbers.dtype.kind == "i":
             return numbers.astype(np.int64)
         values = numbers.astype(np.float64)
-        bad = ~((values == np.rint(values)) & (np.abs(values) < _MOST_NUMBER))
+        bad = ~((values == np.rint(values)) & (np.abs(values) < _MAX_NUMBER))
         if bad.any():
             raise CpunetError(
                 f"{self.path}: row {start + int(bad.argmax())}: the event number is "

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.shape import CrystalShape
-from cpunet.simulation.gammas.transport import MOST_HITS, Source, simulate_block
+from cpunet.simulation.gammas.transport import MAX_HITS, Source, simulate_block
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 
@@ -115,7 +115,7 @@ def simulate_gammas(
     missing = np.array([line.events for line in lines], np.int64)
     spectrum = np.zeros(math.ceil(energy_kev) + 1, np.int64)
     rng = np.random.default_rng(seed)
-    hits = np.empty((min(_BLOCK_HITS, MOST_HITS + 300 * n_primaries), 4))
+    hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
     offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
     primaries = np.empty(_BLOCK_EVENTS, np.int64)
     blocks: list[Hits] = [Hits.of([], [], [0])]

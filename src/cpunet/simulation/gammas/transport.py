@@ -31,7 +31,7 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 STACK_HEIGHT = 256
-MOST_HITS = 2000
+MAX_HITS = 2000
 """Maximum number of hits per event; Tl-208 gives about 200."""
 
 
@@ -164,13 +164,13 @@ def simulate_block(
     offsets[0] = 0
     for primary in range(n_primaries):
         start = offsets[n_kept]
-        full = len(hits) - start < MOST_HITS or n_kept == len(primaries)
+        full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
         if full or (len(wanted) > 0 and wanted.sum() == 0):
             return primary, n_kept
         n_stack = emit(shape, source, stack, rng)
         if n_stack == 0:
             continue
-        mine = hits[start : start + MOST_HITS]
+        mine = hits[start : start + MAX_HITS]
         n_hits = follow_photons(shape, photons, electrons, mine, stack, n_stack, rng)
         energy = 0.0
         for i in range(n_hits):

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hits import FARTHEST_MM, MOST_KEV, Hits
+from cpunet.simulation.hits import FARTHEST_MM, MAX_KEV, Hits
 
 FloatArray = npt.NDArray[np.float64]
 
-_MOST_NUMBER = 2.0**62
+_MAX_NUMBER = 2.0**62
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
 
@@ -81,12 +81,12 @@ def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
     """
     # written so that NaN fails
     placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
-    bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MOST_KEV))
+    bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MAX_KEV))
     if bad.any():
         event = steps.event[np.argmax(bad)]
         raise CpunetError(
             f"{path}: event {event}: a step has no finite position or no energy of at least 0 "
-            f"(nor may it lie {FARTHEST_MM / 1e6:g} km away or have {MOST_KEV / 1e9:g} TeV); "
+            f"(nor may it lie {FARTHEST_MM / 1e6:g} km away or have {MAX_KEV / 1e9:g} TeV); "
             "remove the event or simulate again"
         )
     kept = steps.edep_kev > 0
@@ -121,7 +121,7 @@ def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArra
         If a value is not a whole number or too large.
     """
     kind = values.dtype.kind
-    fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MOST_NUMBER).all())
+    fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MAX_NUMBER).all())
     if fit and kind == "f":
         fit = bool((values == np.rint(values)).all())
     if not fit:

@@ -14,7 +14,7 @@ LINE, TOP, BOTTOM = 14, 6, 24
 LONGEST = 27  # maximum characters of a name
 
 
-def dot_panel(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> str:
+def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> str:
     """Draw a forest plot of a score with errors, and its expectation by chance in grey.
 
     Parameters
