@@ -68,6 +68,9 @@ COMMANDS = {
     ],
     "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
     "library make": [("--detector D/my.yaml", "D/my.yaml")],
+    "library merge": [("D/hits.lh5 D/sim.lh5", "D/sim.lh5")],
+    "library expand": [("D/hits.lh5", "D/hits.lh5")],
+    "library lithium": [],  # reads no file
     "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
     "import weights": [("--ren D/fep_REN.pt", "D")],
     "import pulses": [("D/my.pickle", "D/my.pickle")],

@@ -194,9 +194,9 @@ def _compared(
     """Description of the compared inputs, shown before the scores."""
     fit = info.get("fit") or {}
     compared = {
-        "simulation": str(sim.path),
-        "data": str(data.path),
-        "run": str(run),
+        "simulation": _short(sim.path),
+        "data": _short(data.path),
+        "run": run.name,
         "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
         f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
         f"{str(info.get('started', ''))[:10]}",
@@ -204,6 +204,11 @@ def _compared(
     if fit.get("verdict"):
         compared["fit"] = str(fit["verdict"])
     return compared | {"scored with": f"cpunet {cpunet.__version__}"}
+
+
+def _short(path: Path) -> str:
+    """Name of a file and its folder: the same scores wherever a study lies."""
+    return "/".join(path.absolute().parts[-2:])
 
 
 def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
