@@ -82,6 +82,7 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
 
 
+@pytest.mark.slow  # a library is made
 def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
     detector = read_detector("ppc", ["grid_mm=0.2"])
     write_library(detector, tmp_path / "ideal.lh5", grid_mm=6, angles_deg=(0,))

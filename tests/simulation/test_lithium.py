@@ -42,6 +42,7 @@ def test_when_it_arrives() -> None:
     np.testing.assert_allclose(near, erfc(0.02 / np.sqrt(4 * 290e-7 * early)), atol=3e-3)
 
 
+@pytest.mark.slow  # compiles reboost's model
 def test_reboosts_model() -> None:
     surface = pytest.importorskip("reboost.hpge.surface")
     layer, time = LithiumLayer(1.0), np.arange(10_001.0)

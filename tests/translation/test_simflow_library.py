@@ -339,6 +339,7 @@ def a_over_e_of_reboost(path: Path, hits: Hits, phi: Any) -> Any:
     return np.asarray(found) / hits.energy_kev
 
 
+@pytest.mark.slow  # half a minute, most of it that of compilers
 def test_a_over_e_of_geant4_events_at_the_nodes(
     chain: Path, reference_data: Path, tmp_path: Path
 ) -> None:
