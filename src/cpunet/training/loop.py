@@ -1,4 +1,4 @@
-"""The training loop: deal, step, log, keep, and stop when a loss is no longer a number."""
+"""The training loop: batch, step, log, store, and stop when a loss is no longer a number."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def train(
             EpochSampler(
                 torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team
             )
-            for side, pulses in zip(_deck_seeds(seed), (sim, data), strict=True)
+            for side, pulses in zip(_sampler_seeds(seed), (sim, data), strict=True)
         ]
         if hooks.start is None:
             _begin(model, samplers, recipe, surroundings, behind, init)
@@ -294,7 +294,7 @@ def _require_finite_weights(training: _Training) -> None:
             )
 
 
-def _deck_seeds(seed: int) -> Iterator[int]:
+def _sampler_seeds(seed: int) -> Iterator[int]:
     # far apart, so that neighbouring seeds share no sampler
     yield from (2 * seed + 1_000_003, 2 * seed + 2_000_004)
 

@@ -196,7 +196,7 @@ def _compared(
     compared = {
         "simulation": _short(sim.path),
         "data": _short(data.path),
-        "run": run.name,
+        "run": run.absolute().name,
         "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
         f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
         f"{str(info.get('started', ''))[:10]}",
