@@ -30,7 +30,7 @@ test: install-dev
 
 # with CPUNET_SLOW_MINUTES=15 none is begun after so long
 test-slow: install-dev
-	$(PYTEST) -m slow
+	$(PYTEST) -m 'slow or hypothesis' --hypothesis-profile=full
 
 lint: install-dev
 	$(BIN)/ruff check .

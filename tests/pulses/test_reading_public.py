@@ -237,6 +237,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns
 
 
+@pytest.mark.slow
 def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
     rng = np.random.default_rng(5)
     sim = write_pickles(tmp_path / "fep_wf_sim.pickle", charge(rng, N, 1000, 500))

@@ -20,7 +20,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 
-DETECTOR = read_detector("ppc", ["grid_mm=0.25"])
+DETECTOR = read_detector("ppc", ["grid_mm=0.5"])
 SETTINGS = SimulationSettings(length_ns=1600)
 
 

@@ -90,7 +90,7 @@ STOPS = {
     "fast-step": 2,
     "convolutional-judge": 3,
 }
-SLOW = {"rare-judges", "large-batches"}
+SLOW = {"small", "rare-judges", "large-batches"}  # the fast step is that of `small`
 
 
 @pytest.mark.parametrize(
