@@ -54,6 +54,28 @@ def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
     assert told == ["20 0", "20 1", "30 0"]
 
 
+def test_of_two_who_need_the_same_code_one_compiles(tmp_path: Path) -> None:
+    package = tmp_path / "loops"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "called.py").write_text(CALLED.format(number=1))
+    program = (
+        f"import os, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from loops.called import called\n"
+        "child = os.fork()\n"
+        "called(1)\n"
+        "hits = sum(called.stats.cache_hits.values())\n"
+        "if child == 0:\n"
+        "    os._exit(hits)\n"
+        "print(hits + os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "1"  # one of the two had it from the other
+    assert not list(tmp_path.rglob("*.lock"))
+
+
 def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() -> None:
     """Else a process that compiles has other last bits than those that load its code."""
 

@@ -2,7 +2,8 @@
 
 numba's own cache checks only the file of a function, so the function keeps old code of
 functions that it calls in other files.  Moreover, if two processes compile at once, as the
-first jobs after an installation do, one can load the other's code.  Neither happens here.
+first jobs after an installation do, one can load the other's code.  Neither happens here; the
+second waits for the code of the first.
 
 numba chooses the folder: beside the package, or ``NUMBA_CACHE_DIR``.  A folder to which others
 can write is never used, since it would let them execute any code; then the user's own cache
@@ -16,20 +17,25 @@ import hashlib
 import pickle
 import re
 import sys
+import time
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import IO, Any, TypeVar, overload
 
 import numba
 import platformdirs
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+from cpunet.errors import CpunetError
+from cpunet.file_locks import lock
 from cpunet.trusted_folders import trusted
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
+# for code that another process compiles: one that hangs holds nobody up for ever
+MAX_WAIT_S = 60.0
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
 
@@ -154,6 +160,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        self._claim: IO[str] | None = None
         folder = code_folder(Path(self._cache_path))
         if folder is None:
             self.disable()
@@ -162,3 +169,47 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         self._cache_file = KernelFiles(
             self._cache_path, self._impl.filename_base, digest(function.__module__)
         )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Code for a kind of arguments; None if this process is to compile it.
+
+        If another process is compiling the function, its code is waited for.
+        """
+        found = super().load_overload(sig, target_context)
+        if found is None and self._enabled:
+            self._claim = _claimed(Path(self._cache_path) / f"{self._impl.filename_base}.lock")
+            found = super().load_overload(sig, target_context)
+            if found is not None:
+                self._release()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Cache code, for those that wait for it, too."""
+        try:
+            super().save_overload(sig, data)
+        finally:
+            self._release()
+
+    def _release(self) -> None:
+        if self._claim is not None:
+            with suppress(OSError):
+                Path(self._claim.name).unlink()
+            self._claim.close()
+            self._claim = None
+
+
+def _claimed(path: Path) -> IO[str] | None:
+    """Open a lock file, once no other process has it; None if it cannot be had."""
+    try:
+        stream = path.open("a")
+    except OSError:
+        return None
+    end = time.monotonic() + MAX_WAIT_S
+    while time.monotonic() < end:
+        try:
+            lock(stream.fileno(), "compiling")
+        except CpunetError:
+            time.sleep(0.02)
+        else:
+            break
+    return stream
