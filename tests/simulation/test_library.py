@@ -66,7 +66,7 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
 
 @pytest.mark.parametrize(
     ("size", "above", "n_hits"),
-    [((10, 20), 60, 150), pytest.param((40, 96), 0, 1800, marks=pytest.mark.slow)],
+    [((10, 20), 60, 360), pytest.param((40, 96), 0, 1800, marks=pytest.mark.slow)],
     ids=["of a part", "of the crystal"],
 )
 def test_library_agrees_with_the_exact_drift(
