@@ -18,7 +18,6 @@ READOUT = {
     "slow": {"fraction": 0.065, "tau_ns": 400.0},
     "decays": [{"fraction": 1.0, "tau_us": 80.0}],
 }
-COARSE = "grid_mm=0.5"
 PLAIN = (
     "generator.slow_ns=[400]",
     "generator.fast_decays_us=[]",
@@ -28,7 +27,7 @@ PLAIN = (
 )
 
 
-def make_stand(out: Path, full_energy: int, *physics: str, **readout: object) -> Path:
+def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
     """A small stand; made by the package's own job, in this process."""
     from cpunet.electronics.chain import Electronics
     from cpunet.electronics.presets import read_electronics
@@ -39,7 +38,7 @@ def make_stand(out: Path, full_energy: int, *physics: str, **readout: object) ->
 
     make_stand(
         Electronics.model_validate(read_electronics("legend200").model_dump() | readout),
-        read_detector("ppc", list(physics)),
+        read_detector("ppc"),
         tuple(energy_windows("FEP,DEP", load_recipe("fast").peaks, 0.5)),
         (full_energy, 60),
         out,
@@ -67,7 +66,7 @@ def calibrate(stand: Path, run: Path, *overrides: str) -> Path:
 
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory) -> Path:
-    return make_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, COARSE, **READOUT)
+    return make_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
 
 
 @pytest.fixture(scope="module")

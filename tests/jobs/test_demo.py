@@ -39,7 +39,7 @@ RIVALS = ("rc", "gauss_exp", "superpulse")
 
 OPTIONS = {
     "electronics": read_electronics("legend200"),
-    "detector": read_detector("ppc", ["grid_mm=0.5"]),
+    "detector": read_detector("ppc", ["grid_mm=0.2"]),
     "recipe": RECIPE,
     "events": EVENTS,
 }
@@ -109,7 +109,7 @@ def test_finished_parts_are_kept_and_a_whole_one_is_refused(
             'stand: made with electronics.name = "legend200", not "ornl"',
         ),
         (
-            {"detector": read_detector("ppc", ["grid_mm=0.5", "bias_V=2600"])},
+            {"detector": read_detector("ppc", ["grid_mm=0.2", "bias_V=2600"])},
             "stand: made with sim.detector.bias_V = 2500.0, not 2600.0",
         ),
         (
