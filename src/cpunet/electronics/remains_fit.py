@@ -27,8 +27,11 @@ Function = Callable[[FloatArray], float]
 # Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
-GRID = 16384  # points of the density
+LEAST_GRID, MOST_GRID = 1024, 16384  # points of the density
 STEPS_OF_SIGMA = 4.0
+# Standard deviations of room on either side, and arguments (times the standard deviation) beyond
+# which the noise leaves nothing of a characteristic function.
+ROOM, LARGEST_ARGUMENT = 10.0, 9.0
 OUTLIERS = 2e-3  # fraction of traces that the law need not explain
 # Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
 WORTH = 5.0
@@ -114,10 +117,12 @@ class _Likelihood:
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
         self.kev, self.sigma, self.energies = kev, sigma_kev, energies
         self.step = sigma_kev / STEPS_OF_SIGMA
-        self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(GRID, self.step), float)
+        self.points = _points(kev, sigma_kev, float(energies[-1]), self.step)
+        u = np.asarray(2 * np.pi * np.fft.rfftfreq(self.points, self.step), float)
+        self.u = u[u * sigma_kev < LARGEST_ARGUMENT]
         self.exponents = characteristic_exponents(self.u, energies)
-        self.first = GRID // 4
-        self.grid = (np.arange(GRID) - self.first) * self.step
+        self.first = self.points // 4
+        self.grid = (np.arange(self.points) - self.first) * self.step
         self.wings, self.widths = _wings(kev, sigma_kev)
         self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
 
@@ -129,7 +134,8 @@ class _Likelihood:
         noise = (1 - self.wings) * np.exp(squares)
         noise += self.wings * np.exp(self.widths**2 * squares)
         shift = 1j * self.u * (level + self.first * self.step)
-        density = np.fft.irfft(np.conj(noise * np.exp(exponent + shift)), GRID) / self.step
+        density = np.fft.irfft(np.conj(noise * np.exp(exponent + shift)), self.points)
+        density /= self.step
         at = np.interp(self.kev, self.grid, np.maximum(density, 0.0), left=0.0, right=0.0)
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
@@ -140,6 +146,14 @@ class _Likelihood:
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
         found = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
         return -min(float(one.fun) for one in found)
+
+
+def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
+    """Points of a grid, the first quarter below 0, that holds remainders and their noise."""
+    above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
+    below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
+    points = max(4 * above / 3, 4 * below) / step_kev
+    return int(np.clip(2 ** np.ceil(np.log2(points)), LEAST_GRID, MOST_GRID))
 
 
 def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
