@@ -24,6 +24,8 @@ PROGRAM = "cpunet"
 Note = Callable[[str], None]
 Given = Path | str | None
 
+PICTURE_FORMATS = (".png", ".pdf", ".svg")
+
 
 @dataclass(frozen=True)
 class FolderKind:

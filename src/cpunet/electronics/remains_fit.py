@@ -27,9 +27,10 @@ Function = Callable[[FloatArray], float]
 # Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
-GRID = 16384  # points of the density
+LEAST_GRID, MOST_GRID = 1024, 16384  # points of the density
 STEPS_OF_SIGMA = 4.0
 NEGLIGIBLE = 8.8  # standard deviations in u: exp(-8.8²/2) is 1.5e-17
+ROOM = 10.0  # standard deviations of room on either side
 OUTLIERS = 2e-3  # fraction of traces that the law need not explain
 # Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
 WORTH = 5.0
@@ -115,11 +116,12 @@ class _Likelihood:
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
         self.kev, self.sigma, self.energies = kev, sigma_kev, energies
         self.step = sigma_kev / STEPS_OF_SIGMA
-        self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(GRID, self.step), float)
+        self.points = _points(kev, sigma_kev, float(energies[-1]), self.step)
+        self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(self.points, self.step), float)
         exponents = np.conj(characteristic_exponents(self.u, energies)).T
         self.exponents = np.ascontiguousarray(exponents).view(np.float64)  # (energies, 2 of u)
-        self.first = GRID // 4
-        self.grid = (np.arange(GRID) - self.first) * self.step
+        self.first = self.points // 4
+        self.grid = (np.arange(self.points) - self.first) * self.step
         self.wings, self.widths = _wings(kev, sigma_kev)
         self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
 
@@ -138,7 +140,7 @@ class _Likelihood:
         if self.wings:
             wide = np.exp((self.widths**2 - 1) * squares)
             spectrum *= 1 - self.wings + self.wings * wide
-        density = np.fft.irfft(spectrum, GRID)
+        density = np.fft.irfft(spectrum, self.points)
         density /= self.step
         np.maximum(density, 0.0, out=density)
         at = np.interp(self.kev, self.grid, density, left=0.0, right=0.0)
@@ -151,6 +153,14 @@ class _Likelihood:
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
         found = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
         return -min(float(one.fun) for one in found)
+
+
+def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
+    """Points of a grid, the first quarter below 0, that holds remainders and their noise."""
+    above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
+    below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
+    points = max(4 * above / 3, 4 * below) / step_kev
+    return int(np.clip(2 ** np.ceil(np.log2(points)), LEAST_GRID, MOST_GRID))
 
 
 def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:

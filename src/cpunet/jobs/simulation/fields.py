@@ -11,13 +11,12 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.simulate import ImpurityFrom, solved
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import LI_CONTACT, Detector, FloatArray
 from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE
 
 QUIET = Monitor()
-FORMATS = (".png", ".pdf", ".svg")
 _DPI = 200
 
 
@@ -62,8 +61,8 @@ def describe_fields(
         no known format.
     """
     if picture is not None:
-        if picture.suffix.lower() not in FORMATS:
-            raise CpunetError(f"{picture}: pictures are made as {', '.join(FORMATS)}")
+        if picture.suffix.lower() not in PICTURE_FORMATS:
+            raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
         refuse_existing(picture, force=force)
     detector, fields = solved(detector, impurity_from, monitor)
     told = _told(detector, fields)

@@ -27,8 +27,7 @@ from cpunet.jobs.common.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.simulation.fields import FORMATS
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
@@ -142,8 +141,8 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
     """
     from cpunet.analysis.sides_figure import sides_figure
 
-    if picture.suffix.lower() not in FORMATS:
-        raise CpunetError(f"{picture}: pictures are made as {', '.join(FORMATS)}")
+    if picture.suffix.lower() not in PICTURE_FORMATS:
+        raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
     refuse_existing(picture, force=force)
     names = {"data": "data", "raw": "sim"}  # of the figures' sides, the measured one first
     sides = {name: checked.sides[side] for name, side in names.items()}
