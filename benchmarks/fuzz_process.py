@@ -17,6 +17,7 @@ from cpunet.cli.main import main as cpunet_main
 MAX_S = 30
 _LONGEST_S = 900  # on the wall, whatever else the machine does
 _MAX_ADDRESSES = 12 << 30
+_WITH_WORKERS = ("ensemble", "tune")  # whose processes import the main module again
 _SOURCE = "import sys; sys.argv[0] = 'cpunet'; from cpunet.cli.main import main; main()"
 
 
@@ -70,7 +71,7 @@ def run(case: Case, folder: Path, logs: Path) -> Outcome:
     pid = os.fork()
     if pid == 0:
         _become(case, folder, out, err)
-    late, own_s, ticks = False, 0.0, 0
+    late, own_s, ticks, waited = False, 0.0, 0, dict[int, float]()
     while True:
         done, code, usage = os.wait4(pid, os.WNOHANG)
         if done:
@@ -78,7 +79,9 @@ def run(case: Case, folder: Path, logs: Path) -> Outcome:
         wall = time.monotonic() - begun
         ticks += 1
         if ticks % 20 == 0:  # ten times a second
-            own_s = wall - _waited_for_a_core(pid)
+            for each in _family(pid):
+                waited[each] = _waited_for_a_core(each)
+            own_s = wall - sum(waited.values())
             if own_s > MAX_S or wall > _LONGEST_S:
                 late = True
                 os.killpg(pid, signal.SIGKILL)
@@ -100,10 +103,21 @@ def run(case: Case, folder: Path, logs: Path) -> Outcome:
     )
 
 
+def _family(pid: int) -> list[int]:
+    """A process and all that descend from it."""
+    found = [pid]
+    for each in found:
+        with suppress(OSError):
+            text = Path(f"/proc/{each}/task/{each}/children").read_text()
+            found += map(int, text.split())
+    return found
+
+
 def _waited_for_a_core(pid: int) -> float:
     """Seconds in which a process could have run, had the machine had a core for it."""
     with suppress(OSError, IndexError, ValueError):
-        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+        texts = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/schedstat")]
+        return max(int(text.split()[1]) for text in texts) / 1e9
     return 0.0
 
 
@@ -122,7 +136,7 @@ def _become(case: Case, folder: Path, out: Path, err: Path) -> None:
         if case.closed == "errors closed":
             os.close(2)
         resource.setrlimit(resource.RLIMIT_AS, (_MAX_ADDRESSES, _MAX_ADDRESSES))
-        if case.fresh:
+        if case.fresh or case.words[0] in _WITH_WORKERS:
             words = [os.fsencode(word) for word in [sys.executable, "-c", _SOURCE, *case.words]]
             os.execv(sys.executable, words)
         sys.stdout = sys.stderr = None  # as Python has them where they are closed
