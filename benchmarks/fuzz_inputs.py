@@ -51,7 +51,7 @@ def make_base(base: Path) -> None:
     from lh5.compression import RadwareSigcompress, ULEB128ZigZagDiff
 
     rng = np.random.default_rng(0)
-    kev = np.tile(PEAKS, 14) + rng.normal(0, 0.5, 42)
+    kev = np.tile(PEAKS, 28) + rng.normal(0, 0.5, 84)
 
     def table(values: object, n: int, energies: np.ndarray) -> Table:
         wave = WaveformTable(
@@ -64,9 +64,9 @@ def make_base(base: Path) -> None:
         group, _, inner = path.rpartition("/")
         lh5.write(table(values, n, energies), inner, base / name, group=group)
 
-    sim, data = edges(42, rng).astype(np.float32), traces(42, rng, kev)
-    write("sim.lh5", "geds/sim", ArrayOfEqualSizedArrays(nda=sim), 42, kev)
-    write("data.lh5", "geds/raw", ArrayOfEqualSizedArrays(nda=data), 42, kev)
+    sim, data = edges(84, rng).astype(np.float32), traces(84, rng, kev)
+    write("sim.lh5", "geds/sim", ArrayOfEqualSizedArrays(nda=sim), 84, kev)
+    write("data.lh5", "geds/raw", ArrayOfEqualSizedArrays(nda=data), 84, kev)
     for name, codec in (
         ("varlen", ULEB128ZigZagDiff()),
         ("radware", RadwareSigcompress(codec_shift=-32768)),
@@ -84,7 +84,7 @@ def make_base(base: Path) -> None:
     (base / "pulses.spe").write_bytes(head + sim[:8].tobytes() + head[-4:])
     np.savetxt(base / "pulses.txt", sim[:4], fmt="%.4f")
     (base / "run.fcio").write_bytes(flashcam(data[:5, :64]))
-    np.savez(base / "truth.npz", response=traces(42, rng, kev).astype(np.float32))
+    np.savez(base / "truth.npz", response=traces(84, rng, kev).astype(np.float32))
     with (base / "pulses.pickle").open("wb") as stream:
         for i in range(6):
             pickle.dump([{"wf": sim[i], "tp0": 40, "energy": kev[i], "event": i}], stream)
@@ -123,7 +123,8 @@ def make_studies(base: Path) -> None:
         run(Case(words, ""), base, base)
         os._exit(0)
     unfinished = base / "stopped.unfinished"
-    while not (unfinished / "losses.jsonl").exists():
+    losses = unfinished / "losses.jsonl"
+    while not losses.exists() or not losses.stat().st_size:
         time.sleep(0.01)
         if os.waitpid(pid, os.WNOHANG)[0]:
             raise SystemExit("stopped: the training ended before it could be stopped")
@@ -269,7 +270,7 @@ def tiny() -> list[str]:
 
 def tuning() -> list[str]:
     """Options of the shortest search."""
-    return [*tiny(), "--trials", "1", *STUDY]
+    return [*tiny(), "--peak", "1000-", "--trials", "1", *STUDY]
 
 
 def sides() -> list[str]:
