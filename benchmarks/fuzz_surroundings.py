@@ -329,7 +329,7 @@ def wide_files(folder: Path, rng: Rng) -> Case:
         file.create_dataset("waveform", shape, pick(rng, ["u2", "f4", "f8"]), chunks=chunks)
         file["dt_ns"] = 16.0
         rows = min(shape[0], 10**8)
-        energy = file.create_dataset("energy_kev", (rows,), "f4", chunks=(1000,))
+        energy = file.create_dataset("energy_kev", (rows,), "f4", chunks=(min(rows, 1000),))
         energy[:3] = 2614.5
     words = [
         ["info", "wide.h5"],
