@@ -117,7 +117,7 @@ def make_studies(base: Path) -> None:
     words = ["ensemble", *sides(), *tiny(), "--seeds", "1", "--no-validate", "--out", "ens"]
     call([*words, *STUDY], base)
     call(["tune", *sides(), *tuning(), "--out", "tuned"], base)
-    words = ["train", *sides(), "--out", "stopped", *tiny(), "--set", "training.iterations=400"]
+    words = ["train", *sides(), "--out", "stopped", *tiny(), "--set", "training.iterations=30"]
     pid = os.fork()
     if pid == 0:
         run(Case(words, ""), base, base)
