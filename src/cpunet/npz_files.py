@@ -21,6 +21,8 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.machine_memory import require_memory
+
 # Exceptions of NumPy and zipfile on damaged files: headers are parsed as Python source, and
 # archives can declare any encryption or compression.
 DAMAGED = (
@@ -129,11 +131,14 @@ def read_array(path: Path, key: str, header: Header) -> npt.NDArray[Any]:
     ValueError
         If the array contains objects, is larger than `MAX_BYTES`, or does not match its
         header.
+    CpunetError
+        If the memory does not suffice.
     """
     if header.dtype.hasobject:
         raise ValueError("objects instead of numbers")
     if header.n_bytes > MAX_BYTES:
         raise ValueError(f"an array of {header.n_bytes / 1e9:.0f} GB")
+    require_memory(header.n_bytes, f"{path}: '{key}'", "give a smaller file")
     with member(path, key) as file:
         values: npt.NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     return values

@@ -20,7 +20,7 @@ from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.studies.held_out import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
-from cpunet.jobs.studies.tuning_study import _is_gone, this_worker
+from cpunet.jobs.studies.tuning_study import _is_gone, open_study, this_worker
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
@@ -198,6 +198,26 @@ def test_a_process_is_gone_before_anyone_asks_how_it_ended():
     assert _is_gone(f"{host}:{ended.pid}")
     assert not _is_gone(this_worker())
     assert not _is_gone(f"another host:{ended.pid}")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda lines: [*lines, b'{"op_code": 4, "wor', *lines[-1:]],  # by a full disk
+        lambda lines: [lines[0].replace(b"cpunet", b"\xff")],
+        lambda lines: [lines[0], b"[]\n"],
+        lambda lines: [lines[0], b'{"op_code": 99}\n'],
+    ],
+)
+def test_a_damaged_journal_is_one_line(tmp_path, damage):
+    optuna = pytest.importorskip("optuna")
+    study = open_study(tmp_path, tiny())
+    trial = study.ask({"x": optuna.distributions.FloatDistribution(0, 1)})
+    study.tell(trial, 1.0)
+    journal = tmp_path / "journal.log"
+    journal.write_bytes(b"".join(damage(journal.read_bytes().splitlines(keepends=True))))
+    with pytest.raises(CpunetError, match=r"journal.log: is damaged .* begin again with --fo"):
+        open_study(tmp_path, tiny())
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")

@@ -111,6 +111,34 @@ def test_limit_stops_reading_and_progress_is_told() -> None:
     assert told == [4, 4]
 
 
+def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
+    source = source_of([1000.0, 50.0] * 500)
+    first, second = (
+        load_prepared(source, CONFIG, "measured", select=near_1000, most=60) for _ in range(2)
+    )
+    assert (len(first), first.n_read) == (60, 1000)
+    assert first.rejections == {"energy_outside_selection": 500, "not_drawn": 440}
+    assert (first.index == second.index).all()
+    assert (np.diff(first.index) > 0).all()
+    # rows 0, 2 ... 998, each as likely: their mean is 499 with a scatter of 289 / sqrt(60)
+    assert abs(first.index.mean() - 499) < 3 * 289 / 60**0.5
+    assert (first.codes[first.index] == 0).all()
+    whole = load_prepared(source, CONFIG, "measured", select=near_1000)
+    same = np.isin(whole.index, first.index)
+    assert (whole.pulses.waveforms[same] == first.pulses.waveforms).all()
+
+
+def test_a_sample_that_is_large_enough_is_everything() -> None:
+    source = source_of([1000.0] * 9)
+    assert load_prepared(source, CONFIG, "measured", most=9).rejections == {}
+
+
+def test_more_than_the_memory_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cpunet.machine_memory.available_bytes", lambda: 100)
+    with pytest.raises(CpunetError, match=r"run7.lh5: more than 4 selected pulses: about"):
+        load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
+
+
 def test_only_windows_are_kept() -> None:
     prepared = load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
     assert prepared.pulses.waveforms.shape == (9, 40)

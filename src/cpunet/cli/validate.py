@@ -20,6 +20,14 @@ AeRange = Annotated[
         help="More energies for A/E against energy: 900,2350 (keV), if the files have them.",
     ),
 ]
+Most = Annotated[
+    int,
+    typer.Option(
+        min=100,
+        max=10_000_000,
+        help="Pulses a side that are compared: of more, a random sample. Some 30 kB each.",
+    ),
+]
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 
 
@@ -31,6 +39,7 @@ def validate(
     truth: options.Truth = None,
     rivals: options.Rivals = True,
     ae_range: AeRange = None,
+    most: Most = 50_000,
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,
@@ -64,6 +73,7 @@ def validate(
         rivals=rivals,
         seed=seed,
         ae_range_kev=span,
+        most=most,
         device=device,
         force=force,
         monitor=monitor(),

@@ -44,6 +44,7 @@ class Rejection(IntEnum):
     TAIL_NOT_POSITIVE = _kernels.TAIL_NOT_POSITIVE
     ENERGY_UNKNOWN = 16
     ENERGY_OUTSIDE_SELECTION = 17
+    NOT_DRAWN = 18
     TAIL_SLOPE = 32
     CHI2 = 33
     BASELINE = 34

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.machine_memory import require_memory
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -64,6 +65,7 @@ def load_prepared(
     select: Select | None = None,
     peaks: PeakNames | None = None,
     limit: int | None = None,
+    most: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Prepared:
     """Read, select, prepare and collect the pulses of a file.
@@ -81,6 +83,9 @@ def load_prepared(
         Function that returns the name of the peak of each energy in keV.
     limit
         Number of accepted pulses after which reading stops.
+    most
+        Largest number of accepted pulses to keep: if there are more, a random sample of all of
+        them, the same for the same file.  Memory is bounded by it.
     progress
         Function called after each block with the number of pulses read since the last call.
 
@@ -96,20 +101,45 @@ def load_prepared(
     """
     sets: list[Prepared] = []
     n_read = n_kept = 0
+    rng, drawn = np.random.default_rng(0), list[FloatColumn]()
     for block in source.blocks(BLOCK_SIZE):
         part = _prepare_selected(block, config, kind, select, peaks, n_read)
         n_read += len(block)
         if limit is not None and n_kept + len(part) >= limit:
             part = _shortened(part, limit - n_kept)
         n_kept += len(part)
+        require_memory(
+            block.waveforms.nbytes,
+            f"{source.path}: more than {n_kept} selected pulses",
+            "select fewer energies, or give a shorter file",
+        )
         sets.append(part)
+        drawn.append(rng.random(len(part)))
+        if most is not None and n_kept > 1.5 * most:
+            n_kept = _thin(sets, drawn, most)
         if progress is not None:
             progress(len(block))
         if limit is not None and n_kept >= limit:
             break
     if not n_kept:
         raise CpunetError(_nothing_left(source, sets))
+    if most is not None and n_kept > most:
+        n_kept = _thin(sets, drawn, most)
     return _joined(sets, n_kept)
+
+
+def _thin(sets: list[Prepared], drawn: list[FloatColumn], most: int) -> int:
+    """Keep the pulses that drew the smallest numbers; return how many these are.
+
+    What is left out now would be left out with all later pulses, too: so the sample is one of
+    the whole file, each pulse as likely as any other.
+    """
+    bound = np.partition(np.concatenate(drawn), most)[most]
+    for number, part in enumerate(sets):
+        stays = drawn[number] < bound
+        codes = np.where(stays, Rejection.ACCEPTED, Rejection.NOT_DRAWN).astype(np.uint8)
+        sets[number], drawn[number] = part.rejected(codes), drawn[number][stays]
+    return most
 
 
 def _joined(sets: list[Prepared], n: int) -> Prepared:

@@ -118,17 +118,27 @@ class InputSet:
 
 
 def load_simulated(
-    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+    file: InputFile,
+    recipe: Recipe,
+    selection: EnergySelection,
+    monitor: Monitor,
+    *,
+    most: int | None = None,
 ) -> InputSet:
-    """Read and prepare the selected simulated pulses of a file."""
-    return _load(file, recipe, selection, monitor, measured=False)
+    """Read and prepare the selected simulated pulses of a file, or a sample of `most`."""
+    return _load(file, recipe, selection, monitor, measured=False, most=most)
 
 
 def load_measured(
-    file: InputFile, recipe: Recipe, selection: EnergySelection, monitor: Monitor
+    file: InputFile,
+    recipe: Recipe,
+    selection: EnergySelection,
+    monitor: Monitor,
+    *,
+    most: int | None = None,
 ) -> InputSet:
-    """Read, prepare and cut the selected measured pulses of a file."""
-    return _load(file, recipe, selection, monitor, measured=True)
+    """Read, prepare and cut the selected measured pulses of a file, or a sample of `most`."""
+    return _load(file, recipe, selection, monitor, measured=True, most=most)
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
@@ -184,6 +194,7 @@ def _load(
     monitor: Monitor,
     *,
     measured: bool,
+    most: int | None,
 ) -> InputSet:
     source = file.open()
     side: Kind = "measured" if measured else "simulated"
@@ -202,6 +213,7 @@ def _load(
                 side,
                 select=select,
                 peaks=lambda energies: label_peaks(energies, recipe.peaks),
+                most=most,
                 progress=advance,
             )
         except CpunetError as error:

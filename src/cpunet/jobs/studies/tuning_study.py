@@ -44,18 +44,34 @@ def require_optuna() -> Any:
 
 
 def open_study(folder: Path, recipe: Recipe) -> Study:
-    """Open the study in a folder, or create a new one."""
+    """Open the study in a folder, or create a new one.
+
+    Raises
+    ------
+    CpunetError
+        If its journal cannot be read: it was damaged, or its last line cut off by a full disk.
+    """
     optuna = require_optuna()
     from optuna.storages.journal import JournalFileBackend
 
-    study: Study = optuna.create_study(
-        study_name=STUDY,
-        storage=optuna.storages.JournalStorage(JournalFileBackend(str(folder / JOURNAL))),
-        pruner=optuna.pruners.MedianPruner(
-            n_startup_trials=4, n_warmup_steps=recipe.training.iterations // WARM_UP
-        ),
-        load_if_exists=True,
-    )
+    journal = folder / JOURNAL
+    try:
+        study: Study = optuna.create_study(
+            study_name=STUDY,
+            storage=optuna.storages.JournalStorage(JournalFileBackend(str(journal))),
+            pruner=optuna.pruners.MedianPruner(
+                n_startup_trials=4, n_warmup_steps=recipe.training.iterations // WARM_UP
+            ),
+            load_if_exists=True,
+        )
+        _ = study.trials
+    except OSError:
+        raise
+    except Exception as error:  # optuna does as each line says, unchecked
+        raise CpunetError(
+            f"{journal}: is damaged ({type(error).__name__}); remove its damaged lines, or "
+            "begin again with --force"
+        ) from error
     return study
 
 

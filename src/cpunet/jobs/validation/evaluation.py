@@ -35,12 +35,17 @@ from cpunet.jobs.validation.pulse_tests import survivals
 from cpunet.jobs.validation.rivals import fit_rivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
+from cpunet.machine_memory import require_memory
 from cpunet.pulses.peaks import parse_selection
 from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
 from cpunet.translation.translator import IREN, REN
 
 PAIRS = 200  # of pulses in the test of linearity
+MOST_PULSES = 50_000  # of a side: scores are then certain to some 0.3 percent points
+# Windows that are kept of each pair of pulses: both sides, the rivals' translations, and what
+# is made of them on the way.
+_WINDOWS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,7 @@ def evaluate(
     device: str,
     monitor: Monitor,
     ae_range_kev: Range | None = None,
+    most: int = MOST_PULSES,
 ) -> Evaluation:
     """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
@@ -99,7 +105,7 @@ def evaluate(
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
     more = () if ae_range_kev is None else (ae_range_kev,)
-    sim_set, data_set = _load_both(ren, sim, data, names, more, monitor)
+    sim_set, data_set = _load_both(ren, sim, data, names, more, most, monitor)
     responses = None if truth is None else Responses(truth, sim_set)
     others = fit_rivals(
         sim_set,
@@ -174,11 +180,19 @@ def _load_both(
     data: InputFile,
     names: list[str],
     more_kev: tuple[Range, ...],
+    most: int,
     monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe, more_kev)
-    sim_set = load_simulated(sim, ren.recipe, selection, monitor)
-    data_set = load_measured(data, ren.recipe, selection, monitor)
+    length = ren.recipe.preparation.samples_before + ren.recipe.preparation.samples_after
+    pulses = min(most, max(file.open().n_pulses for file in (sim, data)))
+    require_memory(
+        pulses * length * _WINDOWS * np.dtype(np.float32).itemsize,
+        f"{data.path}: comparing {pulses} pulses",
+        "give a smaller --most",
+    )
+    sim_set = load_simulated(sim, ren.recipe, selection, monitor, most=most)
+    data_set = load_measured(data, ren.recipe, selection, monitor, most=most)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(

@@ -13,7 +13,7 @@ from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import Evaluation, evaluate
+from cpunet.jobs.validation.evaluation import MOST_PULSES, Evaluation, evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
 from cpunet.jobs.validation.figures import Drawing, drawings
 from cpunet.jobs.validation.views import report_views
@@ -33,6 +33,7 @@ def validate_run(
     rivals: bool = True,
     seed: int = 0,
     ae_range_kev: tuple[float, float] | None = None,
+    most: int = MOST_PULSES,
     device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -59,6 +60,8 @@ def validate_run(
         Seed of noise and bootstraps.
     ae_range_kev
         Further energies to read on both sides for A/E against energy, such as 900 to 2350.
+    most
+        Largest number of pulses a side that are compared: of more, a random sample.
     device, force, monitor
         See `cpunet.jobs.training.train.train_run`.
 
@@ -74,7 +77,7 @@ def validate_run(
     """
     found, _ = validated(
         run, sim, data, out, truth=truth, rivals=rivals, seed=seed, ae_range_kev=ae_range_kev,
-        device=device, force=force, monitor=monitor,
+        most=most, device=device, force=force, monitor=monitor,
     )  # fmt: skip
     return found.metrics
 
@@ -89,6 +92,7 @@ def validated(
     rivals: bool = True,
     seed: int = 0,
     ae_range_kev: tuple[float, float] | None = None,
+    most: int = MOST_PULSES,
     device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -99,14 +103,14 @@ def validated(
     ----------
     out
         Report folder; None for none.
-    run, sim, data, truth, rivals, seed, ae_range_kev, device, force, monitor
+    run, sim, data, truth, rivals, seed, ae_range_kev, most, device, force, monitor
         As for `validate_run`.
     """
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     score = partial(
         evaluate, run, sim, data, truth=truth, rivals=rivals, seed=seed, device=device,
-        monitor=monitor, ae_range_kev=ae_range_kev,
+        monitor=monitor, ae_range_kev=ae_range_kev, most=most,
     )  # fmt: skip
     if out is None:
         found = score()

@@ -1,0 +1,86 @@
+"""Load: a thousand reports in one summary, a validation of many pulses, and their memory.
+
+Run with ``python benchmarks/load.py summary --reports 1000 --report REPORT`` for copies of a
+report, or with ``validate --run RUN --sim SIM --data DATA --pulses 1000000``, which repeats the
+pulses of two files until there are so many on either side.  Prints wall-clock time, processor
+time and the most memory of the process, and the size of what was written.
+The chain from steps to raw traces has a benchmark of its own, ``chain.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from validation import repeated
+
+NAMES = "V{detector:02d}-p{period:02d}"
+_CALL = """
+import resource, sys, time
+from cpunet.cli.main import main
+begun = time.monotonic()
+sys.argv = ["cpunet", *sys.argv[1:]]
+try:
+    main()
+finally:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    print(f"{time.monotonic() - begun:.1f} s, {used.ru_utime + used.ru_stime:.1f} CPU s, "
+          f"{used.ru_maxrss / 1024:.0f} MB", file=sys.stderr)
+"""
+
+
+def call(*words: str | Path) -> None:
+    """Run a command, whose last line says what it took."""
+    done = subprocess.run(
+        [sys.executable, "-c", _CALL, *map(str, words)], check=True, capture_output=True
+    )
+    print(done.stderr.decode().splitlines()[-1])
+
+
+def many_reports(report: Path, folder: Path, n: int) -> list[Path]:
+    """Copies of the scores of a report, each a bit off, as of many detectors and periods."""
+    scores = (report / "metrics.json").read_text("utf-8")
+    made = []
+    for number in range(n):
+        name = NAMES.format(detector=number % 100, period=number // 100)
+        (folder / name).mkdir()
+        (folder / name / "metrics.json").write_text(scores, encoding="utf-8")
+        made.append(folder / name)
+    return made
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="what", required=True)
+    one = commands.add_parser("summary")
+    one.add_argument("--report", type=Path, required=True)
+    one.add_argument("--reports", type=int, default=1000)
+    two = commands.add_parser("validate")
+    for name in ("--run", "--sim", "--data"):
+        two.add_argument(name, type=Path, required=True)
+    two.add_argument("--pulses", type=int, default=1_000_000)
+    two.add_argument("--most", type=int, default=50_000)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if given.what == "summary":
+            reports = many_reports(given.report, folder, given.reports)
+            call("summary", *reports, "--out", folder / "all.html")
+            print(f"{(folder / 'all.html').stat().st_size / 1e6:.1f} MB")
+            return
+        for side, noise in (("sim", 0.0), ("data", 1.0)):
+            source = getattr(given, side)
+            repeated(source, folder / f"{side}.lh5", given.pulses, noise=noise)
+        files = ["--sim", folder / "sim.lh5", "--data", folder / "data.lh5"]
+        files += ["--most", str(given.most)]
+        call("validate", given.run, *files, "--no-rivals", "--out", folder / "report")
+        scores = json.loads((folder / "report" / "metrics.json").read_text("utf-8"))
+        print(scores["rejections"])
+
+
+if __name__ == "__main__":
+    main()
