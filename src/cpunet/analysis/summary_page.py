@@ -14,7 +14,7 @@ from typing import Any
 
 from cpunet.analysis.forest_plot import forest_plot
 from cpunet.analysis.side_by_side import Row, side_by_side
-from cpunet.analysis.verdicts import method_verdicts, part, summary
+from cpunet.analysis.verdicts import judged_scores, part, summary
 
 METHOD = "ren"
 _NAMES_APART = " · "
@@ -96,22 +96,11 @@ def _cell(entry: Entry | None) -> str:
         return "<td>–</td>"
     if entry.metrics is None:
         return '<td class="missing">no report</td>'
-    off, judged = _off(entry.metrics)
+    off, judged = judged_scores(entry.metrics, METHOD)
     text = f"{off} of {judged} off" if judged else "not judged"
     # one or two scores can be off by chance
     marked = ' class="off"' if off > 2 and off > 0.2 * judged else ""
     return f"<td{marked}>{_linked(entry, text)}</td>"
-
-
-def _off(metrics: Mapping[str, Any]) -> tuple[int, int]:
-    """Number of scores that are off, and number of scores with a verdict."""
-    judged = [
-        verdict.agrees
-        for peak in part(metrics, "peaks")
-        for verdict in method_verdicts(metrics, peak, METHOD).values()
-        if verdict.agrees is not None
-    ]
-    return judged.count(False), len(judged)
 
 
 def _panels(rows: Sequence[Row], entries: Sequence[Entry]) -> list[str]:

@@ -68,11 +68,13 @@ class InputFile:
             Side of the file, ``"sim"`` or ``"data"``.
         """
         told = run_info.get(side)
-        if self.options or not isinstance(told, dict):
+        if not isinstance(told, dict):
             return self
         before, read_as = told.get("file"), told.get("read_as")
         same = isinstance(before, str) and Path(before).resolve() == self.path.resolve()
         if not same or not isinstance(read_as, dict):
+            return self
+        if any(read_as.get(name) != value for name, value in self.options.items()):
             return self
         return replace(self, **{name: read_as[name] for name in _READ_AS if name in read_as})
 
