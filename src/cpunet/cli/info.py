@@ -40,7 +40,7 @@ Crystal = Annotated[
     str | None,
     typer.Option(
         "--detector",
-        help="Of hits: share inside this crystal (icpc, ppc or a file), and the frame that fits.",
+        help="Crystal of hits (icpc, ppc or a file): how many are inside, the frame that fits.",
     ),
 ]
 

@@ -12,6 +12,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.yaml_files import plain_json
 
 # attributes of a table, and of a file
 SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
@@ -109,6 +110,16 @@ def recorded_attributes(source: PulseSource) -> dict[str, str]:
         }
         found[TRANSLATION] = text_attribute(file, TRANSLATION)
     return {name: text for name, text in found.items() if text}
+
+
+def recorded_detector(source: PulseSource) -> str | None:
+    """Name of the simulated detector; None if the file does not contain it."""
+    try:
+        detector = plain_json(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
+        name = detector["name"]
+    except (ValueError, LookupError, TypeError):
+        return None
+    return name if isinstance(name, str) else None
 
 
 def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:

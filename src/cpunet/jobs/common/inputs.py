@@ -20,7 +20,7 @@ from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
-from cpunet.pulses.side import require_side
+from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
 
@@ -94,7 +94,8 @@ class InputSet:
     """The prepared pulses of a file, with the quality cuts if they are measured.
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
-    ``read_as`` the reading options, see `InputFile.options`.
+    ``read_as`` the reading options, see `InputFile.options`; ``detector`` the name of the
+    simulated one, if the file contains it.
     """
 
     prepared: Prepared
@@ -103,6 +104,7 @@ class InputSet:
     energies_kev: Energies
     cuts: CutWindows | None = None
     read_as: dict[str, Any] = field(default_factory=dict)
+    detector: str | None = None
 
     def provenance(self) -> dict[str, Any]:
         """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
@@ -227,7 +229,10 @@ def _load(
         f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
         + (f" (left out: {rejected})" if rejected else "")
     )
-    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options)
+    return InputSet(
+        prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options,
+        recorded_detector(source),
+    )  # fmt: skip
 
 
 def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:

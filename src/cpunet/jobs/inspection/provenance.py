@@ -42,13 +42,6 @@ def provenance(source: PulseSource) -> dict[str, str]:
     return {name: text for name, text in words.items() if text}
 
 
-def simulated_detector(source: PulseSource) -> str | None:
-    """Name of the detector of a simulation; None if the file does not contain it."""
-    detector = _parsed(recorded_attributes(source).get(SIMULATION)).get("detector")
-    name = detector.get("name") if isinstance(detector, Mapping) else None
-    return name if isinstance(name, str) else None
-
-
 def _parsed(text: str | None) -> Mapping[str, Any]:
     with suppress(ValueError, TypeError):
         found = plain_json(text or "")

@@ -8,6 +8,7 @@ from typing import Any
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.evaluation import period_of
 from cpunet.jobs.validation.summary_page import summarise_reports
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.training.run_folder import INFO
@@ -60,5 +61,7 @@ def validate_channels(
     outcome = one_by_one(channels, out, validate, monitor.note)
     if outcome.done:
         folders = [out / name for name in channels]
-        summarise_reports(folders, out / INDEX, missing_ok=True, force=True)
+        period = period_of(data.path) or data.path.stem
+        names = [(name, period) for name in channels]
+        summarise_reports(folders, out / INDEX, names=names, missing_ok=True, force=True)
     return outcome
