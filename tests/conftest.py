@@ -160,7 +160,7 @@ def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
     patch.setattr("cpunet.jobs.validation.validate._drawn", lambda _drawing, _advance: Figure())
-    patch.setattr("cpunet.analysis.report._png", lambda _figure: b"")
+    patch.setattr("cpunet.analysis.report.figure_png", lambda _figure: b"")
 
 
 @pytest.fixture

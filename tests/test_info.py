@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -14,16 +15,13 @@ import pytest
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info import describe
+from cpunet.jobs.inspection.trace_properties import trace_properties
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.geometry_readers import read_detector
 
-LINES = {
-    "FEP": PeakConfig(energy_kev=2614.511, half_width_kev=5),
-    "SEP": PeakConfig(energy_kev=2103.511, half_width_kev=5),
-    "DEP": PeakConfig(energy_kev=1592.511, half_width_kev=5),
-}
+RECIPE = load_recipe("fast")
 
 
 def test_a_file_of_pulses(tmp_path):
@@ -35,7 +33,7 @@ def test_a_file_of_pulses(tmp_path):
     energies = [2614.0, 2615.0, 2103.0, 500.0, np.nan, 100.0]
     path = tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=energies))
-    assert describe(path, peaks=LINES) == {
+    assert describe(path, recipe=RECIPE) == {
         "kind": "pulses",
         "path": str(path),
         "format": "LH5",
@@ -75,26 +73,24 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
 
 def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
-    preparation = load_recipe("fast").preparation
     flat = tmp_path / "flat.lh5"
-    told = describe(path, kev_per_adc=calibrated, preparation=preparation, without_remains=flat)
+    told = describe(path, kev_per_adc=calibrated, recipe=RECIPE, without_remains=flat)
     assert told["remains"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
     json.dumps(told)
     left = lh5.read("geds/raw/remains_kev", flat).nda
     assert len(left) == 1000
     assert np.nanmean(left > 10) == pytest.approx(0.3, abs=0.03)
-    again = describe(flat, preparation=preparation)["remains"]
+    again = describe(flat, recipe=RECIPE)["remains"]
     assert again["rate_khz"] == 0
 
 
 def test_remains_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
-    preparation = load_recipe("fast").preparation
-    told = describe(path, preparation=preparation)
+    told = describe(path, recipe=RECIPE)
     assert told["remains"].startswith("cannot be told: only 0 of 40 traces can be prepared")
     with pytest.raises(CpunetError, match="only 0 of 40 traces"):
-        describe(path, preparation=preparation, without_remains=tmp_path / "flat.lh5")
+        describe(path, recipe=RECIPE, without_remains=tmp_path / "flat.lh5")
     write_pulses(tmp_path / "sim.lh5", Pulses.of(np.tile(np.arange(400), (9, 1)), dt_ns=16))
     with pytest.raises(CpunetError, match="remains are taken off measured traces"):
         describe(tmp_path / "sim.lh5", without_remains=tmp_path / "flat.lh5")
@@ -122,7 +118,7 @@ def test_folders_that_are_no_runs(tmp_path, text, message):
 
 
 def test_reference_pulses(reference_data: Path):
-    told = describe(reference_data / "closure" / "data.lh5", peaks=LINES)
+    told = describe(reference_data / "closure" / "data.lh5", recipe=RECIPE)
     assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
     assert min(told["peaks"].values()) > 500
     assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
@@ -176,7 +172,7 @@ def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
     np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
-    told = describe(path, peaks=load_recipe("fast").peaks)["detectors"][""]
+    told = describe(path, recipe=RECIPE)["detectors"][""]
     assert (told["events"], told["hits"]) == (2, 3)
     assert told["energy_kev"] == [50.0, 2614.5]
     assert told["r_mm"] == [0.0, 5.0]
@@ -186,8 +182,88 @@ def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
     csv.write_text(
         f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,2,3,4,5\n"
     )
-    for file, said in ((path, "z_mm        10 … 30"), (csv, "names no unit")):
+    for file, said in ((path, "z 10 … 30, r 0 … 5 mm"), (csv, "names no unit")):
         monkeypatch.setattr("sys.argv", ["cpunet", "info", str(file)])
         with pytest.raises(SystemExit):
             main()
         assert said in capsys.readouterr().out
+
+
+def test_measured_traces_are_described(reference_data: Path):
+    """A bench detector: what its digitiser was set to, and what is seen by eye."""
+    told = describe(reference_data / "real" / "th228.fcio", recipe=RECIPE)["traces"]
+    assert told["looked_at"] == 1000
+    low, middle, high = told["trigger_sample"]
+    assert low <= middle <= high
+    assert middle == pytest.approx(911, abs=3)
+    assert 700 < told["baseline_samples"] < middle
+    assert told["decay_us"] == pytest.approx(78.9, rel=0.03)
+    assert told["saturated_percent"] == pytest.approx(0.2)
+    assert told["noise_adc"] == pytest.approx(15, abs=2)
+    assert "noise_kev" not in told
+
+
+def test_the_properties_are_those_that_were_made():
+    """Noise, decay, trigger and saturation of traces made here."""
+    rng, n, length, at = np.random.default_rng(4), 60, 1600, 700
+    time = np.arange(length)
+    shape = np.where(time < at, 0, np.exp(-(time - at) * 16e-3 / 50))
+    traces = 1000 + np.linspace(2000, 4000, n)[:, np.newaxis] * shape
+    traces = np.round(traces + rng.normal(0, 6, traces.shape))
+    traces[:3] = np.minimum(traces[:3], 2000)
+    pulses = Pulses.of(traces, dt_ns=16, energy_kev=np.linspace(1000, 2000, n))
+    told = trace_properties([pulses], RECIPE)
+    assert told["trigger_sample"] == [at, at, at]
+    assert told["baseline_samples"] == at
+    assert told["noise_adc"] == pytest.approx(6, rel=0.1)
+    assert told["noise_kev"] == pytest.approx(3, rel=0.15)
+    assert told["decay_us"] == pytest.approx(50, rel=0.02)
+    assert told["saturated_percent"] == pytest.approx(5)
+    with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
+        trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
+
+
+def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
+    told = describe(stand_of_one_detector)
+    assert told["provenance"]["made by"].startswith("cpunet simulate")
+    assert told["provenance"]["detector"].startswith("ppc, 2500 V, 90 K")
+    assert told["provenance"]["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
+
+
+@pytest.fixture
+def stand_of_one_detector(tmp_path: Path) -> Path:
+    """A file with the attributes of ``cpunet simulate``."""
+    made = {
+        "detector": {"name": "ppc", "bias_V": 2500.0, "temperature_K": 90.0},
+        "hits": {"file": "/a/hits.npz", "origin_mm": [0.0, 0.0, 0.0], "flip_z": False},
+        "events": 3,
+        "events_without_signal": 0,
+        "seed": 1,
+    }
+    attrs = {"made_by": "cpunet simulate 0.1.0", "simulation": json.dumps(made)}
+    path = tmp_path / "sim.lh5"
+    write_pulses(path, Pulses.of(np.tile(np.arange(300.0), (3, 1)), dt_ns=16), attrs=attrs)
+    return path
+
+
+def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
+    """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
+    crystal = read_detector("icpc")
+    rng = np.random.default_rng(3)
+    place = rng.uniform(-1, 1, (20000, 3)) * [40.4, 40.4, 48] + [0, 0, 48]
+    place = place[crystal.inside(np.hypot(place[:, 0], place[:, 1]), place[:, 2])]
+    moved = place * [1, -1, -1] + [25.0, -10.0, 200.0]
+    path = tmp_path / "hits.npz"
+    columns = dict(zip(("x_mm", "y_mm", "z_mm"), moved.T, strict=True))
+    offsets = np.arange(len(moved) + 1)
+    np.savez(path, **columns, edep_keV=np.full(len(moved), 100.0), offsets=offsets)
+    told = describe(path, detector=crystal)["detectors"][""]["crystal"]
+    assert told["outside_percent"] > 90
+    assert told["fits"]["flip_z"]
+    assert told["fits"]["origin_mm"] == pytest.approx([25, -10, 200], abs=0.5)
+    assert told["fits"]["inside_percent"] > 98
+    monkeypatch.setattr("sys.argv", ["cpunet", "info", str(path), "--detector", "icpc"])
+    with pytest.raises(SystemExit):
+        main()
+    assert f"{told['fits']['options']}\n" in capsys.readouterr().out
+    assert re.fullmatch(r"--origin [\d.,-]+ --flip-z", told["fits"]["options"])

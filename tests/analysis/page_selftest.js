@@ -94,6 +94,21 @@
   seen.hidden = getComputedStyle(host("distributions").querySelector(".pair")).display;
   choose("distributions", 0, "SEP");
   seen.widths = [document.documentElement.scrollWidth, innerWidth, svg("distributions").clientWidth];
+  // what a browser does to print: its rules for paper, and the event before and after
+  const rules = [...document.styleSheets].flatMap((sheet) => [...sheet.cssRules]).filter((rule) => rule.media?.mediaText === "print");
+  const folded = () => [...document.querySelectorAll("details")].map((d) => d.open);
+  const before = folded();
+  rules.forEach((rule) => { rule.media.mediaText = "all"; });
+  dispatchEvent(new Event("beforeprint"));
+  seen.printed = {
+    before,
+    open: folded(),
+    hidden: [...document.querySelectorAll("nav, .controls, .readout")].map((e) => getComputedStyle(e).display),
+    widths: [document.documentElement.scrollWidth, innerWidth, svg("distributions").clientWidth],
+  };
+  dispatchEvent(new Event("afterprint"));
+  seen.printed.closed = folded();
+  rules.forEach((rule) => { rule.media.mediaText = "print"; });
   document.querySelectorAll("details").forEach((d) => { d.open = true; });
   seen.unfolded = document.documentElement.scrollWidth;
   seen.resources = performance.getEntriesByType("resource").map((e) => e.name);

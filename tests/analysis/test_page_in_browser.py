@@ -21,15 +21,16 @@ addEventListener("error", (event) => window.caught.push(String(event.message)));
 addEventListener("unhandledrejection", (event) => window.caught.push(String(event.reason)));
 console.error = (...words) => window.caught.push(words.join(" "));
 </script>"""
-# both widths at once: a browser's start is slow
+# all widths at once: a browser's start is slow
 AROUND = """<!doctype html><style>iframe { border: 0; height: 900px }</style>
 <iframe src="inner.html" style="width: 1280px"></iframe>
+<iframe src="inner.html" style="width: 768px"></iframe>
 <iframe src="inner.html" style="width: 400px"></iframe>
 <script>
 const seen = {};
 addEventListener("message", (event) => {
-  seen[event.source === frames[0] ? "1280" : "400"] = event.data;
-  if (Object.keys(seen).length < 2) return;
+  seen[["1280", "768", "400"].find((_, i) => event.source === frames[i])] = event.data;
+  if (Object.keys(seen).length < 3) return;
   const pre = document.createElement("pre");
   pre.id = "selftest";
   pre.textContent = JSON.stringify(seen);
@@ -77,7 +78,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def report(folder: Path) -> dict[str, dict[str, Any]]:
-    seen, log = browser.run_page(folder / "around.html", width=1800)
+    seen, log = browser.run_page(folder / "around.html", width=2600)
     for found in seen.values():
         assert "failed" not in found, found
     spoken = [line for line in log.splitlines() if "CONSOLE" in line]
@@ -86,7 +87,7 @@ def report(folder: Path) -> dict[str, dict[str, Any]]:
     return seen
 
 
-@pytest.fixture(scope="module", params=["1280", "400"])
+@pytest.fixture(scope="module", params=["1280", "768", "400"])
 def seen(request: pytest.FixtureRequest, report: dict[str, dict[str, Any]]) -> dict[str, Any]:
     return report[request.param]
 
@@ -179,3 +180,14 @@ def test_events_are_picked(seen):
 def test_a_peak_without_data_says_so(seen):
     assert seen["gap"] == "Nothing to show: no measured pulses were scored."
     assert seen["hidden"] == "none"
+
+
+def test_on_paper_all_is_open_and_nothing_is_cut(report):
+    """With the rules for print, in a frame as wide as a sheet."""
+    found = report["768"]["printed"]
+    assert found["open"] == [True] * len(found["open"])
+    assert set(found["hidden"]) == {"none"}
+    width, window, chart = found["widths"]
+    assert width <= window
+    assert 300 < chart <= 16 / 2.54 * 96 + 1
+    assert found["closed"] == found["before"]

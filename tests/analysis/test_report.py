@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cpunet.analysis.comparisons import compare
+from cpunet.analysis.html_pages import DPI, figure_png
 from cpunet.analysis.nested_tables import nested_html
-from cpunet.analysis.report import DPI, _png, write_report
+from cpunet.analysis.report import write_report
 from cpunet.analysis.views import distributions, method_looks
 from cpunet.recipes import load_recipe
 
@@ -295,5 +296,5 @@ def test_a_figure_has_the_pixels_that_it_would_be_saved_with():
 
     saved = io.BytesIO()
     made().savefig(saved, format="png", dpi=DPI)
-    drawn, wanted = (Image.open(png) for png in (io.BytesIO(_png(made())), saved))
+    drawn, wanted = (Image.open(png) for png in (io.BytesIO(figure_png(made())), saved))
     np.testing.assert_array_equal(drawn, wanted)

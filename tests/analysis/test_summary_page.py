@@ -148,7 +148,7 @@ def test_links_lead_to_the_reports(four, tmp_path):
 def test_nothing_is_loaded_from_elsewhere(four, tmp_path):
     out = tmp_path / "index.html"
     summarise_reports(four, out)
-    assert not re.search(r"(src|url\(|https?:|@import)", out.read_text())
+    assert not re.search(r"(src=|url\(|https?:|@import)", out.read_text())
 
 
 def test_verdicts_in_words(four, tmp_path):
@@ -164,6 +164,20 @@ def test_folders_name_detector_and_period(tmp_path, monkeypatch):
     assert detector_and_period(Path("V01/p03/report/")) == ("V01", "p03")
     assert detector_and_period(Path("p03/report")) == (tmp_path.name, "p03")
     assert detector_and_period(Path("/")) == ("", "/")
+
+
+def test_runs_that_record_detector_and_period_need_no_folders(tmp_path):
+    """As recorded if all runs do so and no two are the same; else by their folders."""
+    reports = [report(tmp_path / name, 87.0) for name in ("a", "b")]
+    for folder, detector, period in zip(reports, ("V01", "V01"), ("p03", "p04"), strict=True):
+        told = metrics(87.0) | {"compared": {"detector": detector, "period": period}}
+        (folder / "metrics.json").write_text(json.dumps(told))
+    entries = summarise_reports(reports, tmp_path / "index.html")
+    assert [entry.name for entry in entries] == ["V01 · p03", "V01 · p04"]
+    told["compared"] |= {"period": "p03"}
+    (reports[1] / "metrics.json").write_text(json.dumps(told))
+    entries = summarise_reports(reports, tmp_path / "index.html", force=True)
+    assert [entry.period for entry in entries] == ["a", "b"]
 
 
 def call(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[object, str, str]:

@@ -283,12 +283,15 @@ def test_info_of_files_and_runs(command, stand, trained):
     told = command("info", stand.data)
     assert told.code == 0
     lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
-    assert lines["n_pulses"] == str(len(stand.data_kev))
-    assert (lines["length"], lines["dt_ns"]) == ("1200", "16")
-    assert [lines[f"peaks.{peak}"] for peak in ("FEP", "SEP", "DEP")] == ["24"] * 3
+    assert lines["traces"] == f"{len(stand.data_kev)} of 1200 samples, every 16 ns"
+    assert lines["lines"] == "24 FEP, 24 SEP, 24 DEP"
+    assert lines["trigger"].startswith("half of the height at sample 5")
     told = command("info", trained)
     lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
-    assert (lines["kind"], lines["seed"], lines["recipe"]) == ("run", "3", "small")
+    assert lines["run"] == str(trained)
+    assert lines["trained"].startswith("recipe small on FEP, seed 3; ")
+    assert "pulses used" in lines["simulated"] and "pulses used" in lines["measured"]  # noqa: PT018
+    assert len(told.out.splitlines()) < 20
 
 
 @pytest.mark.parametrize("what", ["train", "translate", "validate"])

@@ -223,7 +223,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     assert "column energy [keV]" in table
     one = told(capsys, monkeypatch, "info", raw, "--table", 5, "--dt-ns", 10)
     assert "Majorana release" in one
-    assert re.search(rf"^peaks.FEP +{2 * N * 2 // 3}$", one, re.MULTILINE)
+    assert re.search(rf"^lines +{2 * N * 2 // 3} FEP$", one, re.MULTILINE)
     simulated = charge(np.random.default_rng(3), N, 1000, 500)
     pulses = cpunet.Pulses.of(simulated, dt_ns=10, energy_kev=np.full(N, KEV))
     write_pulses(sim, pulses)

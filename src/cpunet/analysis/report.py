@@ -6,28 +6,21 @@ policy blocks all requests.
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
-from matplotlib.backend_bases import FigureCanvasBase
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.analysis.ae_energy_figure import ae_energy_html
-from cpunet.analysis.nested_tables import nested_html
+from cpunet.analysis.html_pages import asset, figure_html, figure_png, rendered
+from cpunet.analysis.nested_tables import nested_html, number
 from cpunet.analysis.report_tables import (
-    compared_html,
     folded,
     gap,
     pairs_table,
@@ -46,9 +39,6 @@ REPORT = FolderKind(
     older=r"(spectrum|losses|.*_(forward_cycle|backward_cycle|mean_pulse|single_pulse|superpulses"
     r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
 )
-DPI = 150
-COMPRESSION = 1  # of PNG, 0 … 9: files a tenth larger than with the usual 6, in half the time
-WIDE = 2.0  # aspect ratio from which a figure takes the full width of the page
 FIRST = 2  # figures of mean pulses at the top of the page
 MANY = 4  # number of figures from which they are collapsed
 
@@ -127,18 +117,19 @@ def write_report(
     (folder / METRICS).write_text(text + "\n", encoding="utf-8")
     drawn = {}
     for name, figure in figures.items():
-        png = _png(figure)
+        png = figure_png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
-        drawn[name] = _figure_html(name, figure, png)
+        drawn[name] = figure_html(name.replace("_", " "), figure, png)
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, ""))
     first, of_noise, of_ae, others = _shared_out(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
-    html = Template(_asset("page.html")).substitute(
-        css=_asset("page.css"),
-        compared=compared_html(metrics.get("compared", {})),
+    html = rendered(
+        "report.html",
+        title="CPU-Net validation",
+        compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
         first=_gallery(first),
-        notes="\n".join(f"<p>{escape(note)}</p>" for note in notes),
+        notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts")),
         scores="\n".join(
             peak_html(name, scores, judged.get(name))
@@ -158,10 +149,6 @@ def write_report(
         script=_script(views),
     )
     (folder / "report.html").write_text(html, encoding="utf-8")
-
-
-def _asset(name: str) -> str:
-    return files("cpunet.analysis").joinpath("page", name).read_text("utf-8")
 
 
 def _shared_out(
@@ -205,7 +192,7 @@ def _script(views: Mapping[str, Any]) -> str:
     data = json.dumps(views, allow_nan=False, separators=(",", ":"))
     # in a script element any "<" of the JSON could start the closing tag
     data = data.replace("<", "\\u003c")
-    code = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
+    code = "\n".join(asset(f"{name}.js") for name in SCRIPTS)
     return (
         f'<script type="application/json" id="view-data">{data}</script>\n'
         f'<script>\n(() => {{\n"use strict";\n{code}}})();\n</script>'
@@ -228,29 +215,6 @@ def _gallery(drawn: Sequence[str]) -> str:
     if len(drawn) <= MANY:
         return gallery
     return folded(f"{len(drawn)} figures, also as PNG beside this page", gallery)
-
-
-def _figure_html(name: str, figure: Figure, png: bytes) -> str:
-    width, height = figure.get_size_inches()
-    caption = escape(name.replace("_", " "))
-    data = base64.b64encode(png).decode("ascii")
-    kind = ' class="wide"' if width >= WIDE * height else ""
-    return (
-        f'<figure{kind}><img alt="{caption}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _png(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    figure.set_dpi(DPI)
-    # ``Figure.savefig`` would process every figure twice, once without drawing;
-    # without the program's name and version, equal figures give equal files
-    FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
-        stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
-    )
-    FigureCanvasBase(figure)  # releases the pixel buffer, which the figure would keep
-    return stream.getvalue()
 
 
 def _file_stem(name: str) -> str:

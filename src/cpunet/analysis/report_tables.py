@@ -23,12 +23,6 @@ def folded(title: str, html: str) -> str:
     return f"<details><summary>{title}</summary>\n{html}\n</details>"
 
 
-def compared_html(compared: Mapping[str, Any]) -> str:
-    """Return the compared inputs: files, dates, versions, the quality of the fit."""
-    rows = [[name.replace("_", " "), str(number(value))] for name, value in compared.items()]
-    return html_table(["Compared", ""], rows, words={0, 1}) if rows else ""
-
-
 def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
     """Return the verdicts in plain words; nothing without verdicts."""
     if not verdicts:

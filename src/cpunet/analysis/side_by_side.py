@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from cpunet.analysis.verdicts import number, part
@@ -67,12 +67,16 @@ class SideBySide:
         Scores, ordered by peak.
     notes
         Reasons to doubt the comparison, one sentence each.
+    compared
+        What the runs were made of: files, detector, period, quality of the fit; texts in the
+        order of the runs, by name.
     """
 
     names: tuple[str, ...]
     method: str
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
+    compared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide:
@@ -116,7 +120,9 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
             f"{', '.join(runs)}: no score of the method {method}; "
             + (f"there are {', '.join(known)}" if known else "nothing is scored there")
         )
-    return SideBySide(tuple(runs), method, tuple(rows), tuple(_notes(runs)))
+    told = [part(metrics, "compared") for metrics in runs.values()]
+    compared = {n: tuple(str(one.get(n, NO_VALUE)) for one in told) for n in _union(told)}
+    return SideBySide(tuple(runs), method, tuple(rows), tuple(_notes(runs)), compared)
 
 
 def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
@@ -189,6 +195,8 @@ def _notes(runs: Mapping[str, Metrics]) -> list[str]:
     first, *others = runs
     notes = []
     for other in others:
+        if crystals := _crystals(runs[first], runs[other]):
+            notes.append(f"{first} and {other} are of different detectors, {crystals}.")
         apart = _differences(runs[first], runs[other])
         if apart:
             notes.append(
@@ -196,6 +204,12 @@ def _notes(runs: Mapping[str, Metrics]) -> list[str]:
                 f"({', '.join(apart)}): their scores differ for that reason, too."
             )
     return notes
+
+
+def _crystals(one: Metrics, other: Metrics) -> str:
+    """The two detectors, if the runs are of different ones."""
+    names = [part(metrics, "compared").get("detector") for metrics in (one, other)]
+    return f"{names[0]} and {names[1]}" if all(names) and names[0] != names[1] else ""
 
 
 def _differences(one: Metrics, other: Metrics) -> list[str]:

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
-from importlib.resources import files
-from string import Template
 from typing import Any
 
 from cpunet.analysis.forest_plot import forest_plot
+from cpunet.analysis.html_pages import rendered
 from cpunet.analysis.side_by_side import Row, side_by_side
-from cpunet.analysis.verdicts import method_verdicts, part, summary
+from cpunet.analysis.verdicts import judged_scores, part, summary
 
 METHOD = "ren"
 _NAMES_APART = " · "
@@ -61,88 +59,56 @@ def summary_page(entries: Sequence[Entry]) -> str:
     """
     scored = {e.name: e.metrics for e in entries if e.metrics is not None}
     rows = side_by_side(scored, METHOD).rows
-    periods = list(dict.fromkeys(entry.period for entry in entries))
-    missing = [entry.name for entry in entries if entry.metrics is None]
-    page = files("cpunet.analysis").joinpath("summary_page.html").read_text(encoding="utf-8")
-    return Template(page).substitute(
-        count=f"{len(scored)} of {len(entries)} reports",
-        missing=_missing(missing),
-        periods="".join(f'<th scope="col">{escape(period)}</th>' for period in periods),
-        overview="\n".join(_overview(entries, periods)),
-        panels="\n".join(_panels(rows, [e for e in entries if e.metrics is not None])),
-        words="\n".join(_in_words(entry) for entry in entries if entry.metrics is not None),
+    with_scores = [entry for entry in entries if entry.metrics is not None]
+    return rendered(
+        "summary.html",
+        title="REN translations by detector and period",
+        entries=entries,
+        scored=len(scored),
+        missing=[entry.name for entry in entries if entry.metrics is None],
+        periods=(periods := list(dict.fromkeys(entry.period for entry in entries))),
+        overview=_overview(entries, periods),
+        panels=_panels(rows, with_scores),
+        words=[(entry, *_in_words(entry.metrics or {})) for entry in with_scores],
     )
 
 
-def _missing(names: Sequence[str]) -> str:
-    if not names:
-        return ""
-    listed = ", ".join(map(escape, names))
-    return f'<p class="missing"><strong>No report:</strong> {listed}.</p>'
-
-
-def _overview(entries: Sequence[Entry], periods: Sequence[str]) -> list[str]:
-    """One row per detector, one cell per period: number of scores off, and the report."""
+def _overview(
+    entries: Sequence[Entry], periods: Sequence[str]
+) -> dict[str, list[dict[str, Any]]]:
+    """By detector, a cell for each period: number of scores off, and the report."""
     found = {(entry.detector, entry.period): entry for entry in entries}
-    lines = []
-    for detector in dict.fromkeys(entry.detector for entry in entries):
-        cells = [_cell(found.get((detector, period))) for period in periods]
-        lines.append(f'<tr><th scope="row">{escape(detector)}</th>{"".join(cells)}</tr>')
-    return lines
+    return {
+        detector: [_cell(found.get((detector, period))) for period in periods]
+        for detector in dict.fromkeys(entry.detector for entry in entries)
+    }
 
 
-def _cell(entry: Entry | None) -> str:
-    if entry is None:
-        return "<td>–</td>"
-    if entry.metrics is None:
-        return '<td class="missing">no report</td>'
-    off, judged = _off(entry.metrics)
-    text = f"{off} of {judged} off" if judged else "not judged"
+def _cell(entry: Entry | None) -> dict[str, Any]:
+    off, judged = judged_scores((entry and entry.metrics) or {}, METHOD)
     # one or two scores can be off by chance
-    marked = ' class="off"' if off > 2 and off > 0.2 * judged else ""
-    return f"<td{marked}>{_linked(entry, text)}</td>"
+    marked = off > 2 and off > 0.2 * judged
+    text = f"{off} of {judged} off" if judged else "not judged"
+    return {"entry": entry, "text": text, "marked": marked}
 
 
-def _off(metrics: Mapping[str, Any]) -> tuple[int, int]:
-    """Number of scores that are off, and number of scores with a verdict."""
-    judged = [
-        verdict.agrees
-        for peak in part(metrics, "peaks")
-        for verdict in method_verdicts(metrics, peak, METHOD).values()
-        if verdict.agrees is not None
-    ]
-    return judged.count(False), len(judged)
-
-
-def _panels(rows: Sequence[Row], entries: Sequence[Entry]) -> list[str]:
-    """A heading per peak, and a forest plot per score."""
+def _panels(rows: Sequence[Row], entries: Sequence[Entry]) -> dict[str, list[str]]:
+    """By peak, a forest plot per score."""
     names = [entry.name for entry in entries]
     detectors = [entry.detector for entry in entries]
     starts = [i for i, name in enumerate(detectors) if i and name != detectors[i - 1]]
-    lines = []
-    for peak in dict.fromkeys(row.peak for row in rows):
-        panels = [forest_plot(row, names, starts) for row in rows if row.peak == peak]
-        lines.append(f'<h3>{escape(peak)}</h3>\n<div class="panels">')
-        lines += [*panels, "</div>"]
-    return lines
+    return {
+        peak: [forest_plot(row, names, starts) for row in rows if row.peak == peak]
+        for peak in dict.fromkeys(row.peak for row in rows)
+    }
 
 
-def _in_words(entry: Entry) -> str:
-    metrics = entry.metrics or {}
+def _in_words(metrics: Mapping[str, Any]) -> tuple[str, list[str]]:
+    """How the network was trained, and the verdict on each peak."""
     training = part(metrics, "training")
     known = [
         f"{words} {training[key]}"
         for key, words in (("recipe", "recipe"), ("peak", "trained on"), ("device", "on"))
         if isinstance(training.get(key), (str, int, float))
     ]
-    lines = "".join(
-        f"<li>{escape(summary(metrics, peak, METHOD))}</li>" for peak in part(metrics, "peaks")
-    )
-    about = f' <span class="about">{escape(", ".join(known))}</span>' if known else ""
-    return f"<dt>{_linked(entry, entry.name)}{about}</dt>\n<dd><ul>{lines}</ul></dd>"
-
-
-def _linked(entry: Entry, text: str) -> str:
-    if entry.link is None:
-        return escape(text)
-    return f'<a href="{escape(entry.link, quote=True)}">{escape(text)}</a>'
+    return ", ".join(known), [summary(metrics, peak, METHOD) for peak in part(metrics, "peaks")]

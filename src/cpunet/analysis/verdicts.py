@@ -320,3 +320,14 @@ def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -
     unit = f" {PARAMETERS[name].unit}" if name in PARAMETERS else ""
     distance, chance = number(one, "wasserstein", method), number(one, "wasserstein_null")
     return f" (W₁ {distance:.3g}{unit}, by chance {chance:.3g}{unit})"
+
+
+def judged_scores(metrics: Mapping[str, Any], method: str) -> tuple[int, int]:
+    """Number of scores of a method that are off, and number of scores with a verdict."""
+    judged = [
+        verdict.agrees
+        for peak in part(metrics, "peaks")
+        for verdict in method_verdicts(metrics, peak, method).values()
+        if verdict.agrees is not None
+    ]
+    return judged.count(False), len(judged)

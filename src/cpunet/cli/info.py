@@ -12,11 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table, warn
-from cpunet.outputs import refuse_inputs
+from cpunet.cli.messages import out, print_table, tell, warn
+from cpunet.errors import CpunetError
+from cpunet.jobs.inspection.info_words import Lines, in_words
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
-TableName = Annotated[str | None, typer.Option("--table", help="Table, if there are several.")]
+TableName = Annotated[
+    str | None, typer.Option("--table", help="Table, if there are several; or all.")
+]
 Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
 
 WithoutRemains = Annotated[
@@ -29,57 +32,84 @@ WithoutRemains = Annotated[
 ]
 
 
+Page = Annotated[
+    Path | None,
+    typer.Option("--out", help="HTML page to write: the same with the spectrum and its lines."),
+]
+Crystal = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        help="Crystal of hits (icpc, ppc or a file): how many are inside, the frame that fits.",
+    ),
+]
+
+
 def info(
     source: Source,
     table: TableName = None,
     energy: Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
+    detector: Crystal = None,
+    page: Page = None,
     without_remains: WithoutRemains = None,
     force: options.Force = False,
 ) -> None:
     """Say what is in a file or run: events, sampling, energies, peaks, provenance.
 
-    Files of hits are described, too: events, energies and where they lie.
+    Of measured traces it says trigger, baseline, decay, noise, saturation and pile-up, and what
+    earlier pulses have left under them. Files of hits are described, too: events, energies and
+    where they lie.
 
-    Of measured traces it says what earlier pulses have left under them, and the rate of
-    pulses that follows.
+    Example: cpunet info raw.lh5 --out raw.html
 
-    Example: cpunet info raw.lh5
+    Example: cpunet info raw.lh5 --table all
 
-    Example: cpunet info raw.lh5 --without-remains flat.lh5
+    Example: cpunet info hits.npz --detector icpc
     """
     from cpunet.jobs.inspection.info import describe
     from cpunet.recipes import load_recipe
+    from cpunet.simulation.geometry_readers import read_detector
     from cpunet.training.run_schema import problem
 
-    if without_remains is not None:
-        refuse_inputs(without_remains, source, energy)
-    recipe = load_recipe("fast")
     told = describe(
         source,
         table=table,
         energy=energy,
         kev_per_adc=kev_per_adc,
         dt_ns=dt,
-        peaks=recipe.peaks,
-        preparation=recipe.preparation,
+        recipe=load_recipe("fast"),
+        detector=None if detector is None else read_detector(detector),
         without_remains=without_remains,
+        out=page,
         force=force,
     )
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is damaged ({wrong}); train again")
     if told["kind"] == "tables":
         print_table(_tables(told))
-        out.print("one of them: --table NAME", highlight=False)
-        return
-    if told["kind"] == "hits":
-        told |= told.pop("detectors")
-        if "" in told:
-            told |= {"hits": told.pop("")} if isinstance(told[""], str) else told.pop("")
-    width = max(len(name) for name, _ in _lines(told))
-    for name, value in _lines(told):
-        out.print(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)
+        out.print("one of them: --table NAME; each in full: --table all", highlight=False)
+    elif told["kind"] == "channels":
+        for name, one in told["channels"].items():
+            out.print(f"{name}:", markup=False, highlight=False)
+            _print([("", one)] if isinstance(one, str) else in_words(one))
+    else:
+        _print(in_words(told))
+    if page is not None:
+        tell(f"{page}", soft_wrap=True)
+    failed = [n for n, one in told.get("channels", {}).items() if isinstance(one, str)]
+    if failed:
+        raise CpunetError(
+            f"{source}: {len(failed)} of {len(told['channels'])} tables cannot be read: "
+            f"{', '.join(failed)}"
+        )
+
+
+def _print(lines: Lines) -> None:
+    width = max(len(name) for name, _ in lines)
+    for name, text in lines:
+        out.print(f"{name:<{width}}  {text}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _tables(told: Mapping[str, Any]) -> Table:
@@ -91,26 +121,6 @@ def _tables(told: Mapping[str, Any]) -> Table:
         if isinstance(one, str):
             table.add_row(escape(name), "", "", "", escape(one))
             continue
-        numbers = (_text(one.get(key)) for key in ("n_pulses", "length", "dt_ns"))
-        table.add_row(escape(name), *numbers, escape(_text(one.get("energy"))))
+        numbers = (str(one[key]) for key in ("n_pulses", "length"))
+        table.add_row(escape(name), *numbers, f"{one['dt_ns']:g}", escape(str(one["energy"])))
     return table
-
-
-def _lines(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested mappings as ``outer.inner`` lines, in order."""
-    lines: list[tuple[str, str]] = []
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value:
-            lines += _lines(value, f"{prefix}{name}.")
-        else:
-            lines.append((f"{prefix}{name}", _text(value)))
-    return lines
-
-
-def _text(value: Any) -> str:
-    if value is None or value == {}:
-        return "–"
-    if isinstance(value, (list, tuple)):
-        bounds = len(value) == 2 and all(isinstance(v, (int, float)) for v in value)
-        return (" … " if bounds else ", ").join(map(_text, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

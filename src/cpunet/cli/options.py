@@ -59,6 +59,12 @@ SimTable = Annotated[
 DataTable = Annotated[
     str | None, typer.Option(help="Table of the measured pulses, if the file has several.")
 ]
+OneTableOrAll = Annotated[
+    str | None,
+    typer.Option(
+        help="Table of the measured pulses, if the file has several; or all, one after another."
+    ),
+]
 SimEnergy = Annotated[
     str | None, typer.Option(help="Energy column of the simulation, or FILE:path/to/column.")
 ]

@@ -7,11 +7,12 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
 from cpunet.cli import options
+from cpunet.cli.channels import tell_channels
 from cpunet.cli.messages import fail, monitor, tell
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
@@ -56,7 +57,7 @@ def train(
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
+    data_table: options.OneTableOrAll = None,
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
@@ -75,12 +76,16 @@ def train(
 
     Example: cpunet train --recipe paper --sim sim.lh5 --data raw.lh5 --out run --resume
 
+    Example: cpunet train --sim sim.lh5 --data raw.lh5 --data-table all --out runs
+
     Example: torchrun --nproc-per-node 4 --no-python cpunet train --recipe paper … --out run
     """
     import torch
 
+    from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.training.train import train_run
+    from cpunet.jobs.training.train_channels import train_channels
     from cpunet.recipes import load_recipe
     from cpunet.training.loop import StoppedError
     from cpunet.training.team import ToldElsewhereError, launch
@@ -96,9 +101,13 @@ def train(
         if _follows(launched):  # the process that leads says the same
             raise typer.Exit(2) from None
         raise
+    every = data_table == ALL
+    if every and launched is not None:
+        raise CpunetError(f"--data-table {ALL}: trains channel by channel; leave out torchrun")
+    work = train_channels if every else train_run
     with _StopRequest(shown, launched) as stop:
         try:
-            info = train_run(
+            told = work(
                 InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
                 InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
                 out_folder,
@@ -116,17 +125,23 @@ def train(
         except StoppedError as stopped:
             fail(str(stopped))
             raise typer.Exit(stop.status) from None
-        except ToldElsewhereError as told:
-            stopped_too = isinstance(told.__cause__, StoppedError)
+        except ToldElsewhereError as elsewhere:
+            stopped_too = isinstance(elsewhere.__cause__, StoppedError)
             raise typer.Exit(stop.status if stopped_too else 2) from None
     if _follows(launched):
         return
-    tell(
-        f"{out_folder}: trained in {info['seconds']:.0f} s on {info['device']}", soft_wrap=True
-    )
+    if isinstance(told, Outcome):
+        tell_channels(told, out_folder, _in_words)
+    else:
+        tell(f"{out_folder}: {_in_words(told)}", soft_wrap=True)
     words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]
     report = out_folder.with_name(f"{out_folder.name}-report")
-    shown.note(f"next: {shlex.join(map(str, [*words, report]))}")
+    of_all = ["--data-table", ALL] if every else []
+    shown.note(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
+
+
+def _in_words(info: dict[str, Any]) -> str:
+    return f"trained in {info['seconds']:.0f} s on {info['device']}"
 
 
 def _follows(launched: Launch | None) -> bool:

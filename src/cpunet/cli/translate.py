@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
+from cpunet.cli.channels import tell_channels
 from cpunet.cli.environment import MAX_THREADS
 from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
@@ -54,7 +55,9 @@ Realisations = Annotated[
         help="Draw the noise so many times: rows repeated, and counted.",
     ),
 ]
-Table = Annotated[str | None, typer.Option(help="Table to read, if the file has several.")]
+Table = Annotated[
+    str | None, typer.Option(help="Table to read, if the file has several; or all.")
+]
 OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or geds/iren.")]
 AppendColumn = Annotated[
     str | None,
@@ -142,15 +145,41 @@ def translate(
     Example: cpunet translate run sim.lh5 --out translated.lh5
 
     Example: cpunet translate run sim_*.lh5 --out translated/ --jobs 4 --resume
+
+    Example: cpunet translate runs sim.lh5 --table all --out translated/
     """
+    from cpunet.jobs.common.channels import ALL
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.translation.translate import translate_file
+    from cpunet.jobs.translation.translate_channels import translate_channels
     from cpunet.jobs.translation.translate_files import expanded, translate_files
     from cpunet.jobs.translation.translate_options import TranslateOptions
 
     adc = _adc(output, adc_per_kev, baseline, length, n_pre)
     files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
     place = Path(out_name)
+    if table == ALL:
+        if len(files) > 1:
+            raise CpunetError(f"--table {ALL} belongs to one file, not to {len(files)}")
+        outcome = translate_channels(
+            run,
+            files[0],
+            place,
+            inverse=inverse,
+            noise=noise,
+            seed=seed,
+            table=out_table,
+            append_column=append_column,
+            realisations=realisations,
+            adc=adc,
+            remains=remains,
+            device=device,
+            resume=resume,
+            force=force,
+            monitor=monitor(),
+        )
+        tell_channels(outcome, place, lambda told: _in_words(told, adc))
+        return
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
         form = TranslateOptions(
             inverse, noise, seed, out_table, append_column, realisations, adc, remains

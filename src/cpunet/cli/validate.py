@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from cpunet.cli import options
+from cpunet.cli.channels import tell_channels
 from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
 from cpunet.cli.values import parse_numbers
@@ -43,7 +44,7 @@ def validate(
     seed: options.Seed = 0,
     sim_table: options.SimTable = None,
     sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
+    data_table: options.OneTableOrAll = None,
     data_energy: options.DataEnergy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
@@ -54,9 +55,13 @@ def validate(
     """Score a run per peak and write a report: figures, metrics.json, report.html.
 
     Example: cpunet validate run --sim sim.lh5 --data raw.lh5 --out report
+
+    Example: cpunet validate runs --sim sim.lh5 --data raw.lh5 --data-table all --out reports
     """
+    from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.validation.validate import validate_run
+    from cpunet.jobs.validation.validate_channels import INDEX, validate_channels
 
     span = None
     if ae_range is not None:
@@ -64,7 +69,8 @@ def validate(
         if not 0 < low < high:
             raise CpunetError(f"--ae-range {ae_range}: give two energies, from < to")
         span = (low, high)
-    metrics = validate_run(
+    work = validate_channels if data_table == ALL else validate_run
+    metrics = work(
         run,
         InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
         InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
@@ -78,5 +84,16 @@ def validate(
         force=force,
         monitor=monitor(),
     )
+    if isinstance(metrics, Outcome):
+        tell(f"{out_folder / INDEX}", soft_wrap=True)
+        tell_channels(metrics, out_folder, _in_words)
+        return
     print_scores(metrics)
     tell(f"{out_folder / 'report.html'}", soft_wrap=True)
+
+
+def _in_words(metrics: dict[str, Any]) -> str:
+    from cpunet.analysis.verdicts import judged_scores
+
+    off, judged = judged_scores(metrics, "ren")
+    return f"{off} of {judged} scores off" if judged else "not judged"

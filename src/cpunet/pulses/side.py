@@ -12,8 +12,13 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.yaml_files import plain_json
 
-SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"  # attributes of a table
+# attributes of a table, and of a file
+SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
+    "side", "made_by", "translated_by", "run", "simulation",
+)  # fmt: skip
+TRANSLATION = "cpunet_translation"
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 
 _LOOKED_AT = 256  # pulses
@@ -75,15 +80,10 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
 
 def recorded_side(source: PulseSource) -> Recognised | None:
     """Side recorded in a file that this program wrote; None for other files."""
-    told = source.describe()
-    if told["format"] not in ("LH5", "HDF5"):
-        return None
-    with opened(source.path) as file:
-        places = _places(file, told["table"])
-        side, made_by, translated_by = (
-            next((text for place in places if (text := text_attribute(place, name))), "")
-            for name in (SIDE, MADE_BY, TRANSLATED_BY)
-        )
+    told = recorded_attributes(source)
+    side, made_by, translated_by = (
+        told.get(name, "") for name in (SIDE, MADE_BY, TRANSLATED_BY)
+    )
     if translated_by in (REN, IREN):
         kind: Kind = "measured" if translated_by == REN else "simulated"
         name = translated_by.rpartition(" ")[2].upper()
@@ -95,6 +95,31 @@ def recorded_side(source: PulseSource) -> Recognised | None:
             "measured", f"are traces behind electronics ({made_by})", certain=True
         )
     return None
+
+
+def recorded_attributes(source: PulseSource) -> dict[str, str]:
+    """Attributes in which this program records how it made the pulses; none in other files."""
+    told = source.describe()
+    if told["format"] not in ("LH5", "HDF5"):
+        return {}
+    with opened(source.path) as file:
+        places = _places(file, told["table"])
+        found = {
+            name: next((text for place in places if (text := text_attribute(place, name))), "")
+            for name in (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
+        }
+        found[TRANSLATION] = text_attribute(file, TRANSLATION)
+    return {name: text for name, text in found.items() if text}
+
+
+def recorded_detector(source: PulseSource) -> str | None:
+    """Name of the simulated detector; None if the file does not contain it."""
+    try:
+        detector = plain_json(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
+        name = detector["name"]
+    except (ValueError, LookupError, TypeError):
+        return None
+    return name if isinstance(name, str) else None
 
 
 def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:

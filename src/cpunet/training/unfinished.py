@@ -57,6 +57,11 @@ UNFINISHED = FolderKind(
 )
 
 
+def unfinished_name(out: Path) -> Path:
+    """Folder of the unfinished training of which `out` will be the run."""
+    return out.parent / f"{out.name}.unfinished"
+
+
 @contextmanager
 def unfinished_folder(
     out: Path,
@@ -93,7 +98,7 @@ def unfinished_folder(
     out = Path(out)
     refuse_existing(out, *inputs, force=force)
     require_replaceable(out, RUN)
-    folder = out.parent / f"{out.name}.unfinished"
+    folder = unfinished_name(out)
     refuse_inputs(folder, *inputs)
     require_replaceable(folder, UNFINISHED)
     try:

@@ -20,7 +20,7 @@ from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
-from cpunet.pulses.side import require_side
+from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
 
@@ -68,11 +68,13 @@ class InputFile:
             Side of the file, ``"sim"`` or ``"data"``.
         """
         told = run_info.get(side)
-        if self.options or not isinstance(told, dict):
+        if not isinstance(told, dict):
             return self
         before, read_as = told.get("file"), told.get("read_as")
         same = isinstance(before, str) and Path(before).resolve() == self.path.resolve()
         if not same or not isinstance(read_as, dict):
+            return self
+        if any(read_as.get(name) != value for name, value in self.options.items()):
             return self
         return replace(self, **{name: read_as[name] for name in _READ_AS if name in read_as})
 
@@ -92,7 +94,8 @@ class InputSet:
     """The prepared pulses of a file, with the quality cuts if they are measured.
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
-    ``read_as`` the reading options, see `InputFile.options`.
+    ``read_as`` the reading options, see `InputFile.options`; ``detector`` the name of the
+    simulated one, if the file contains it.
     """
 
     prepared: Prepared
@@ -101,6 +104,7 @@ class InputSet:
     energies_kev: Energies
     cuts: CutWindows | None = None
     read_as: dict[str, Any] = field(default_factory=dict)
+    detector: str | None = None
 
     def provenance(self) -> dict[str, Any]:
         """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
@@ -237,7 +241,10 @@ def _load(
         f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
         + (f" (left out: {rejected})" if rejected else "")
     )
-    return InputSet(prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options)
+    return InputSet(
+        prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options,
+        recorded_detector(source),
+    )  # fmt: skip
 
 
 def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:

@@ -10,14 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.inspection.hit_frame import describe_frame
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import hit_detectors, read_hits
 from cpunet.simulation.hits import Hits
 
 
 def describe_hits(
-    path: Path, detector: str | None, peaks: Mapping[str, PeakConfig]
+    path: Path,
+    detector: str | None,
+    peaks: Mapping[str, PeakConfig],
+    crystal: Detector | None = None,
 ) -> dict[str, Any]:
     """Describe the hits of a file, detector by detector.
 
@@ -29,6 +34,8 @@ def describe_hits(
         Detector to describe; None for all.
     peaks
         Gamma lines whose events are counted, by the energy deposited.
+    crystal
+        Crystal in which the hits should lie.
 
     Returns
     -------
@@ -36,24 +43,31 @@ def describe_hits(
         ``kind`` (``"hits"``), ``path``, and ``detectors``: by name (``""`` where a file names
         none) ``events``, ``hits``, ``energy_kev`` (lowest and highest of an event), ``x_mm``,
         ``y_mm``, ``z_mm``, ``r_mm`` (lowest and highest, in the frame of the file less a known
-        origin) and ``peaks``; or why they cannot be read.
+        origin), ``peaks`` and, with `crystal`, ``crystal`` (result of `describe_frame`); or
+        why they cannot be read.
     """
     names: list[str | None] = [*hit_detectors(path)] if detector is None else [detector]
     return {
         "kind": "hits",
         "path": str(path),
-        "detectors": {name or "": _of_detector(path, name, peaks) for name in names or [None]},
+        "detectors": {
+            name or "": _of_detector(path, name, peaks, crystal) for name in names or [None]
+        },
     }
 
 
 def _of_detector(
-    path: Path, name: str | None, peaks: Mapping[str, PeakConfig]
+    path: Path,
+    name: str | None,
+    peaks: Mapping[str, PeakConfig],
+    crystal: Detector | None,
 ) -> dict[str, Any] | str:
     try:
         hits = read_hits(path, detector=name).hits
     except CpunetError as error:
         return str(error).removeprefix(f"{path}: ")
-    return _summary(hits, peaks)
+    told = _summary(hits, peaks)
+    return told if crystal is None else told | {"crystal": describe_frame(hits, crystal)}
 
 
 def _summary(hits: Hits, peaks: Mapping[str, PeakConfig]) -> dict[str, Any]:

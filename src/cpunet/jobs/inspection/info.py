@@ -10,10 +10,16 @@ from typing import Any
 import numpy as np
 
 import cpunet
+from cpunet.analysis.spectrum_figure import Spectrum
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.channels import ALL, channels_of
+from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.inspection.hits_info import describe_hits
-from cpunet.outputs import refuse_inputs
+from cpunet.jobs.inspection.info_page import Spectra, write_info_page
+from cpunet.jobs.inspection.provenance import provenance
+from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
+from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
@@ -23,8 +29,9 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
 from cpunet.pulses.spectrum import Values, suggested_calibration
 from cpunet.pulses.writing import PulseWriter
-from cpunet.recipes.schema import PeakConfig, PreparationConfig
+from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.regular_files import read_text
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
@@ -39,30 +46,33 @@ def describe(
     energy: str | None = None,
     kev_per_adc: float | None = None,
     dt_ns: float | None = None,
-    peaks: Mapping[str, PeakConfig] | None = None,
-    preparation: PreparationConfig | None = None,
+    recipe: Recipe | None = None,
+    detector: Detector | None = None,
     without_remains: Path | None = None,
+    out: Path | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
     """Describe the content of a file of pulses or of the folder of a training run.
 
-    A file is read once, in blocks, so memory does not grow with its size.
+    A file is read once, in blocks, so memory does not grow with its size but for its energies.
 
     Parameters
     ----------
     path
         File of pulses, or folder with ``run.json``.
     table, energy, kev_per_adc, dt_ns
-        See `cpunet.pulses.reading.open_pulses`.
-    peaks
-        Gamma lines whose pulses are counted.
-    preparation
-        Preparation of measured traces, with which remains of earlier pulses are estimated.
+        See `cpunet.pulses.reading.open_pulses`. With ``"all"`` as table each is described.
+    recipe
+        Its gamma lines are counted, and with its preparation measured traces are described.
+    detector
+        Crystal in which hits should lie.
     without_remains
         LH5 file to write: the traces after subtraction of their remains, with columns
         ``remains_kev`` and ``remains_error_kev``.
+    out
+        HTML page to write.
     force
-        Whether to replace that file.
+        Whether to replace these files.
 
     Returns
     -------
@@ -72,19 +82,22 @@ def describe(
         For a file with several tables of which none was chosen, ``kind`` (``"tables"``),
         ``path`` and ``tables``: the result of `PulseSource.describe` by name, or the reason
         why a table cannot be read.
+        For all tables of a file, ``kind`` (``"channels"``), ``path`` and ``channels``: the
+        description of each table, or the reason why it cannot be read.
         For a file, ``kind`` (``"pulses"``), ``path``, the result of `PulseSource.describe`,
         and: ``n_pulses``; ``energy_kev`` (lowest and highest, None if unknown) and
         ``n_without_energy``; ``peaks`` (number of pulses by line); ``amplitudes``, a
         suggested calibration if no energy is known; ``samples`` (lowest and highest of the
-        finite traces); the numbers ``n_not_finite`` and ``n_constant`` of traces; for
-        measured traces with `preparation`, ``remains``: the result of `Remains.describe`, or
-        the reason why there is none.
+        finite traces); the numbers ``n_not_finite`` and ``n_constant`` of traces;
+        ``provenance``, if the file records it; for measured traces with a `recipe`,
+        ``traces``, the result of `trace_properties`, and ``remains``, that of
+        `Remains.describe`, or the reason why there is none.
 
     Raises
     ------
     CpunetError
-        If the file does not exist or cannot be read, or remains are to be subtracted but
-        cannot be estimated.
+        If the file does not exist or cannot be read, a file to be written exists, or remains
+        are to be subtracted but cannot be estimated.
 
     Examples
     --------
@@ -96,32 +109,79 @@ def describe(
     (3, 8, 3)
     """
     path = Path(path)
+    for target in (without_remains, out):
+        if target is not None:
+            refuse_inputs(target, path, energy)
+    if out is not None:
+        refuse_existing(out, force=force)
     if path.is_dir():
-        return {"kind": "run", "path": str(path), **_run(path)}
-    if holds_hits(path) and without_remains is None:
-        return describe_hits(path, table, peaks or {})
-    tables = tables_of(path) if table is None else []
+        told: dict[str, Any] = {"kind": "run", "path": str(path), **_run(path)}
+        spectra: Spectra = {}
+    elif holds_hits(path) and without_remains is None:
+        told = describe_hits(path, table, recipe.peaks if recipe else {}, detector)
+        spectra = {}
+    else:
+        file = InputFile(path, table, energy, kev_per_adc, dt_ns)
+        told, spectra = _of_file(file, recipe, without_remains, force=force)
+    if out is not None:
+        write_info_page(out, told, spectra)
+    return told
+
+
+def _of_file(
+    file: InputFile, recipe: Recipe | None, without_remains: Path | None, *, force: bool
+) -> tuple[dict[str, Any], Spectra]:
+    """Describe a file of pulses; give the spectrum of each of its tables that was read."""
+    if file.table == ALL and without_remains is None:
+        channels: dict[str, Any] = {}
+        spectra: Spectra = {}
+        for name, one in channels_of(file).items():
+            try:
+                channels[name], spectra[name] = _of_pulses(one, recipe)
+            except CpunetError as error:
+                channels[name] = str(error).removeprefix(f"{file.path}: ")
+        return {"kind": "channels", "path": str(file.path), "channels": channels}, spectra
+    tables = tables_of(file.path) if file.table is None else []
     if len(tables) > 1 and without_remains is None:
-        return {"kind": "tables", "path": str(path), "tables": _told_of(path, tables, dt_ns)}
-    source = open_pulses(path, table=table, energy=energy, kev_per_adc=kev_per_adc, dt_ns=dt_ns)
-    counts = _Counts(dict.fromkeys(peaks or {}, 0))
+        told = {"tables": _told_of(file.path, tables, file.dt_ns)}
+        return {"kind": "tables", "path": str(file.path), **told}, {}
+    described, spectrum = _of_pulses(file, recipe, without_remains, force=force)
+    return described, {"": spectrum}
+
+
+def _of_pulses(
+    file: InputFile,
+    recipe: Recipe | None,
+    without_remains: Path | None = None,
+    *,
+    force: bool = False,
+) -> tuple[dict[str, Any], Spectrum]:
+    """Describe the pulses of one table; give their spectrum."""
+    path, source = file.path, file.open()
+    peaks = recipe.peaks if recipe else {}
+    counts = _Counts(dict.fromkeys(peaks, 0))
     for block in source.blocks():
-        counts.add(block, peaks or {})
+        counts.add(block, peaks)
     told = {"kind": "pulses", "path": str(path), **source.describe(), **counts.summary()}
-    if preparation is None or _side(source) != "measured":
+    made = provenance(source)
+    told |= {"provenance": made} if made else {}
+    if recipe is None or _side(source) != "measured":
         if without_remains is not None:
             raise CpunetError(f"{path}: remains are taken off measured traces; these are none")
-        return told
+        return told, counts.spectrum()
     try:
-        remains = Remains.of_traces(source.blocks(REMAINS_BLOCK), preparation)
+        told["traces"] = trace_properties(source.blocks(BLOCK), recipe)
+    except CpunetError as error:
+        told["traces"] = f"cannot be described: {error}"
+    try:
+        remains = Remains.of_traces(source.blocks(REMAINS_BLOCK), recipe.preparation)
     except CpunetError as error:
         if without_remains is not None:
             raise CpunetError(f"{path}: {error}") from error
-        return told | {"remains": f"cannot be told: {error}"}
+        return told | {"remains": f"cannot be told: {error}"}, counts.spectrum()
     if without_remains is not None:
-        refuse_inputs(without_remains, path, energy)
         _write_without(source, remains, without_remains, force=force)
-    return told | {"remains": remains.describe()}
+    return told | {"remains": remains.describe()}, counts.spectrum()
 
 
 def _told_of(path: Path, tables: list[str], dt_ns: float | None) -> dict[str, Any]:
@@ -170,6 +230,7 @@ class _Counts:
     n_not_finite: int = 0
     n_constant: int = 0
     amplitudes: list[Values] = field(default_factory=list)
+    energies: list[Values] = field(default_factory=list)
     energy_kev: list[float] = field(default_factory=list)
     samples: list[float] = field(default_factory=list)
 
@@ -177,7 +238,9 @@ class _Counts:
         self.n_pulses += len(block)
         known = block.energy_kev[np.isfinite(block.energy_kev)]
         self.n_without_energy += len(block) - len(known)
-        if not len(known):
+        if len(known):
+            self.energies.append(known)
+        else:
             self.amplitudes.append(amplitude(block.waveforms))
         self.energy_kev = _range([*self.energy_kev, *_extremes(known)])
         names, counts = np.unique(label_peaks(known, peaks), return_counts=True)
@@ -193,11 +256,17 @@ class _Counts:
         self.n_constant += int((low == high).sum())
         self.samples = _range([*self.samples, *_extremes(low), *_extremes(high)])
 
+    def spectrum(self) -> Spectrum:
+        """Energies of the pulses, or their amplitudes if no energy is known, with lines."""
+        known = bool(self.energies)
+        values = np.concatenate(self.energies or self.amplitudes or [np.empty(0)])
+        return Spectrum(values, in_kev=known, found=suggested_calibration(values))
+
     def _likely_calibration(self) -> dict[str, str]:
         """Calibration suggested by lines in the amplitudes, if no energy is known."""
-        if self.n_without_energy < self.n_pulses or not self.amplitudes:
+        if self.energies or not self.amplitudes:
             return {}
-        found = suggested_calibration(np.concatenate(self.amplitudes))
+        found = self.spectrum().found
         return {"amplitudes": "no lines that stand out" if found is None else f"like {found}"}
 
     def summary(self) -> dict[str, Any]:

@@ -11,10 +11,9 @@ from typing import Any, Protocol
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.inputs import InputFile
+from cpunet.pulses.side import TRANSLATION
 from cpunet.training.run_folder import RECIPE, WEIGHTS
 from cpunet.yaml_files import plain_json
-
-RECORD = "cpunet_translation"  # attribute of the file
 
 Record = dict[str, Any]
 
@@ -122,13 +121,13 @@ def _is_count(value: Any) -> bool:
 
 def stamp(file: Stamped, record: Record) -> None:
     """Write into a file how it was made."""
-    file.stamp(RECORD, json.dumps(record))
+    file.stamp(TRANSLATION, json.dumps(record))
 
 
 def _read(out: Path) -> Record:
     try:
         with opened(out) as file:
-            record = plain_json(file.attrs[RECORD])
+            record = plain_json(file.attrs[TRANSLATION])
     except (CpunetError, LookupError, ValueError, TypeError):
         record = None
     if not isinstance(record, dict):

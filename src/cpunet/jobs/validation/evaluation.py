@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -207,7 +208,13 @@ def _compared(
 ) -> dict[str, Any]:
     """Description of the compared inputs, shown before the scores."""
     fit = info.get("fit") or {}
-    compared = {
+    known = {
+        "detector": sim.detector,
+        "channel": data.read_as.get("table"),
+        "period": period_of(data.path),
+    }
+    compared = {name: str(value) for name, value in known.items() if value is not None}
+    compared |= {
         "simulation": _short(sim.path),
         "data": _short(data.path),
         "run": run.absolute().name,
@@ -218,6 +225,18 @@ def _compared(
     if fit.get("verdict"):
         compared["fit"] = str(fit["verdict"])
     return compared | {"scored with": f"cpunet {cpunet.__version__}"}
+
+
+def period_of(path: Path) -> str | None:
+    """Period and run in a file name of LEGEND; None for other names.
+
+    Examples
+    --------
+    >>> period_of(Path("l200-p03-r001-cal-20230318T012144Z-tier_raw.lh5"))
+    'p03 r001'
+    """
+    found = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
+    return None if found is None else f"{found[1]} {found[2]}"
 
 
 def _short(path: Path) -> str:

@@ -6,7 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from cpunet.analysis.report import DPI, REPORT
+from cpunet.analysis.html_pages import DPI
+from cpunet.analysis.report import REPORT
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from cpunet.analysis.report import METRICS
 from cpunet.analysis.summary_page import Entry, summary_page
+from cpunet.analysis.verdicts import part
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.validation.compare import read_metrics
@@ -19,17 +21,25 @@ PAGE = "report.html"
 
 
 def summarise_reports(
-    reports: Sequence[Path], out: Path, *, missing_ok: bool = False, force: bool = False
+    reports: Sequence[Path],
+    out: Path,
+    *,
+    names: Sequence[tuple[str, str]] | None = None,
+    missing_ok: bool = False,
+    force: bool = False,
 ) -> list[Entry]:
     """Write a summary page of the reports of many detectors and periods.
 
     Parameters
     ----------
     reports
-        Folders of `cpunet validate`, as ``DETECTOR/PERIOD/report`` or
-        ``DETECTOR/PERIOD``; the folder names identify detector and period.
+        Folders of `cpunet validate`, as ``DETECTOR/PERIOD/report`` or ``DETECTOR/PERIOD``.
+        Where not all of them record detector (or channel) and period, each pair once, the
+        folder names identify these.
     out
         Page to write, with links to the reports.
+    names
+        Detector and period of each report, if known otherwise.
     missing_ok
         Whether to list missing or unfinished reports instead of raising.
     force
@@ -49,17 +59,20 @@ def summarise_reports(
     if out.is_dir():
         raise CpunetError(f"{out}: is a folder; give the name of a page, as index.html")
     refuse_existing(out, *reports, force=force)
-    entries = []
+    found = [_metrics(report, missing_ok=missing_ok) for report in reports]
+    whose = names or _recorded(found) or [detector_and_period(report) for report in reports]
     known: dict[tuple[str, str], Path] = {}
-    for report in reports:
-        whose = detector_and_period(report)
-        if whose in known:
+    entries = []
+    for report, one, metrics in zip(reports, whose, found, strict=True):
+        if one in known:
             raise CpunetError(
-                f"{report}: of detector {whose[0]} and period {whose[1]}, as is "
-                f"{known[whose]}; put reports at DETECTOR/PERIOD/report"
+                f"{report}: of detector {one[0]} and period {one[1]}, as is "
+                f"{known[one]}; put reports at DETECTOR/PERIOD/report"
             )
-        known[whose] = report
-        entries.append(_entry(report, whose, out.parent, missing_ok=missing_ok))
+        known[one] = report
+        target = report / PAGE
+        link = quote(os.path.relpath(target, out.parent)) if target.is_file() else None
+        entries.append(Entry(*one, metrics, link))
     if all(entry.metrics is None for entry in entries):
         raise CpunetError(f"{out}: none of the {len(entries)} reports is there yet")
     page = summary_page(entries)
@@ -86,15 +99,23 @@ def detector_and_period(report: Path) -> tuple[str, str]:
     return detector, period
 
 
-def _entry(report: Path, whose: tuple[str, str], beside: Path, *, missing_ok: bool) -> Entry:
+def _recorded(found: Sequence[Mapping[str, Any] | None]) -> list[tuple[str, str]] | None:
+    """Detectors and periods as recorded; None if one is not, or if two are the same."""
+    names = []
+    for metrics in found:
+        told = part(metrics or {}, "compared")
+        names.append((told.get("channel") or told.get("detector"), told.get("period")))
+    known = [(str(detector), str(period)) for detector, period in names if detector and period]
+    return known if len(set(known)) == len(names) else None
+
+
+def _metrics(report: Path, *, missing_ok: bool) -> dict[str, Any] | None:
+    """Content of ``metrics.json``; None if it may be missing and is."""
     file = report / METRICS
-    if not file.is_file():
-        if missing_ok:
-            return Entry(*whose)
-        raise CpunetError(
-            f"{report}: no {METRICS} in it; give a folder of cpunet validate, or --missing-ok"
-        )
-    metrics = read_metrics(file)
-    page = report / PAGE
-    link = quote(os.path.relpath(page, beside)) if page.is_file() else None
-    return Entry(*whose, metrics, link)
+    if file.is_file():
+        return read_metrics(file)
+    if missing_ok:
+        return None
+    raise CpunetError(
+        f"{report}: no {METRICS} in it; give a folder of cpunet validate, or --missing-ok"
+    )

@@ -1,0 +1,171 @@
+"""The channels of a file one after another, each with an output of its own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.outputs import MARKER
+from cpunet.pulses.reading.opening import tables_of
+
+ALL = "all"  # in place of the name of a table
+CHANNEL = "{channel}"  # in the name of an energy column
+
+R = TypeVar("R")
+Pair = tuple[InputFile, InputFile]
+
+
+def channel_names(tables: list[str]) -> dict[str, str]:
+    """Short name of each table: its path without what all have in common at their ends.
+
+    Examples
+    --------
+    >>> channel_names(["ch1/raw", "ch2/raw"])
+    {'ch1': 'ch1/raw', 'ch2': 'ch2/raw'}
+    >>> channel_names(["hpge/det1/raw", "hpge/det2/raw"])
+    {'det1': 'hpge/det1/raw', 'det2': 'hpge/det2/raw'}
+    >>> channel_names(["geds/raw"])
+    {'geds': 'geds/raw'}
+    """
+    parts = [table.strip("/").split("/") for table in tables]
+    for end in (-1, 0):
+        while all(len(part) > 1 for part in parts) and len({part[end] for part in parts}) == 1:
+            for part in parts:
+                part.pop(end)
+    short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) for part in parts]
+    names = short if len(set(short)) == len(short) else [t.replace("/", "_") for t in tables]
+    return dict(zip(names, tables, strict=True))
+
+
+def channels_of(file: InputFile) -> dict[str, InputFile]:
+    """Each channel of a file whose table is ``"all"``, by its short name.
+
+    In the name of the energy column ``{channel}`` stands for the name of the channel.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, or its format has no tables.
+    """
+    tables = tables_of(file.path)
+    if not tables:
+        raise CpunetError(
+            f"{file.path}: holds no tables of waveforms of which to take all; leave out "
+            f"--table {ALL}"
+        )
+    energy = file.energy or ""
+    if ":" in energy and CHANNEL not in energy and len(tables) > 1:
+        raise CpunetError(
+            f"{energy}: one column for {len(tables)} channels; put {CHANNEL} into its path, as "
+            f"in hit.lh5:{CHANNEL}/hit/energy"
+        )
+    return {
+        name: replace(file, table=table, energy=energy.replace(CHANNEL, name) or None)
+        for name, table in channel_names(tables).items()
+    }
+
+
+def paired(sim: InputFile, data: InputFile) -> dict[str, Pair | CpunetError]:
+    """The simulation and the data of each channel of the data.
+
+    One table of simulated pulses serves all channels; where ``"all"`` is given for it too,
+    channels of the same name belong together, and one without its simulation has the reason.
+    """
+    measured = channels_of(data)
+    if sim.table != ALL:
+        return {name: (sim, file) for name, file in measured.items()}
+    simulated = channels_of(sim)
+    there = ", ".join(simulated)
+    return {
+        name: (simulated[name], file)
+        if name in simulated
+        else CpunetError(f"{sim.path}: no table of {name}; there are those of {there}")
+        for name, file in measured.items()
+    }
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[R]):
+    """What became of each channel: a result, or the reason why there is none."""
+
+    done: dict[str, R] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def require_all(self, out: Path) -> None:
+        """Raise a `CpunetError` that counts the channels that failed, if any did."""
+        if not self.failed:
+            return
+        n = len(self.done) + len(self.failed)
+        name, reason = next(iter(self.failed.items()))
+        others = f"; the others are in {out}" if self.done else ""
+        raise CpunetError(
+            f"{len(self.failed)} of {n} channels failed, the first: {name}: {reason}{others}"
+        )
+
+
+def one_by_one(
+    channels: Mapping[str, Pair | CpunetError],
+    out: Path,
+    do: Callable[[str, Pair, Path], R],
+    note: Callable[[str], None],
+    ends: type[CpunetError] | tuple[type[CpunetError], ...] = (),
+) -> Outcome[R]:
+    """Do something for each channel; one that fails does not keep the others from being done.
+
+    Parameters
+    ----------
+    channels
+        Result of `paired`.
+    out
+        Folder of the outputs, made if it is not there; each is in a folder (or file) with the
+        name of its channel.
+    do
+        Takes the name of a channel, its two files and the path of its output.
+    note
+        Told which channel is begun, and why one failed.
+    ends
+        Errors that end everything, such as a request to stop.
+
+    Raises
+    ------
+    CpunetError
+        If `out` is the output of one channel, or an error of `ends` occurs.
+    """
+    if out.is_file() or (out / MARKER).exists():
+        raise CpunetError(
+            f"{out}: is the output of one channel; choose another --out for the folders of "
+            f"{len(channels)}"
+        )
+    outcome: Outcome[R] = Outcome()
+    for name, pair in channels.items():
+        try:
+            if isinstance(pair, CpunetError):
+                raise pair
+            note(f"{name}:")
+            outcome.done[name] = do(name, pair, out / name)
+        except CpunetError as error:
+            if isinstance(error, ends):
+                raise
+            outcome.failed[name] = str(error)
+            note(f"{name}: failed: {error}")
+    return outcome
+
+
+def own_folder(folder: Path, name: str, file: str) -> Path:
+    """The folder of a channel inside `folder`, if that is the folder of several.
+
+    Parameters
+    ----------
+    folder
+        Folder of a run, or of runs by channel.
+    name
+        Short name of the channel.
+    file
+        File by which the folder of a run is known, such as ``run.json``.
+    """
+    return folder if (folder / file).is_file() else folder / name

@@ -1,0 +1,91 @@
+"""Whether hits lie in a crystal, and the frame in which they would."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_readers import Transform
+from cpunet.simulation.hits import Hits
+
+MOST = 200_000  # hits that are looked at
+FITS = 0.999  # share inside above which the frame is right but for rounding at the surface
+BETTER = 0.02  # share by which another frame must be better than that of the file
+AS_GIVEN = Transform()
+
+
+def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
+    """Tell how many hits lie in a crystal, and which frame would have more of them inside.
+
+    Parameters
+    ----------
+    hits
+        Hits in the frame of their file.
+    detector
+        Crystal with its point contact at z = 0.
+
+    Returns
+    -------
+    dict
+        ``name``, ``radius_mm`` and ``length_mm`` of the crystal; ``inside_percent`` and
+        ``outside_percent`` of the hits; and, if another frame fits better, ``fits``:
+        ``origin_mm``, ``flip_z``, ``inside_percent`` and ``options`` of ``cpunet simulate``.
+
+    Examples
+    --------
+    >>> from cpunet.simulation.geometry_readers import read_detector
+    >>> places = np.random.default_rng(1).uniform(-30, 30, (2000, 3)) + [100, 0, 41]
+    >>> told = describe_frame(Hits.of(places, np.ones(2000), [0, 2000]), read_detector("icpc"))
+    >>> told["inside_percent"], told["fits"]["origin_mm"][0]
+    (0.0, 100.0)
+    """
+    position = hits.position_mm
+    if len(position) > MOST:
+        position = position[np.random.default_rng(0).choice(len(position), MOST, replace=False)]
+
+    def inside(frame: Transform) -> float:
+        x, y, z = frame.apply(position).T
+        return float(detector.inside(np.hypot(x, y), z).mean())
+
+    as_given = inside(AS_GIVEN)
+    told: dict[str, Any] = {
+        "name": detector.name,
+        "radius_mm": detector.crystal_radius,
+        "length_mm": detector.crystal_length,
+        "inside_percent": 100 * as_given,
+        "outside_percent": 100 * (1 - as_given),
+    }
+    if as_given > FITS:
+        return told
+    # of equally good frames, the first: that of the file, not flipped
+    share, frame = max(
+        ((inside(frame), frame) for frame in _frames(position, detector)),
+        key=lambda one: one[0],
+    )
+    if share < as_given + BETTER:
+        return told
+    origin = [float(value) for value in frame.origin_mm]
+    words = [f"--origin {','.join(f'{value:g}' for value in origin)}"] if any(origin) else []
+    return told | {
+        "fits": {
+            "origin_mm": origin,
+            "flip_z": frame.flip_z,
+            "inside_percent": 100 * share,
+            "options": " ".join([*words, *(["--flip-z"] if frame.flip_z else [])]),
+        }
+    }
+
+
+def _frames(position: np.ndarray[Any, Any], detector: Detector) -> Iterator[Transform]:
+    """Frames with the hits about the axis and one of their ends at one of the crystal's."""
+    low, high = position.min(axis=0), position.max(axis=0)
+    centres = [(0.0, 0.0), tuple((low[:2] + high[:2]) / 2)]
+    for flip in (False, True):
+        length = -detector.crystal_length if flip else detector.crystal_length
+        near, far = (high[2], low[2]) if flip else (low[2], high[2])
+        for z in (0.0, length, near, far - length, (near + far - length) / 2):
+            for x, y in centres:
+                yield Transform((round(x, 1) + 0.0, round(y, 1) + 0.0, round(z, 1) + 0.0), flip)

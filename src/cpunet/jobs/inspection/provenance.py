@@ -1,0 +1,92 @@
+"""How the pulses of a file were made, as far as this program recorded it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.side import (
+    MADE_BY,
+    RUN,
+    SIDE,
+    SIMULATION,
+    TRANSLATED_BY,
+    TRANSLATION,
+    recorded_attributes,
+)
+from cpunet.yaml_files import plain_json
+
+# options of a translation as they are unless given
+_PLAIN = {"noise": True, "remains": "none"}
+
+
+def provenance(source: PulseSource) -> dict[str, str]:
+    """Describe how the pulses of a file were made.
+
+    Returns
+    -------
+    dict
+        Text by name, as ``made by``, ``detector``, ``hits`` and ``translated``; empty for
+        files of other programs.
+    """
+    told = recorded_attributes(source)
+    words = {"made by": told.get(MADE_BY, ""), "side": told.get(SIDE, "")}
+    words |= _of_simulation(_parsed(told.get(SIMULATION)))
+    if TRANSLATED_BY in told:
+        part = told[TRANSLATED_BY].rpartition(" ")[2].upper()
+        words["translated"] = f"by the {part} of {told.get(RUN, 'an unknown run')}"
+        words |= _of_translation(_parsed(told.get(TRANSLATION)))
+    return {name: text for name, text in words.items() if text}
+
+
+def _parsed(text: str | None) -> Mapping[str, Any]:
+    with suppress(ValueError, TypeError):
+        found = plain_json(text or "")
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
+def _of_simulation(made: Mapping[str, Any]) -> dict[str, str]:
+    detector, hits, settings = (
+        found if isinstance(found := made.get(name), Mapping) else {}
+        for name in ("detector", "hits", "settings")
+    )
+    if not detector:
+        return {}
+    physics = [str(detector.get("name"))]
+    physics += [
+        f"{detector[name]:g} {unit}"
+        for name, unit in (("bias_V", "V"), ("temperature_K", "K"))
+        if isinstance(detector.get(name), int | float)
+    ]
+    if isinstance(settings.get("cloud_fwhm_mm"), int | float):
+        physics.append(f"charge clouds of {settings['cloud_fwhm_mm']:g} mm")
+    return {
+        "detector": ", ".join(physics),
+        "hits": _of_hits(hits),
+        "events": f"{made.get('events')}, of which {made.get('events_without_signal')} without "
+        f"a signal; seed {made.get('seed')}",
+    }
+
+
+def _of_hits(hits: Mapping[str, Any]) -> str:
+    if "file" not in hits:
+        return str(hits.get("monte_carlo", ""))
+    frame = f"origin {hits.get('origin_mm')} mm" + (", z flipped" if hits.get("flip_z") else "")
+    return f"{Path(str(hits['file'])).name}, {frame}"
+
+
+def _of_translation(record: Mapping[str, Any]) -> dict[str, str]:
+    source, chosen = record.get("source"), record.get("options")
+    words = {}
+    if isinstance(source, Mapping) and isinstance(source.get("files"), list):
+        names = [str(one.get("name")) for one in source["files"] if isinstance(one, Mapping)]
+        words["from"] = ", ".join(names)
+    if isinstance(chosen, Mapping):
+        given = {k: v for k, v in chosen.items() if v not in (None, False, _PLAIN.get(k))}
+        words["options"] = ", ".join(f"{name} {value}" for name, value in given.items())
+    return words

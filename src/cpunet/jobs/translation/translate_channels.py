@@ -1,0 +1,50 @@
+"""Translate each table of a file with the run of its channel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, own_folder
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.translation.translate import translate_file
+from cpunet.training.run_folder import INFO
+
+QUIET = Monitor()
+
+
+def translate_channels(
+    runs: Path, source: InputFile, out: Path, *, monitor: Monitor = QUIET, **options: Any
+) -> Outcome[dict[str, Any]]:
+    """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
+
+    Parameters
+    ----------
+    runs
+        Folder of the runs by channel; or one run, with which all are translated.
+    source
+        File whose table is ``"all"``.
+    out
+        Folder of the LH5 files.
+    monitor, options
+        As for `cpunet.jobs.translation.translate.translate_file`.
+
+    Returns
+    -------
+    Outcome
+        The counts of each file, and the reasons why channels have none.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read.
+    """
+
+    def translate(name: str, pair: Pair, place: Path) -> dict[str, Any]:
+        run = own_folder(runs, name, INFO)
+        target = place.with_name(f"{name}.lh5")
+        return translate_file(run, pair[0], target, monitor=monitor, **options)
+
+    channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
+    return one_by_one(channels, out, translate, monitor.note)

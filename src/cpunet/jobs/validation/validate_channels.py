@@ -1,0 +1,67 @@
+"""Validate the run of each channel of a file of data, and put all on one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
+from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.evaluation import period_of
+from cpunet.jobs.validation.summary_page import summarise_reports
+from cpunet.jobs.validation.validate import validate_run
+from cpunet.training.run_folder import INFO
+
+QUIET = Monitor()
+INDEX = "index.html"
+
+
+def validate_channels(
+    runs: Path,
+    sim: InputFile,
+    data: InputFile,
+    out: Path,
+    *,
+    force: bool = False,
+    monitor: Monitor = QUIET,
+    **options: Any,
+) -> Outcome[dict[str, Any]]:
+    """Validate ``RUNS/CHANNEL`` for each channel of the data, in the folder ``OUT/CHANNEL``.
+
+    ``OUT/index.html`` shows all channels and links to their reports.
+
+    Parameters
+    ----------
+    runs
+        Folder of the runs by channel; or one run, which is validated on all of them.
+    sim, data
+        Files; the table of the data is ``"all"``, that of the simulation may be.
+    out
+        Folder of the report folders.
+    force, monitor, options
+        As for `cpunet.jobs.validation.validate.validate_run`.
+
+    Returns
+    -------
+    Outcome
+        The content of each ``metrics.json``, and the reasons why channels have none.
+
+    Raises
+    ------
+    CpunetError
+        If the files cannot be read, or `out` is a report itself.
+    """
+
+    def validate(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
+        run = own_folder(runs, name, INFO)
+        return validate_run(run, *pair, folder, force=force, monitor=monitor, **options)
+
+    channels = paired(sim, data)
+    outcome = one_by_one(channels, out, validate, monitor.note)
+    if outcome.done:
+        folders = [out / name for name in channels]
+        period = period_of(data.path) or data.path.stem
+        names = [(name, period) for name in channels]
+        summarise_reports(folders, out / INDEX, names=names, missing_ok=True, force=True)
+    return outcome

@@ -1,0 +1,64 @@
+"""Files of several channels: one run, one report and one file of translations for each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import lh5
+import pytest
+
+
+@pytest.fixture
+def raw(stand, tmp_path: Path) -> Path:
+    """Two channels with the stand's traces, and one without pulses that can be used."""
+    file = tmp_path / "raw.lh5"
+    with h5py.File(stand.data) as source, h5py.File(file, "w") as target:
+        for channel in ("ch1", "ch2", "ch3"):
+            source.copy("geds/raw", target.create_group(channel), "raw")
+            target[channel].attrs["datatype"] = "struct{raw}"
+        target["ch3/raw/energy"][...] = 100.0
+    return file
+
+
+def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, undrawn):
+    files = ["--sim", stand.sim, "--data", raw, "--data-table", "all"]
+    trained = command("train", *files, "--out", tmp_path / "runs", *tiny)
+    assert trained.code == 2
+    told = trained.out.splitlines()
+    assert told[0].startswith("ch1  trained in ")
+    assert told[1].startswith("ch2  trained in ")
+    assert told[2].startswith("ch3  failed: ")
+    assert "1 of 3 channels failed, the first: ch3: " in trained.err
+    info = json.loads((tmp_path / "runs" / "ch2" / "run.json").read_text())
+    assert info["data"]["read_as"] == {"table": "ch2/raw"}
+
+    words = [*files, "--no-rivals", "--out", tmp_path / "reports"]
+    validated = command("validate", tmp_path / "runs", *words)
+    assert validated.code == 2
+    assert (tmp_path / "reports" / "ch1" / "report.html").is_file()
+    index = (tmp_path / "reports" / "index.html").read_text("utf-8")
+    assert 'href="ch2/report.html"' in index
+    assert "ch3" in index
+
+    out = tmp_path / "translated"
+    words = ["--table", "all", "--inverse", "--out", out]
+    translated = command("translate", tmp_path / "runs", raw, *words)
+    assert translated.code == 2
+    assert translated.out.startswith("ch1  ")
+    assert len(lh5.read("geds/iren/energy", out / "ch2.lh5")) == len(stand.data_kev)
+
+    again = command("train", *files, "--out", tmp_path / "runs", *tiny, "--resume")
+    assert again.code == 2
+    assert "ch1: trained already" in again.err
+
+
+def test_info_of_all_tables(command, raw, tmp_path):
+    page = tmp_path / "raw.html"
+    told = command("info", raw, "--table", "all", "--out", page)
+    assert told.code == 0
+    assert told.out.count("trigger ") == 3
+    html = page.read_text("utf-8")
+    assert html.count("<h2>ch") == html.count("<img ") == 3
+    assert "http:" not in html

@@ -1,0 +1,85 @@
+"""Channels of a file one after another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.channels import channels_of, one_by_one, own_folder, paired
+from cpunet.jobs.common.inputs import InputFile
+
+
+def made(path: Path, *tables: str) -> Path:
+    with h5py.File(path, "w") as file:
+        for table in tables:
+            file.create_group(table)["waveform"] = np.zeros((3, 50), np.float32)
+    return path
+
+
+def test_channels_have_short_names_and_their_own_energies(tmp_path):
+    raw = made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw")
+    file = InputFile(raw, "all", "hit.lh5:{channel}/hit/energy")
+    found = channels_of(file)
+    assert [(n, f.table, f.energy) for n, f in found.items()] == [
+        ("ch1", "ch1/raw", "hit.lh5:ch1/hit/energy"),
+        ("ch2", "ch2/raw", "hit.lh5:ch2/hit/energy"),
+    ]
+    with pytest.raises(CpunetError, match="one column for 2 channels"):
+        channels_of(InputFile(raw, "all", "hit.lh5:energy"))
+    np.save(tmp_path / "raw.npy", np.zeros((3, 50)))
+    with pytest.raises(CpunetError, match="no tables of waveforms"):
+        channels_of(InputFile(tmp_path / "raw.npy", "all"))
+
+
+def test_a_simulation_serves_all_channels_or_its_own(tmp_path):
+    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
+    one = InputFile(made(tmp_path / "one.h5", "geds/sim"))
+    assert [pair[0] for pair in paired(one, data).values()] == [one, one]
+    both = InputFile(made(tmp_path / "both.h5", "ch1/sim", "ch3/sim"), "all")
+    found = paired(both, data)
+    assert found["ch1"][0].table == "ch1/sim"
+    assert str(found["ch2"]).endswith("both.h5: no table of ch2; there are those of ch1, ch3")
+
+
+def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path):
+    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")
+    notes: list[str] = []
+
+    def work(name: str, _pair: object, out: Path) -> str:
+        if name == "ch2":
+            raise CpunetError("too few pulses")
+        return out.name
+
+    outcome = one_by_one(paired(data, data), tmp_path / "out", work, notes.append)
+    assert outcome.done == {"ch1": "ch1", "ch3": "ch3"}
+    assert outcome.failed == {"ch2": "too few pulses"}
+    assert "ch2: failed: too few pulses" in notes
+    with pytest.raises(CpunetError, match="1 of 3 channels failed, the first: ch2: too few"):
+        outcome.require_all(tmp_path / "out")
+
+
+def test_what_ends_one_may_end_all_and_an_output_of_one_is_refused(tmp_path):
+    class StopError(CpunetError):
+        pass
+
+    def stop(*_given: object) -> None:
+        raise StopError("asked to")
+
+    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
+    with pytest.raises(StopError):
+        one_by_one(paired(data, data), tmp_path / "out", stop, lambda _n: None, StopError)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".cpunet.json").write_text("{}")
+    with pytest.raises(CpunetError, match="is the output of one channel"):
+        one_by_one(paired(data, data), tmp_path / "run", stop, lambda _n: None)
+
+
+def test_runs_of_channels_are_found(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    assert own_folder(tmp_path / "run", "ch1", "run.json") == tmp_path / "run"
+    assert own_folder(tmp_path / "runs", "ch1", "run.json") == tmp_path / "runs" / "ch1"
