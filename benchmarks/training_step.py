@@ -28,11 +28,11 @@ from torch.nn import functional
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.networks.positional_unet import positional_map
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Step
-from cpunet.training.fast_step import keep_freed_memory
 
 CONVOLUTIONS = (
     "aten::convolution",
