@@ -169,7 +169,7 @@ def our_step(recipe: Recipe, sim: Tensor, data: Tensor) -> Callable[[], object]:
     keep_freed_memory()
     model = CycleGan(recipe).to(sim.device).train()
     step = Step(model, recipe.cyclegan.training)
-    return lambda: step._update_generators(sim, data)
+    return lambda: step._update_generators(sim, data, None)
 
 
 OURS: dict[str, list[str]] = {

@@ -16,8 +16,8 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
-from cpunet.jobs.studies.workers import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.training.train import train_run
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
