@@ -98,7 +98,9 @@ def kolmogorov_smirnov(a: Values, b: Values) -> float:
 
     a, b = _finite(a), _finite(b)
     # an exact probability takes long, and only the distance is wanted
-    return float(ks_2samp(a, b, method="asymp").statistic) if a.size and b.size else float("nan")
+    return (
+        float(ks_2samp(a, b, method="asymp").statistic) if a.size and b.size else float("nan")
+    )
 
 
 def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:

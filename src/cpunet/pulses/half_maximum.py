@@ -25,7 +25,7 @@ class Splines:
         Finite pulses, shape ``(n, samples)``.
     """
 
-    def __init__(self, waveforms: FloatArray) -> None:
+    def __init__(self, waveforms: FloatArray | Values) -> None:
         from scipy.ndimage import spline_filter1d
 
         padded = np.pad(waveforms.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
@@ -65,7 +65,7 @@ class Splines:
 
 
 def last_below_half(
-    waveforms: FloatArray,
+    waveforms: FloatArray | Values,
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
     """Find the last upward crossing of half of the maximum before the maximum.
 

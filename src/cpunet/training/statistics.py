@@ -10,6 +10,7 @@ generator's own input side (Wu and Johnson 2021, arXiv:2105.07576, section 3).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from torch import Tensor, nn
 from torch.optim.swa_utils import update_bn
@@ -46,7 +47,7 @@ class _Behind(nn.Module):
     def __init__(self, network: nn.Module, run: Callable[[Tensor], object]) -> None:
         super().__init__()
         self.network = network
-        self.run = lambda pulses: run(pulses)  # a module would be trained, too
+        self.run = partial(run)  # bare, a module would be set to train, too
         self.training = network.training
 
     def forward(self, pulses: Tensor) -> object:
