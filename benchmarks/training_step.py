@@ -28,11 +28,11 @@ from torch.nn import functional
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.networks.positional_unet import positional_map
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Step
-from cpunet.training.fast_step import keep_freed_memory
 
 CONVOLUTIONS = (
     "aten::convolution",
@@ -169,7 +169,7 @@ def our_step(recipe: Recipe, sim: Tensor, data: Tensor) -> Callable[[], object]:
     keep_freed_memory()
     model = CycleGan(recipe).to(sim.device).train()
     step = Step(model, recipe.cyclegan.training)
-    return lambda: step._update_generators(sim, data)
+    return lambda: step._update_generators(sim, data, None)
 
 
 OURS: dict[str, list[str]] = {

@@ -129,7 +129,7 @@ def held() -> ModuleType:
 
 def work_here(patch: pytest.MonkeyPatch) -> None:
     from cpunet.errors import CpunetError
-    from cpunet.jobs.studies.workers import Link, Outcome
+    from cpunet.jobs.common.pool import Link, Outcome
 
     def work_off(begin: Any, items: Any, **_options: Any) -> Iterator[Outcome]:
         work = begin(Link(SimpleNamespace(send=lambda _message: None)))  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,30 +12,8 @@ import pytest
 import cpunet
 
 HOUSE = Path(cpunet.__file__).parent
-ROOMS = [
-    "recipes",
-    "pulses",
-    "simulation",
-    "electronics",
-    "networks",
-    "training",
-    "calibration",
-    "translation",
-    "analysis",
-    "jobs",
-    "calls",
-    "cli",
-]
-JOBS = [
-    "common",
-    "simulation",
-    "training",
-    "calibration",
-    "inspection",
-    "translation",
-    "validation",
-    "studies",
-]
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+ORDER = PROJECT["tool"]["cpunet"]
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -50,8 +29,8 @@ def imported(path: Path) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("house", "package", "rooms"),
     [
-        (HOUSE, "cpunet.", ROOMS),
-        (HOUSE / "jobs", "cpunet.jobs.", JOBS),
+        (HOUSE, "cpunet.", ORDER["rooms"]),
+        (HOUSE / "jobs", "cpunet.jobs.", ORDER["jobs"]),
     ],
 )
 def test_no_module_imports_from_a_later_room(

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-SOURCE = Path(__file__).parents[2] / "src" / "cpunet"
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "src" / "cpunet"
 FOLDER = "reference/python"
 LEFT_OUT = {"cli"}  # has a reference of its own
-# As data flow; a room that is not named here comes last.
-ORDER = [
-    "recipes",
-    "pulses",
-    "simulation",
-    "electronics",
-    "networks",
-    "training",
-    "calibration",
-    "translation",
-    "analysis",
-    "jobs",
-    "calls",
-]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+# As data flow; a room that is not named there comes last.
+ORDER = PROJECT["tool"]["cpunet"]["rooms"]
 OPTIONS = (
     "options:",
     "  heading_level: 3",

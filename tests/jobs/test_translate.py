@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import operator
 import os
 import resource
 from contextlib import contextmanager
@@ -28,8 +27,8 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.output_lock import only_writer
+from cpunet.jobs.common.pool import work_off
 from cpunet.jobs.translation import translate as translate_job
-from cpunet.jobs.translation.file_workers import in_processes
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_files import expanded, translate_files
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
@@ -700,12 +699,26 @@ def test_targets_that_cannot_be_written(run, tmp_path):
         translate_files(run, [source, source], source.path, device="cpu")
 
 
+def _ends(code, _link):
+    os._exit(code)
+
+
+def _telling(link):
+    def work(item):
+        link.advance(1)
+        return item == "a"
+
+    return work
+
+
 def test_a_process_that_is_killed_costs_its_task():
-    silent = (lambda _: None, lambda _: None)
-    done = dict(in_processes(partial(os._exit, 3), ["a", "b"], 2, *silent))
-    assert all("ended with status 3" in str(error) for error in done.values())
-    done = dict(in_processes(partial(partial, operator.is_), ["a", "b", "c"], 2, *silent))
-    assert done == {0: False, 1: False, 2: False}
+    options = {"jobs": 2, "threads": 1, "monitor": Monitor()}
+    found = list(work_off(partial(_ends, 3), ["a", "b"], **options))
+    assert [one.failure for one in found] == ["its process ended with status 3"] * 2
+    found = list(work_off(_telling, ["a", "b", "c"], **options))
+    assert sum(one for one in found if isinstance(one, int)) == 3  # no step is lost
+    done = {one.item: one.result for one in found if not isinstance(one, int)}
+    assert done == {"a": True, "b": False, "c": False}
 
 
 def test_names(run, many, tmp_path):

@@ -14,12 +14,11 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.half_maximum import Splines, last_below_half
 
 Values = npt.NDArray[np.float64]
 
 BLOCK = 512  # pulses per block: bounds memory
-BISECTIONS = 30  # of one sample: a precision of 1e-9
-PAD = 8  # samples of the edge value; the effect of the spline's end falls by 3.7 per sample
 
 
 class PairedScores(TypedDict):
@@ -177,65 +176,14 @@ def _check_shape(waveforms: FloatArray) -> None:
 def _aligned(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     """One block of `align_half_maximum`, in float64."""
     moved = np.full((len(waveforms), n_before + n_after), np.nan)
-    usable, before = _half_maximum_sample(waveforms)
-    if not usable.any():
-        return moved
-    coefficients = _spline_coefficients(waveforms[usable])
-    level = 0.5 * waveforms[usable].max(axis=1).astype(float)
-    crossing = _crossing(coefficients, before[usable], level)
-
-    start = np.floor(crossing).astype(int)
-    end = waveforms.shape[1] - (crossing > start)
-    weights = _cubic_weights(crossing - start)
-    # row by row: fancy indexing of every sample would take ten times as long
-    for row, curve, at, known, w in zip(
-        np.flatnonzero(usable), coefficients, start, end, weights, strict=True
-    ):
-        first, stop = max(at - n_before, 0), min(at + n_after, known)
-        if first < stop:
-            near = curve[first + PAD - 1 : stop + PAD + 2]
-            moved[row, first - at + n_before : stop - at + n_before] = np.correlate(near, w)
+    usable, before = last_below_half(waveforms)
+    if usable.any():
+        pulses = waveforms[usable]
+        splines = Splines(pulses)
+        level = 0.5 * pulses.max(axis=1).astype(float)
+        times = splines.crossing(before[usable], level)
+        moved[usable] = splines.shifted(times, n_before, n_after)
     return moved
-
-
-def _half_maximum_sample(
-    waveforms: FloatArray,
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Mask of the pulses that cross half of their maximum, and their last sample below it."""
-    length = waveforms.shape[1]
-    finite = np.isfinite(waveforms).all(axis=1)
-    top = np.where(finite, waveforms.argmax(axis=1), 0)
-    height = waveforms[np.arange(len(waveforms)), top]
-    below = waveforms < 0.5 * height[:, np.newaxis]
-    below &= np.arange(length) < top[:, np.newaxis]
-    last = length - 1 - below[:, ::-1].argmax(axis=1)
-    return finite & (height > 0) & below.any(axis=1), last
-
-
-def _spline_coefficients(waveforms: FloatArray) -> Values:
-    """Cubic B-spline coefficients of each pulse, padded by `PAD` samples of its end values."""
-    from scipy.ndimage import spline_filter1d
-
-    padded = np.pad(waveforms.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
-    return np.asarray(spline_filter1d(padded, order=3, axis=1))
-
-
-def _crossing(coefficients: Values, before: npt.NDArray[np.intp], level: Values) -> Values:
-    """Time, in samples, at which the spline reaches `level` after sample `before`."""
-    columns = before[:, np.newaxis] + PAD + np.arange(-1, 3)
-    local = np.take_along_axis(coefficients, columns, axis=1)
-    low, high = np.zeros(len(level)), np.ones(len(level))
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        under = (_cubic_weights(middle) * local).sum(axis=1) < level
-        low, high = np.where(under, middle, low), np.where(under, high, middle)
-    return before + 0.5 * (low + high)
-
-
-def _cubic_weights(fraction: Values) -> Values:
-    """Weights ``(n, 4)`` of the coefficients at -1, 0, 1, 2 for a time in 0 … 1."""
-    t, s = fraction, 1 - fraction
-    return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=1) / 6
 
 
 def _squares(difference: Values) -> Values:

@@ -10,9 +10,10 @@ generator's own input side (Wu and Johnson 2021, arXiv:2105.07576, section 3).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
-import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 
 from cpunet.training.sampling import EpochSampler
 
@@ -36,17 +37,19 @@ def refresh_batch_statistics(
     run
         Where the network stands behind a chain, both of windows of shape (batch, samples).
     """
-    norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm1d)]
-    momenta = [norm.momentum for norm in norms]
-    training = network.training
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # a plain average over all batches
-    network.train()
-    with torch.no_grad():
-        for _ in range(batches):
-            pulses = sampler.next_batch()
-            network(pulses) if run is None else run(pulses[:, 0])
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum
-    network.train(training)
+    batch = (sampler.next_batch() for _ in range(batches))
+    update_bn(batch, network if run is None else _Behind(network, run))
+
+
+class _Behind(nn.Module):
+    """A network that is run behind something else."""
+
+    def __init__(self, network: nn.Module, run: Callable[[Tensor], object]) -> None:
+        super().__init__()
+        self.network = network
+        self.run = partial(run)  # bare, a module would be set to train, too
+        self.training = network.training
+
+    def forward(self, pulses: Tensor) -> object:
+        """Run it on pulses of shape (batch, 1, samples)."""
+        return self.run(pulses[:, 0])

@@ -13,14 +13,13 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.half_maximum import Splines, last_below_half
 from cpunet.pulses.preparation import Codes
 from cpunet.training.ensemble_folder import finished_members
 from cpunet.translation.backends import Backend, Energies
 from cpunet.translation.translator import BATCH, REN
 
 Values = npt.NDArray[np.float64]
-
-BISECTIONS = 30  # of one sample: a precision of 1e-9
 
 
 class EnsembleREN(REN):
@@ -141,44 +140,18 @@ def _at_their_mean_time(translations: Values) -> Values:
     The ends are padded with the end values.  Rows are NaN where the pulse of any member does
     not cross half maximum.
     """
-    from scipy.interpolate import CubicSpline
-
     members, n, samples = translations.shape
     flat = translations.reshape(-1, samples)
-    usable, before = _last_below_half(flat)
+    usable, before = last_below_half(flat)
     usable = np.tile(usable.reshape(members, n).all(axis=0), members)
     moved = np.full_like(flat, np.nan)
-    if not usable.any():
-        return moved.reshape(translations.shape)
-    whole = flat[usable]
-    pieces = CubicSpline(np.arange(samples), whole, axis=1).c  # (4, samples - 1, pulses)
-    pulse = np.arange(len(whole))
-
-    def at(piece: npt.NDArray[np.intp], fraction: Values) -> Values:
-        row = pulse.reshape(-1, *[1] * (piece.ndim - 1))
-        cubic, square, slope, value = pieces[:, piece, row]
-        return np.asarray(((cubic * fraction + square) * fraction + slope) * fraction + value)
-
-    start, level = before[usable], 0.5 * whole.max(axis=1)
-    low, high = np.zeros(len(whole)), np.ones(len(whole))
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        under = at(start, middle) < level
-        low, high = np.where(under, middle, low), np.where(under, high, middle)
-    time = (start + 0.5 * (low + high)).reshape(members, -1)
-    shift = (time - time.mean(axis=0)).reshape(-1, 1)
-    wanted = np.clip(np.arange(samples) + shift, 0, samples - 1)
-    piece = np.minimum(wanted.astype(int), samples - 2)
-    moved[usable] = at(piece, wanted - piece)
+    if usable.any():
+        whole = flat[usable]
+        splines = Splines(whole)
+        times = splines.crossing(before[usable], 0.5 * whole.max(axis=1)).reshape(members, -1)
+        found = splines.shifted((times - times.mean(axis=0)).ravel(), 0, samples)
+        inside = np.isfinite(found)
+        rising = inside.cumsum(axis=1) == 0  # before the record
+        ends = np.where(rising, whole[:, :1], whole[:, -1:])
+        moved[usable] = np.where(inside, found, ends)
     return moved.reshape(translations.shape)
-
-
-def _last_below_half(pulses: Values) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Mask of the pulses that cross half maximum, and their last sample below it."""
-    samples = pulses.shape[1]
-    finite = np.isfinite(pulses).all(axis=1)
-    top = np.where(finite, pulses.argmax(axis=1), 0)
-    height = pulses[np.arange(len(pulses)), top]
-    below = (pulses < 0.5 * height[:, None]) & (np.arange(samples) < top[:, None])
-    last = samples - 1 - below[:, ::-1].argmax(axis=1)
-    return finite & (height > 0) & below.any(axis=1), last

@@ -1,7 +1,7 @@
-"""A library of currents as a few components, and coefficients of each place.
+"""Low-rank approximation of a library of currents: components, and coefficients of each node.
 
-Aligned at their maxima, the currents of a detector differ in few ways.  The components are
-those of a part of the templates; the error is measured on all of them.
+Once aligned at their maxima, the currents of a detector differ in a few ways only.  The
+components are determined from some of the templates, the error from all of them.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ import scipy.linalg
 from cpunet.errors import CpunetError
 from cpunet.translation.peak_currents import PEAK
 
-MOST = 2000  # templates that components are taken from
+MOST = 2000  # maximum number of templates that determine the components
 Floats = npt.NDArray[np.float32]
 
 
 def components(templates: Floats, rank: int) -> Floats:
-    """The components that lose least of these templates, orthonormal, shape (rank, samples).
+    """Leading principal components, without centring: orthonormal, shape ``(rank, samples)``.
+
+    They minimise the squared error of templates of shape ``(n, samples)``.
 
     Raises
     ------
@@ -36,21 +38,21 @@ def components(templates: Floats, rank: int) -> Floats:
     values, vectors = scipy.linalg.eigh(gram, subset_by_index=(n - rank, n - 1))
     kept = values > 1e-12 * values[-1]
     made = (vectors[:, kept] / np.sqrt(values[kept])).T @ templates
-    # once more, for what single precision of the sums above has lost
+    # again, since the sums above are of single precision
     orthonormal = np.linalg.qr(made[::-1].T)[0].T
     return np.asarray(orthonormal, np.float32)
 
 
 @dataclass
 class Loss:
-    """What components lose of templates, in units of the most frequent A/E.
+    """Error of the low-rank approximation, in units of the most frequent A/E.
 
     Attributes
     ----------
     largest, rms
-        Of the differences of all samples.
-    a_over_e_percent
-        The largest change of a template's A/E, and its RMS below.
+        Largest absolute value and RMS of the differences of all samples.
+    a_over_e_percent, a_over_e_rms_percent
+        Largest absolute value and RMS of the relative changes of A/E, in percent.
     """
 
     largest: float = 0.0
@@ -61,7 +63,7 @@ class Loss:
     _templates: int = field(default=0, repr=False)
 
     def add(self, templates: Floats, coefficients: Floats, basis: Floats) -> None:
-        """Count templates in, shape (n, samples), with their coefficients (n, rank)."""
+        """Add templates, shape ``(n, samples)``, with coefficients ``(n, rank)``."""
         if not len(templates):
             return
         apart = coefficients @ basis - templates
@@ -77,7 +79,7 @@ class Loss:
         self._templates += len(apart)
 
     def told(self) -> dict[str, float]:
-        """The numbers by name."""
+        """Errors by name."""
         return {name: v for name, v in asdict(self).items() if not name.startswith("_")}
 
 

@@ -1,9 +1,8 @@
-"""Currents about their maximum, as production simulations take the templates of a library.
+"""Currents aligned at their maxima: templates of the libraries of production simulations.
 
-The current of a template is averaged three times over 48 ns, as A of A/E is, and moved so that
-its maximum is at one and the same sample.  The maximum of a smooth current lies between
-samples: templates are moved by fractions of one, since half a nanosecond changes the sum of
-two sites' currents.
+The current of a template is averaged three times over 48 ns, like that of A in A/E, and
+shifted so that its maximum is at sample `PEAK`.  The shift includes the fraction of a sample,
+since half a nanosecond already changes the summed current of two sites.
 """
 
 from __future__ import annotations
@@ -15,29 +14,29 @@ from numba import prange
 from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray
 
-WINDOW, WINDOWS = 48, 3  # samples of 1 ns, and how often the current is averaged over them
-PEAK, LENGTH = 1000, 4001  # sample of the maximum, and samples of a template
+WINDOW, WINDOWS = 48, 3  # length of a moving average in ns, and number of averages
+PEAK, LENGTH = 1000, 4001  # sample of the maximum, and length of a template in ns
 MODE_BINS = 1000
 
 Values = npt.NDArray[np.float64]
 
 
 def currents_about_peak(charge: FloatArray) -> tuple[npt.NDArray[np.float32], Values]:
-    """Averaged currents with their maximum at sample `PEAK`, and when it was.
+    """Average the currents, and shift their maxima to sample `PEAK`.
 
     Parameters
     ----------
     charge
-        Templates sampled every nanosecond, 0 before their first sample, shape (n, samples).
+        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)``.
 
     Returns
     -------
     currents
-        In units of the charge per ns, shape (n, `LENGTH`): 0 where nothing was sampled.
-        Rows of NaN for templates that hold NaN or have no maximum above 0.
+        Currents in units of the charge per ns, shape ``(n, LENGTH)``; 0 outside the record,
+        rows of NaN for templates that contain NaN or have no maximum above 0.
     times_ns
-        Of the maxima, after the first sample and late by the windows, which look back only:
-        the same for all templates.  NaN where the row is.
+        Times of the maxima after the first sample, shape ``(n,)``, including the delay of the
+        backward averages, which is the same for all templates; NaN for rows of NaN.
     """
     n = len(charge)
     currents = np.empty((n, LENGTH), np.float32)
@@ -47,17 +46,17 @@ def currents_about_peak(charge: FloatArray) -> tuple[npt.NDArray[np.float32], Va
 
 
 def heights(currents: FloatArray) -> Values:
-    """A/E of templates of unit charge: their currents at the maximum."""
+    """A/E of templates of unit charge, i.e. their currents at `PEAK`."""
     return np.asarray(currents[..., PEAK], np.float64)
 
 
 def most_frequent(amplitudes: Values) -> float:
-    """Mode of A/E as production takes it: the fullest of a thousand bins from least to most.
+    """Mode of A/E as in production: centre of the fullest of 1,000 bins of the whole range.
 
     Parameters
     ----------
     amplitudes
-        Finite numbers, at least one.
+        Finite values, at least one.
 
     Examples
     --------
@@ -89,7 +88,7 @@ def _about_peak(
         times[i] = time
         first = int(np.floor(time))
         f = time - first
-        # a cubic through the values, with the slopes of their neighbours (Catmull and Rom)
+        # cubic interpolation with the slopes of the neighbours (Catmull and Rom)
         w0 = 0.5 * f * (-1 + f * (2 - f))
         w1 = 0.5 * (2 + f * f * (3 * f - 5))
         w2 = 0.5 * f * (1 + f * (4 - 3 * f))
@@ -109,7 +108,7 @@ def _about_peak(
 
 @kernel
 def _averaged(charge: npt.NDArray[np.float32]) -> Values:
-    """Differences from sample to sample, averaged over the last ones; NaN if any is."""
+    """Differences between samples after the backward averages; NaN if the charge has NaN."""
     n_samples = len(charge)
     current = np.empty(n_samples)
     before = 0.0

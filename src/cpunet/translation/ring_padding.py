@@ -1,8 +1,8 @@
-"""Rings of nodes beyond the crystal's surface: templates and drift times that go on there.
+"""Extrapolate templates and drift times to rings of nodes beyond the crystal's surface.
 
-Whoever reads a library takes drift times between nodes and the template of the nearest one.
-At the surface a node of the cell lies outside: without a number there, hits just inside get
-none.
+Readers of a library interpolate drift times between nodes and take the template of the nearest
+one.  At the surface, some nodes of a cell are outside the crystal; without values there, hits
+just inside would have none.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy.typing as npt
 
 Axis = npt.NDArray[np.float64]
 
-RINGS = 3
+RINGS = 3  # number of rings
 _NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 
 
 def with_rings(
     templates: npt.NDArray[np.float32], rings: int = RINGS
 ) -> npt.NDArray[np.float32]:
-    """Fill nodes without a template with the mean of those around, ring after ring.
+    """Fill nodes without a template with the mean of their neighbours, ring by ring.
 
-    Of currents that are aligned at their maxima, the mean has the mean A/E.
+    The mean of currents that are aligned at their maxima has the mean A/E.
 
     Parameters
     ----------
     templates
-        Shape (r, z, samples); rows of NaN where there is none.  They are changed in place.
+        Templates, shape ``(r, z, samples)``, NaN if there is none; changed in place.
     rings
-        How often.  What a node becomes depends on nodes no further away than this.
+        Number of rings; a node depends only on nodes at most this far away.
 
     Returns
     -------
@@ -56,20 +56,20 @@ def with_rings(
 
 
 def continued(times: Axis, rings: int = RINGS) -> Axis:
-    """Fill places without a drift time, ring after ring, as its slope goes on.
+    """Extrapolate drift times linearly to nodes without one, ring by ring.
 
     Parameters
     ----------
     times
-        Shape (r, z); NaN where there is none.
+        Drift times in ns, shape ``(r, z)``; NaN if there is none.
     rings
-        How often.
+        Number of rings.
 
     Returns
     -------
     numpy.ndarray
-        Each new one is the mean of what two places in a row tell, over the eight directions;
-        or that of its neighbours, where there are no two.
+        Drift times in ns, shape ``(r, z)``. A new one is the mean of the linear extrapolations
+        from two nodes in each of eight directions, or else the mean of its neighbours.
 
     Examples
     --------
@@ -105,12 +105,12 @@ def padded_axis(axis: Axis, before: int, after: int) -> Axis:
 
 
 def _seen(made: Axis, i: int, j: int, n_r: int, n_z: int) -> Axis:
-    """The inner part of an array with two places of room, seen from elsewhere."""
+    """Inner part of an array with a padding of two nodes, shifted by (i, j)."""
     return made[2 + i : 2 + i + n_r, 2 + j : 2 + j + n_z]
 
 
 def _mean(values: Axis) -> Axis:
-    """Mean over the first axis of what is a number; NaN where nothing is."""
+    """Mean of the finite values along the first axis; NaN if there is none."""
     known = np.isfinite(values)
     n = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0)
@@ -118,6 +118,6 @@ def _mean(values: Axis) -> Axis:
 
 
 def _moved(held: npt.NDArray[np.bool_], i: int, j: int) -> npt.NDArray[np.bool_]:
-    """The inner part of an array, seen from a neighbour."""
+    """Inner part of an array with a padding of one node, shifted by (i, j)."""
     n_r, n_z = held.shape
     return held[1 + i : n_r - 1 + i, 1 + j : n_z - 1 + j]

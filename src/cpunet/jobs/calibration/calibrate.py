@@ -39,7 +39,8 @@ from cpunet.jobs.common.noise import measured_noise
 from cpunet.jobs.common.remains import drawn_like, measured_remains
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.training.train import TrainingJob
+from cpunet.jobs.training.response_trainer import ResponseTrainer
+from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.outputs import FolderKind
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
@@ -157,7 +158,8 @@ class Calibration:
                 self.recipe, self.peak, self.seed, "cpu", Team(), None, again, sides.data,
                 self.data, folder, monitor,
             )  # fmt: skip
-            model, info, recipe = job.match(False, calibrated.response)
+            trainer = ResponseTrainer(self.recipe)
+            model, info, recipe = trainer.train(job, known=calibrated.response)
             info["sim"]["file"] = str(out / SIM)
             info["started"] = started.isoformat(timespec="seconds")
             info["seconds"] = content["seconds"] = round(time.perf_counter() - clock, 1)

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import MatchingConfig
 
 
 def resolve_device(device: str) -> str:
@@ -26,15 +24,13 @@ def resolve_device(device: str) -> str:
 
 
 @contextmanager
-def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
-    """Context manager that reports exhausted memory in one line, with a batch size to try.
+def enough_memory(remedy: str) -> Iterator[None]:
+    """Context manager that reports exhausted memory in one line.
 
     Parameters
     ----------
-    recipe
-        Recipe of the training.
-    processes
-        Number of processes that share a batch.
+    remedy
+        What to try.
     """
     try:
         yield
@@ -44,11 +40,6 @@ def enough_memory(recipe: Recipe, processes: int = 1) -> Iterator[None]:
         if not (known or "DefaultCPUAllocator" in str(error)):
             raise
         where = "GPU" if isinstance(error, torch.cuda.OutOfMemoryError) else "computer"
-        if isinstance(recipe.training, MatchingConfig):
-            remedy = "fewer energies (--peak) or files"
-        else:
-            half = recipe.training.batch_size // 2 // processes * processes
-            remedy = f"--set training.batch_size={max(2, processes, half)}"
         raise CpunetError(f"the {where}'s memory does not suffice; try {remedy}") from error
 
 

@@ -21,3 +21,26 @@ class Monitor:
 
     def note(self, message: str) -> None:
         """Give the user a line of information."""
+
+
+class Relay(Monitor):
+    """Pass steps and notes on to whoever has entered the stage, such as a parent process.
+
+    Parameters
+    ----------
+    advance, note
+        Receivers of the steps of all stages, and of the notes.
+    """
+
+    def __init__(self, advance: Advance, note: Callable[[str], None]) -> None:
+        self._advance, self._note = advance, note
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        """Pass on the steps of a stage."""
+        del title, total
+        yield self._advance
+
+    def note(self, message: str) -> None:
+        """Pass on a note."""
+        self._note(message)

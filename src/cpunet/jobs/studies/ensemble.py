@@ -16,11 +16,11 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
-from cpunet.jobs.studies.workers import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.trainers import trainer_for
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.checkpoints import require_same
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
@@ -216,7 +216,7 @@ class _Member:
                 peak=self.peak,
                 seed=seed,
                 device=self.device,
-                resume=begun and isinstance(self.recipe.training, TrainingConfig),
+                resume=begun and trainer_for(self.recipe).resumable,
                 stop=stop,
                 monitor=_Forwarding(link, seed),
             )
@@ -271,8 +271,7 @@ def _stage(
 
     A seed that ends early or fails counts as complete.
     """
-    training = recipe.training
-    each = training.iterations if isinstance(training, TrainingConfig) else 1
+    each = trainer_for(recipe).steps
     ended = counted = 0
     with monitor.stage(title, seeds * each) as advance:
 

@@ -22,6 +22,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.studies.held_out import HeldOut
 from cpunet.jobs.studies.tuning_study import (
@@ -37,7 +38,6 @@ from cpunet.jobs.studies.tuning_study import (
     suggested,
     this_worker,
 )
-from cpunet.jobs.studies.workers import Link, Outcome, cores, default_jobs, work_off
 from cpunet.outputs import FolderKind
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe

@@ -9,13 +9,12 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
-from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import TrainingConfig
+from cpunet.jobs.training.trainers import Trainer
 from cpunet.training.team import ALONE, Launch, Team, launch, meeting
 
 
 @contextmanager
-def team_for(recipe: Recipe, device: str) -> Iterator[tuple[Team, str]]:
+def team_for(trainer: Trainer, device: str) -> Iterator[tuple[Team, str]]:
     """Join the processes of torchrun, if it started any; give the team and the device.
 
     An error inside ends all processes and is told by one of them, see
@@ -23,8 +22,8 @@ def team_for(recipe: Recipe, device: str) -> Iterator[tuple[Team, str]]:
 
     Parameters
     ----------
-    recipe
-        What is to be trained.
+    trainer
+        Method of the training.
     device
         As for `cpunet.jobs.training.train.train_run`; each process has the GPU of its local
         rank.
@@ -40,23 +39,10 @@ def team_for(recipe: Recipe, device: str) -> Iterator[tuple[Team, str]]:
         yield ALONE, resolve_device(device)
         return
     with meeting(launched) as join:
-        _require_shareable(recipe, launched.team)
+        trainer.require_shareable(launched.team)
         own = _own_device(resolve_device(device), launched)
         with nullcontext() if own == "cpu" else torch.cuda.device(own):
             yield join(own), own
-
-
-def _require_shareable(recipe: Recipe, team: Team) -> None:
-    if not isinstance(recipe.training, TrainingConfig):
-        raise CpunetError(
-            f"recipe {recipe.name}: takes a minute in one process; start it without torchrun"
-        )
-    if recipe.chain is not None:
-        raise CpunetError(
-            f"recipe {recipe.name}: takes minutes in one process, its chain being matched "
-            "first; start it without torchrun"
-        )
-    team.share_of(recipe.training.batch_size)
 
 
 def _own_device(device: str, launched: Launch) -> str:

@@ -1,4 +1,4 @@
-"""Many files of pulses into a folder, in several processes, to be gone on with."""
+"""Translate many files into a folder, in several processes; resumable."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.translation.file_workers import Relay, in_processes
+from cpunet.jobs.common.monitor import Advance, Monitor, Relay
+from cpunet.jobs.common.pool import Link, Outcome, work_off
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.outputs import refuse_existing, refuse_inputs
@@ -97,14 +97,16 @@ def translate_files(
     failed: list[str] = []
     with (
         monitor.stage("Translating", _rows(sources)) as advance,
-        closing(_results(make, tasks, jobs, advance, monitor.note)) as results,
+        closing(_outcomes(make, tasks, jobs, advance, monitor)) as outcomes,
     ):
-        for number, result in results:
-            if isinstance(result, CpunetError):
-                failed.append(_naming(tasks[number], result))
+        for outcome in outcomes:
+            if isinstance(outcome, int):
+                advance(outcome)
+            elif outcome.failure is not None:
+                failed.append(_naming(outcome.item, outcome.failure))
                 monitor.note(f"error: {failed[-1]}")
             else:
-                told.append(result)
+                told.append(outcome.result)
     if failed:
         done = f"; {len(told)} are in {out}" if told else ""
         raise CpunetError(
@@ -136,7 +138,7 @@ def expanded(names: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes in each process what translates a file."""
+    """The work of each process: one file after the other."""
 
     run: Path
     options: TranslateOptions
@@ -144,12 +146,16 @@ class _Maker:
     resume: bool
     force: bool
 
-    def __call__(self) -> Callable[[_Task, Monitor], Told]:
+    def __call__(self, link: Link) -> Callable[[_Task], Told]:
+        return self.work(Relay(link.advance, link.note))
+
+    def work(self, monitor: Monitor) -> Callable[[_Task], Told]:
+        """Return a function that translates a file."""
         # a network's last bits depend on the number of threads, and processes share the cores
         torch.set_num_threads(1)
         translation = FileTranslation(self.run, self.options, self.device)
 
-        def work(task: _Task, monitor: Monitor) -> Told:
+        def work(task: _Task) -> Told:
             return translation(
                 task.source,
                 task.out,
@@ -162,23 +168,19 @@ class _Maker:
         return work
 
 
-def _results(
-    make: _Maker,
-    tasks: Sequence[_Task],
-    jobs: int,
-    advance: Advance,
-    note: Callable[[str], None],
-) -> Generator[tuple[int, Told | CpunetError]]:
-    if min(jobs, len(tasks)) > 1:
-        yield from in_processes(make, tasks, jobs, advance, note)
+def _outcomes(
+    make: _Maker, tasks: Sequence[_Task], jobs: int, advance: Advance, monitor: Monitor
+) -> Generator[Outcome | int]:
+    if (jobs := min(jobs, len(tasks))) > 1:
+        yield from work_off(make, tasks, jobs=jobs, threads=1, monitor=monitor)
         return
     with _threads_kept():
-        work = make()
-        for number, task in enumerate(tasks):
+        work = make.work(Relay(advance, monitor.note))
+        for task in tasks:
             try:
-                yield number, work(task, Relay(advance, note))
+                yield Outcome(task, work(task))
             except CpunetError as error:
-                yield number, error
+                yield Outcome(task, failure=str(error))
 
 
 @contextmanager
@@ -226,9 +228,8 @@ def _rows(sources: Sequence[InputFile]) -> int | None:
     return total
 
 
-def _naming(task: _Task, error: CpunetError) -> str:
+def _naming(task: _Task, text: str) -> str:
     """The error, with the file that it belongs to."""
-    text = str(error)
     named = str(task.source.path) in text or str(task.out) in text
     return text if named else f"{task.source.path}: {text}"
 

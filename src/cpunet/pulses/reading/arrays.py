@@ -1,4 +1,4 @@
-"""Pulses of NumPy files: ``.npz`` with columns beside the waveforms, ``.npy`` without."""
+"""Read pulses from NumPy files: ``.npz`` with columns of values per event, ``.npy`` without."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _WAVEFORMS = ("waveform", "waveforms", "values")
 
 
 class ArraySource(PulseSource):
-    """An array of two dimensions (event, sample), read row by row.
+    """An array of shape ``(events, samples)``, read row by row.
 
-    An ``.npz`` may hold ``dt_ns`` (or ``dt``), energies and event numbers beside
-    ``waveform``, ``waveforms`` or ``values``; `table` names another array.
-    Pickled objects are never loaded.
+    The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array that
+    the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
+    ``dt``), energies and event numbers, are columns. Pickled objects are never loaded.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -97,7 +97,7 @@ def _require_plain(path: Path, key: str, header: Header) -> None:
 
 
 def _columns(path: Path, headers: dict[str, Header]) -> dict[str, MemoryColumn]:
-    """The small arrays, read whole: a few bytes per event."""
+    """Read the arrays with one value per event, or one value, as a whole."""
     return {
         key: MemoryColumn(npz_files.read_array(path, key, header))
         for key, header in headers.items()

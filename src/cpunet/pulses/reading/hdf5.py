@@ -1,4 +1,4 @@
-"""Columns of HDF5 files, and how to open them."""
+"""Open HDF5 files, and read columns with one value per event from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,19 @@ __all__ = ["Hdf5Column", "column_of", "columns_of", "opened", "text_attribute"]
 
 @dataclass(frozen=True)
 class Hdf5Column:
-    """A one-dimensional (or scalar) dataset of an HDF5 file, opened only while read."""
+    """Dataset of an HDF5 file with one value per event; the file is open only while reading.
+
+    Parameters
+    ----------
+    path, dataset
+        File, and path of the dataset in it.
+    units
+        The attribute ``units``, empty if there is none.
+    size
+        Number of values.
+    constant
+        Whether it is a scalar, which applies to all events.
+    """
 
     path: Path
     dataset: str
@@ -31,7 +43,7 @@ class Hdf5Column:
         return self.size
 
     def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events from `start` to before `stop`."""
+        """Values of the events `start` to `stop` - 1, shape ``(stop - start,)``."""
         with opened(self.path) as file:
             if self.constant:
                 return np.full(stop - start, file[self.dataset][()])
@@ -39,18 +51,18 @@ class Hdf5Column:
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
-    """Columns of numbers in a group: its datasets of one dimension or none."""
+    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
     members = {name: group.get(name) for name in group}
     return {name: _column(path, m) for name, m in members.items() if is_column(m)}
 
 
 def column_of(path: Path, name: str) -> Hdf5Column:
-    """One column of an HDF5 file, by its path within the file.
+    """Return a column of an HDF5 file by its path in the file.
 
     Raises
     ------
     CpunetError
-        If there is no such file or column, with the columns beside it.
+        If there is no such file or column; the message lists the other columns of the group.
     """
     with opened(path) as file:
         found = file.get(name)

@@ -1,4 +1,4 @@
-"""Pulses of LH5 files (the waveform tables of LEGEND's software) and of other HDF5."""
+"""Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from cpunet.pulses.reading.lh5_rows import read_rows
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
-_PARTS = ("cumulative_length", "flattened_data")  # of vectors
+_PARTS = ("cumulative_length", "flattened_data")  # datasets of a vector of vectors
 
 
 def open_hdf5(options: ReadOptions) -> PulseSource:
-    """Open the chosen waveforms of an HDF5 file, LH5 or not (see `open_pulses`)."""
+    """Open the waveforms of an HDF5 file, LH5 or not; see `opening.open_pulses`."""
     with opened(options.path) as file:
         if is_majorana(file):
             return MajoranaSource(options)
@@ -33,7 +33,7 @@ def open_hdf5(options: ReadOptions) -> PulseSource:
 
 
 class Lh5Source(PulseSource):
-    """A waveform table ``{t0, dt, values}``, plain or encoded, and its sister columns."""
+    """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
     def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
         self._values = f"{chosen.path}/values"
@@ -83,7 +83,7 @@ class Lh5Source(PulseSource):
 
 
 def _require_waveforms(path: Path, file: h5py.File, name: str) -> None:
-    """Raise a `CpunetError` unless at `name` are waveforms as LH5 has them, all stored."""
+    """Raise a `CpunetError` unless `name` contains LH5 waveforms, all stored."""
     values = file[name]
     kind = text_attribute(values, "datatype")
     if isinstance(values, h5py.Dataset):
@@ -104,7 +104,7 @@ def _require_waveforms(path: Path, file: h5py.File, name: str) -> None:
 
 
 class Hdf5Source(PulseSource):
-    """A dataset of two dimensions (event, sample), and the columns beside it."""
+    """A dataset of shape ``(events, samples)``, and the columns beside it."""
 
     def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
         self._values = chosen.path

@@ -1,4 +1,4 @@
-"""Find the tables of waveforms in an HDF5 file, and choose one of them."""
+"""Find the waveform tables of an HDF5 file, and choose one of them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import shortened
 from cpunet.pulses.reading.hdf5 import text_attribute
 
-# Of several waveform columns in one table: the full record, else the full-rate window.
+# preferred of several waveform columns of a table: the full record, then the full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
 _PLAIN = ("waveform", "waveforms", "values")
 
 
 @dataclass(frozen=True)
 class WaveformColumn:
-    """Waveforms found in a file.
+    """Waveforms in a file.
 
     Parameters
     ----------
     table
-        Path of the group with the columns of the events.
+        Path of the group that contains the waveforms and the other columns.
     name
-        Name of the waveform column in it.
+        Name of the waveforms in it.
     is_lh5
-        Whether it is a waveform table (t0, dt, values) of LH5; else a plain
-        dataset of two dimensions.
+        Whether they are an LH5 waveform table (t0, dt, values), not a plain dataset of shape
+        ``(events, samples)``.
     """
 
     table: str
@@ -43,12 +43,12 @@ class WaveformColumn:
 
 
 def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> WaveformColumn:
-    """The waveforms at `table` (a table, a waveform column or a group around one).
+    """Choose the waveforms at `table`: a table, a waveform column, or a group around one.
 
     Raises
     ------
     CpunetError
-        If there are none, several, or no such table; the message lists what there is.
+        If there is no such table, or not exactly one choice; the message lists the choices.
     """
     if table is None or not table.strip("/"):
         found = list(_walk(file, set()))
@@ -75,7 +75,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
 
 
 def waveform_tables(file: h5py.File) -> list[str]:
-    """Tables that hold waveforms, in the order of their names."""
+    """Paths of the tables that contain waveforms, sorted."""
     return sorted({column.table for column in _walk(file, set())})
 
 
@@ -99,7 +99,7 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
 
 
 def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformColumn]:
-    # Links may give one object several names, or lead in circles: each is met once.
+    # links can give an object several names or form cycles: visit each object once
     info = h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
         return
@@ -108,12 +108,12 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
     found = [column for column in columns if column is not None]
     lh5_found = [column for column in found if column.is_lh5]
     yield from lh5_found or [c for c in found if c.name in _PLAIN][:1]
-    # A table's other columns may be groups of many datasets: no waveforms within.
+    # other columns of a table can be groups of many datasets, but contain no waveforms
     if text_attribute(group, "datatype").startswith("table"):
         return
     names = {column.name for column in found}
     for name in group:
-        # A link that leads nowhere gives None.
+        # None for a broken link
         inner = group.get(name)
         if name not in names and isinstance(inner, h5py.Group):
             yield from _walk(inner, seen)
@@ -122,7 +122,7 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
 def _as_column(
     item: object, parent: h5py.Group | None = None, name: str | None = None
 ) -> WaveformColumn | None:
-    """The item as waveforms, under the name by which it was reached."""
+    """Return the item as waveforms under the name in its parent; None if it is none."""
     if isinstance(item, h5py.Group):
         is_lh5 = text_attribute(item, "datatype").startswith("table") and (
             "values" in item and "dt" in item
@@ -143,7 +143,7 @@ def _as_column(
 
 
 def _tables(group: h5py.Group) -> list[str]:
-    """Tables of LH5, else the groups at the top; for messages."""
+    """LH5 tables, or the top-level groups if there are none; for messages."""
     tables: list[str] = []
 
     def note(name: str, item: h5py.Group | h5py.Dataset) -> None:

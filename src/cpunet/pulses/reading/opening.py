@@ -1,4 +1,4 @@
-"""Open a file of pulses of any known format."""
+"""Open a file of pulses of any supported format."""
 
 from __future__ import annotations
 
@@ -16,43 +16,42 @@ def open_pulses(
     kev_per_adc: float | None = None,
     dt_ns: float | None = None,
 ) -> PulseSource:
-    """Open a file of pulses; its format is found by its content.
+    """Open a file of pulses; the format is recognised by its content.
 
-    Read are LH5 (waveform tables, also encoded ones) and other HDF5, FlashCam
+    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, FlashCam
     ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe`` and text, the Majorana
-    Demonstrator's release for machine learning, and CPU-Net's pickled pulses.
+    Demonstrator's data release for machine learning, and CPU-Net's pickled pulses.
 
     Parameters
     ----------
     path
         The file.
     table
-        Where the waveforms are: a table or waveform column of an LH5 file, a
-        group or dataset of an HDF5 file, an array of an ``.npz``, a channel
-        of an ``.fcio``, a detector of the Majorana release.  Needed only where
-        there are several.
+        Location of the waveforms, needed only if there are several: a table or waveform
+        column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``, a
+        channel of an ``.fcio``, a detector of the Majorana release.
     energy
         Column of the energies, or ``FILE:path/to/column`` for a column of another
         HDF5 file of the same events, such as LEGEND's hit tier.
     kev_per_adc
-        Calibration: keV per unit of the energy column, or of the amplitude
-        (maximum over baseline) if there is no such column.
+        Calibration: keV per unit of the energy column, or of the amplitude (maximum above
+        the baseline) if there is no such column.
     dt_ns
-        Sampling period in ns, where the file does not tell.
+        Sampling period in ns, if it is not in the file.
 
     Returns
     -------
     PulseSource
-        Gives blocks of `Pulses` with energies in keV (NaN where not known).
+        Source of blocks of `Pulses`, with energies in keV (NaN if unknown).
 
     Raises
     ------
     CpunetError
-        If the file is missing, foreign, damaged or without pulses, if a choice is
-        open or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
+        If the file is missing, of an unknown format, damaged or without pulses, if `table` or
+        `energy` is missing or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
     """
     options = ReadOptions(Path(path), table, energy, kev_per_adc, dt_ns)
-    # Formats are imported when met: the LH5 library alone takes seconds to load.
+    # readers are imported when needed: the LH5 library alone takes seconds to load
     match recognise(options.path):
         case "hdf5":
             from cpunet.pulses.reading.hdf5_sources import open_hdf5
@@ -81,9 +80,9 @@ def open_pulses(
 
 
 def tables_of(path: str | Path) -> list[str]:
-    """Tables of waveforms in an LH5 or other HDF5 file; none in files of other formats.
+    """List the waveform tables of an LH5 or other HDF5 file; empty for other formats.
 
-    Of the Majorana release they are the detectors.
+    For the Majorana release, these are the detectors.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which format a file has: its first bytes tell, its name may contradict them."""
+"""Recognise the format of a file by its first bytes, and check it against its suffix."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ _TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
 
 
 def recognise(path: Path) -> Format:
-    """Find the format of a file by its content.
+    """Return the format of a file, from its content.
 
     Raises
     ------
     CpunetError
-        If there is no such file, or it is a folder, empty, of no known format,
-        or not what its suffix says.
+        If there is no such file, or it is a folder, empty, of an unknown format, or of another
+        format than its suffix says.
     """
     head = _head(path)
     found = _by_content(head, path)
     claimed = _SUFFIXES.get(path.suffix.lower())
-    # Plain text passes for anything, so it must not be named as something else; a pickle of
-    # the oldest kind is text.
+    # any text is accepted, unless its suffix is that of another format; pickles of protocol 0
+    # are text
     if found == "text" and claimed is not None:
         found = "pickle" if claimed == "pickle" else None
     if found is not None:
@@ -83,17 +83,17 @@ def _head(path: Path) -> bytes:
 
 
 def _by_content(head: bytes, path: Path) -> Format | None:
-    # MATLAB keeps 512 bytes of its own before the HDF5 part.
+    # MATLAB writes 512 bytes of its own before the HDF5 part
     if _HDF5 in (head[:8], head[512:520]):
         return "hdf5"
     if head.startswith(b"\x93NUMPY"):
         return "npy"
     if head.startswith(b"PK\x03\x04"):
         return "npz"
-    # The FCIO library itself unpacks these two, going by the name.
+    # the FCIO library unpacks these two itself, by their suffix
     if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
         return "fcio"
-    # Fortran's record marks around the 24 bytes of a Radware header.
+    # Fortran record marks around the 24 bytes of a Radware header
     if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
         return "spe"
     if head[0] == _PICKLE and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:

@@ -1,4 +1,4 @@
-"""A file of pulses, whatever its format: what it holds, and its blocks of pulses."""
+"""Files of pulses of any format: their layout, and their pulses in blocks."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from cpunet.pulses.reading.columns import Column, require_length
 from cpunet.pulses.reading.energies import resolve_energies
 from cpunet.pulses.reading.sampling import resolve_sampling
 
-MAX_SAMPLES = 1 << 20  # of a trace: 17 ms at 16 ns
-BLOCK_BYTES = 1 << 28  # of a block of traces in single precision
+MAX_SAMPLES = 1 << 20  # length of a trace: 17 ms at 16 ns
+BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the user says of a file (see `open_pulses`)."""
+    """Options for reading a file; see `cpunet.pulses.reading.open_pulses`."""
 
     path: Path
     table: str | None = None
@@ -41,26 +41,26 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Layout:
-    """What a format's reader found in a file, before any waveform is read.
+    """Content of a file, as found by the reader of its format before any waveform is read.
 
     Parameters
     ----------
     format
         Name of the format.
     table
-        Where in the file the waveforms are.
+        Location of the waveforms in the file.
     n_pulses
-        Number of pulses; None if only a scan of the file would tell.
+        Number of pulses; None if it is unknown without reading the whole file.
     length
         Samples per pulse.
     columns
-        Per-event values beside the waveforms, by name.
+        Columns with one value per event, by name.
     period_name
-        Name of the column with the sampling period.
+        Name of the column of the sampling period.
     period
-        The sampling period, if the file tells.
+        Sampling period, if it is in the file.
     period_hint
-        What is known of it otherwise, for whoever has to say it.
+        Hint at the sampling period otherwise, for the error message.
     """
 
     format: str
@@ -75,17 +75,17 @@ class Layout:
 
 @dataclass(frozen=True)
 class Traces:
-    """Some raw waveforms (one per row), with event numbers if the format brings them."""
+    """Raw waveforms ``(n, samples)``, and event numbers ``(n,)`` if the format has them."""
 
     waveforms: npt.NDArray[Any]
     event_number: npt.NDArray[np.int64] | None = None
 
 
 class PulseSource(ABC):
-    """An opened file of pulses: iterate over `blocks`, or `read` it whole.
+    """A file of pulses: iterate over its `blocks`, or `read` it as a whole.
 
-    Nothing stays open between blocks but what the running iteration needs, so
-    memory does not grow with the file and sources need not be closed.
+    The file is open only during an iteration, so a source need not be closed, and the memory
+    in use does not grow with the file.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class PulseSource(ABC):
     dt_ns : float
         Sampling period in ns.
     n_pulses : int or None
-        Number of pulses; None where only a scan would tell.
+        Number of pulses; None if it is unknown without reading the whole file.
     length : int
         Samples per pulse.
     """
@@ -137,18 +137,18 @@ class PulseSource(ABC):
 
     @abstractmethod
     def _traces(self, size: int) -> Iterator[Traces]:
-        """Raw waveforms in the order of the file, `size` rows at a time."""
+        """Yield raw waveforms in the order of the file, `size` rows at a time."""
 
     def blocks(self, size: int = 4096) -> Iterator[Pulses]:
-        """Give the pulses of the file in order, at most `size` at a time.
+        """Yield the pulses of the file in order, at most `size` at a time.
 
-        Of long traces there are fewer, so that a block stays within `BLOCK_BYTES`.
+        Blocks of long traces are smaller, so that none exceeds `BLOCK_BYTES`.
 
         Raises
         ------
         CpunetError
-            If the file is damaged or turns out to hold no pulses, or if its events
-            differ in length or sampling.
+            If the file is damaged or contains no pulses, or if its events differ in length or
+            sampling period.
         """
         if size < 1:
             raise ValueError(f"block size is {size}; expected at least 1")
@@ -166,16 +166,16 @@ class PulseSource(ABC):
             )
 
     def read(self) -> Pulses:
-        """All pulses of the file at once; for files that fit in memory."""
+        """Read all pulses of the file at once; they must fit in memory."""
         return Pulses.concatenate(list(self.blocks()))
 
     @property
     def columns(self) -> Mapping[str, Column]:
-        """What stands beside the waveforms, by name."""
+        """Columns with one value per event, by name."""
         return self._layout.columns
 
     def describe(self) -> dict[str, Any]:
-        """What the file says of itself without reading its waveforms."""
+        """Describe the file without reading its waveforms."""
         return {
             "format": self._layout.format,
             "table": self._layout.table,
@@ -187,7 +187,7 @@ class PulseSource(ABC):
         }
 
     def _pulses(self, start: int, traces: Traces) -> Pulses:
-        with np.errstate(over="ignore"):  # a sample beyond single precision is infinite
+        with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces.waveforms, np.float32)
         stop = start + len(waveforms)
         numbers = traces.event_number
@@ -208,7 +208,7 @@ class PulseSource(ABC):
         )
 
     def _whole(self, start: int, numbers: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """Event numbers as integers; some files keep them as real numbers."""
+        """Event numbers as integers; some files store them as floating-point numbers."""
         if numbers.dtype.kind == "i":
             return numbers.astype(np.int64)
         values = numbers.astype(np.float64)

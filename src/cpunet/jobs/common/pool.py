@@ -52,11 +52,16 @@ class Link:
         self._steps, self._told = 0, 0.0
 
     def advance(self, steps: int) -> None:
-        """Report completed steps."""
+        """Report completed steps, soon."""
         self._steps += steps
         if time.monotonic() - self._told >= TELL_EVERY_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Report completed steps now."""
+        if self._steps:
             self._send("steps", self._steps)
-            self._steps, self._told = 0, time.monotonic()
+        self._steps, self._told = 0, time.monotonic()
 
     def note(self, message: str) -> None:
         """Send a note to the user."""
@@ -263,6 +268,7 @@ def _serve(pipe: Connection, begin: Begin, threads: int) -> None:
             return
         except (CpunetError, OSError) as error:
             message = ("failure", str(error))
+        link.flush()
         try:
             pipe.send(message)
         except OSError:

@@ -1,0 +1,151 @@
+"""Training of a CycleGAN: resumable, and by several processes if torchrun started them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.training.network_start import NetworkStart, network_start
+from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
+from cpunet.recipes.schema import Recipe
+from cpunet.training.judges import judges_noted
+from cpunet.training.loop import CheckpointHooks, Listener, Record, train
+from cpunet.training.run_folder import read_losses, weights_sha256
+from cpunet.training.team import Team
+from cpunet.training.team_state import require_same_everywhere, share_state
+from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
+
+# settings of logs and checkpoints, which change no weight
+_CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
+
+
+class CycleGanTrainer:
+    """Trains a CycleGAN; see `cpunet.jobs.training.trainers.Trainer`."""
+
+    resumable = True
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self.config = recipe.cyclegan.training
+        self.steps = self.config.iterations
+
+    def require_shareable(self, team: Team) -> None:
+        """Refuse processes that cannot share the batches, or would all match a chain first."""
+        if self.recipe.chain is not None:
+            raise CpunetError(
+                f"recipe {self.recipe.name}: takes minutes in one process, its chain being "
+                "matched first; start it without torchrun"
+            )
+        team.share_of(self.config.batch_size)
+
+    def less_memory(self, processes: int) -> str:
+        """Return what to change if the memory does not suffice."""
+        half = self.config.batch_size // 2 // processes * processes
+        return f"--set training.batch_size={max(2, processes, half)}"
+
+    def workplace(
+        self,
+        out: Path,
+        read: Sequence[Path | str | None],
+        *,
+        resume: bool,
+        force: bool,
+        note: Callable[[str], None],
+    ) -> AbstractContextManager[Path]:
+        """Context of ``OUT.unfinished``, which becomes `out` when the training is complete."""
+        return unfinished_folder(out, *read, resume=resume, force=force, note=note)
+
+    def train(
+        self,
+        job: TrainingJob,
+        *,
+        resume: bool = False,
+        tensorboard: bool = False,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Trained | None:
+        """Train or resume; return None in a process that does not lead."""
+        fingerprint = _fingerprint(job)
+        require_same_everywhere(job.team, fingerprint)
+        if not job.team.leads:
+            state = share_state(job.team, None)
+            hooks = CheckpointHooks(lambda _state: None, state, stop)
+            self._trained(job, self._start(job), hooks, None)
+            return None
+        run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
+        state = share_state(job.team, run.begin(resume=resume))
+        start = self._start(job)
+        left = self.steps - (state["iteration"] if state else 0)
+        with (
+            losses_shown(job.folder, wanted=tensorboard) as show,
+            job.monitor.stage("Training", left) as advance,
+        ):
+
+            def listen(records: list[Record]) -> None:
+                run.log(records)
+                show(records)
+                advance(len(records))
+
+            hooks = CheckpointHooks(run.save, state, stop)
+            model = self._trained(job, start, hooks, listen)
+        run.finish()
+        for line in judges_noted(read_losses(job.folder)):
+            job.monitor.note(f"warning: {line}")
+        resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
+        info = job.info(run.started, run.seconds) | resumed | start.told
+        return Trained(model, info, start.recipe)
+
+    def _start(self, job: TrainingJob) -> NetworkStart:
+        return network_start(job.sides, self.recipe, job.seed, job.init, job.monitor)
+
+    def _trained(
+        self,
+        job: TrainingJob,
+        start: NetworkStart,
+        hooks: CheckpointHooks,
+        listener: Listener | None,
+    ) -> nn.Module:
+        return train(
+            job.sim.prepared.pulses.waveforms,
+            job.data.prepared.pulses.waveforms,
+            start.recipe,
+            seed=job.seed,
+            device=job.device,
+            init=start.fill,
+            surroundings=start.surroundings,
+            listener=listener,
+            hooks=hooks,
+            team=job.team,
+        )
+
+
+def _fingerprint(job: TrainingJob) -> dict[str, Any]:
+    """All that determines the weights."""
+    recipe = job.recipe.model_dump(mode="json")
+    del recipe["search"]  # what may be tuned changes no weight
+    training = recipe["training"]
+    recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
+    told = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
+    sides = (("simulation", job.sim), ("data", job.data))
+    settings = {"recipe": recipe, "peak": job.peak, "seed": job.seed}
+    if job.init is not None:
+        settings["init"] = weights_sha256(job.init)
+    return settings | {
+        side: {k: v for k, v in pulses.provenance().items() if k in told}
+        for side, pulses in sides
+    }
+
+
+def _environment(job: TrainingJob) -> dict[str, Any]:
+    """What the last bits depend on."""
+    return {
+        "device": job.device,
+        "processes": job.team.size,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+    }

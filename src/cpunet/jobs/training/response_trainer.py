@@ -1,0 +1,94 @@
+"""Training by a fit: a readout chain matched to data."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from cpunet.errors import CpunetError
+from cpunet.files import folder_written_aside
+from cpunet.jobs.training.matching import known_response, match
+from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.recipes.schema import Recipe
+from cpunet.training.loop import Record
+from cpunet.training.run_folder import RUN, append_losses
+from cpunet.training.team import Team
+
+
+class ResponseTrainer:
+    """Fits a readout chain; see `cpunet.jobs.training.trainers.Trainer`."""
+
+    steps = 1  # their number is not known beforehand
+    resumable = False
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+
+    def require_shareable(self, team: Team) -> None:
+        """Refuse several processes: a fit has one."""
+        del team
+        raise CpunetError(
+            f"recipe {self.recipe.name}: takes a minute in one process; "
+            "start it without torchrun"
+        )
+
+    def less_memory(self, processes: int) -> str:
+        """Return what to change if the memory does not suffice."""
+        del processes
+        return "fewer energies (--peak) or files"
+
+    def workplace(
+        self,
+        out: Path,
+        read: Sequence[Path | str | None],
+        *,
+        resume: bool,
+        force: bool,
+        note: Callable[[str], None],
+    ) -> AbstractContextManager[Path]:
+        """Context of a folder that appears when the fit is complete."""
+        if resume:
+            raise CpunetError(
+                f"recipe {self.recipe.name}: takes a minute and keeps no checkpoints; give the "
+                "recipe that the training was begun with, or leave out --resume"
+            )
+        return folder_written_aside(out, RUN, *read, force=force, note=note)
+
+    def train(
+        self,
+        job: TrainingJob,
+        *,
+        resume: bool = False,
+        tensorboard: bool = False,
+        stop: Callable[[], bool] | None = None,
+        known: ElectronicsResponse | None = None,
+    ) -> Trained:
+        """Fit a readout chain, from a known one or that of ``job.init`` if there is one."""
+        del resume, stop  # it takes a minute
+        started, clock = datetime.now(UTC), time.perf_counter()
+        if job.init is not None:
+            known = known_response(job.init, job.data.dt_ns)
+        with (
+            losses_shown(job.folder, wanted=tensorboard) as show,
+            # most fits need fewer steps than one start may take
+            job.monitor.stage("Matching", self.recipe.matching.training.steps) as advance,
+        ):
+
+            def listen(step: int, chi_square: float) -> None:
+                losses = {"chi_square": chi_square}
+                record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
+                append_losses(job.folder, [record])
+                show([record])
+                advance(1)
+                job.monitor.state(f"chi-square {chi_square:.4g}")
+
+            model, told, recipe = match(
+                job.sides, self.recipe, job.seed, listen, job.monitor, known
+            )
+        seconds = time.perf_counter() - clock
+        info = job.info(started.isoformat(timespec="seconds"), seconds)
+        return Trained(model, info | told, recipe)

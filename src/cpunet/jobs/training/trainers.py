@@ -1,0 +1,59 @@
+"""The methods of training, each with one class."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Protocol
+
+from cpunet.jobs.training.cyclegan_trainer import CycleGanTrainer
+from cpunet.jobs.training.response_trainer import ResponseTrainer
+from cpunet.jobs.training.training_job import Trained, TrainingJob
+from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.team import Team
+
+
+class Trainer(Protocol):
+    """A method of training, for a recipe.
+
+    Attributes
+    ----------
+    steps
+        Number of steps of a training, 1 if it is unknown beforehand.
+    resumable
+        Whether an interrupted training can be resumed.
+    """
+
+    steps: int
+    resumable: bool
+
+    def require_shareable(self, team: Team) -> None:
+        """Raise a `CpunetError` if several processes cannot train the recipe together."""
+
+    def less_memory(self, processes: int) -> str:
+        """Return what to change if the memory of `processes` does not suffice."""
+
+    def workplace(
+        self,
+        out: Path,
+        read: Sequence[Path | str | None],
+        *,
+        resume: bool,
+        force: bool,
+        note: Callable[[str], None],
+    ) -> AbstractContextManager[Path]:
+        """Context of the folder to write to; see `cpunet.jobs.training.train.train_run`."""
+
+    def train(
+        self, job: TrainingJob, *, resume: bool, tensorboard: bool, stop: Callable[[], bool]
+    ) -> Trained | None:
+        """Train or resume; return None in a process that leaves writing to another one."""
+
+
+def trainer_for(recipe: Recipe) -> Trainer:
+    """Return the method of a recipe."""
+    if isinstance(recipe.training, MatchingConfig):
+        return ResponseTrainer(recipe)
+    return CycleGanTrainer(recipe)

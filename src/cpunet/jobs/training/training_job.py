@@ -1,0 +1,113 @@
+"""A training: its recipe, its pulses, and where it happens."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from cpunet.jobs.common.devices import peak_memory_mb
+from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.matching import Sides
+from cpunet.recipes.schema import Recipe
+from cpunet.training.loop import Record
+from cpunet.training.run_folder import read_losses, versions
+from cpunet.training.team import Team
+from cpunet.training.tensorboard import LossBoard
+
+
+class Trained(NamedTuple):
+    """Result of a training.
+
+    Parameters
+    ----------
+    model
+        Module with ``ren`` and ``iren``.
+    info
+        Content of ``run.json``.
+    recipe
+        The recipe as it was trained: a chain may have turned out to ring.
+    """
+
+    model: nn.Module
+    info: dict[str, Any]
+    recipe: Recipe
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingJob:
+    """What is trained, on which pulses and where.
+
+    Parameters
+    ----------
+    recipe, peak, seed, device, init
+        See `cpunet.jobs.training.train.train_run`; the device is resolved.
+    team
+        Processes that train together.
+    sim, data, data_file
+        Prepared pulses of both sides, and the file of the measured ones.
+    folder
+        Folder to write to.
+    monitor
+        Receiver of the progress.
+    """
+
+    recipe: Recipe
+    peak: str
+    seed: int
+    device: str
+    team: Team
+    init: Path | None
+    sim: InputSet
+    data: InputSet
+    data_file: InputFile
+    folder: Path
+    monitor: Monitor
+
+    @property
+    def sides(self) -> Sides:
+        """Pulses of both sides."""
+        return Sides(
+            self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
+        )
+
+    def info(self, started: str, seconds: float) -> dict[str, Any]:
+        """Provenance of a run, for ``run.json``; `seconds` is the time that it took."""
+        return {
+            "recipe": self.recipe.name,
+            "peak": self.peak,
+            "seed": self.seed,
+            "init": None if self.init is None else str(self.init),
+            "device": self.device,
+            "processes": self.team.size,
+            "threads": torch.get_num_threads(),
+            "started": started,
+            "seconds": round(seconds, 1),
+            "peak_memory_mb": peak_memory_mb(self.device),
+            "dt_ns": self.data.dt_ns,
+            "versions": versions(),
+            "sim": self.sim.provenance(),
+            "data": self.data.provenance(),
+        }
+
+
+@contextmanager
+def losses_shown(folder: Path, *, wanted: bool) -> Iterator[Callable[[list[Record]], None]]:
+    """Yield a function that sends records to TensorBoard, if wanted, after those of the log."""
+    if not wanted:
+        yield lambda _records: None
+        return
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of iterations done again
+    board = LossBoard(folder)
+    try:
+        board.add(read_losses(folder))
+        yield board.add
+    finally:
+        board.close()
