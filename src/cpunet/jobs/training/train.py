@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,10 @@ from cpunet.networks.response import ElectronicsResponse
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.held_out import Kept
 from cpunet.training.judges import judges_noted
 from cpunet.training.loop import CheckpointHooks, Listener, Record, train
+from cpunet.training.network_gate import NetworkGate
 from cpunet.training.run_folder import (
     RUN,
     append_losses,
@@ -251,12 +253,18 @@ class TrainingJob:
                 show(records)
                 advance(len(records))
 
-            model = self._trained(begun, CheckpointHooks(run.save, start, stop), listen)
+            model, kept = self._trained(begun, CheckpointHooks(run.save, start, stop), listen)
         run.finish()
+        if kept is not None and not kept.kept:
+            self.monitor.note(
+                "the network does not help held-out pulses and is left out; the chain stays"
+            )
         for line in judges_noted(read_losses(self.folder)):
             self.monitor.note(f"warning: {line}")
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
         info = self._info(run.started, run.seconds) | resumed | begun.told
+        if kept is not None:
+            info["network"] = asdict(kept)
         return model, info, begun.recipe
 
     def help_train(self, stop: Callable[[], bool]) -> None:
@@ -275,19 +283,29 @@ class TrainingJob:
 
     def _trained(
         self, begun: NetworkStart, hooks: CheckpointHooks, listener: Listener | None
-    ) -> nn.Module:
-        return train(
-            self.sim.prepared.pulses.waveforms,
-            self.data.prepared.pulses.waveforms,
-            begun.recipe,
+    ) -> tuple[nn.Module, Kept | None]:
+        """Train; behind a chain, see whether that helps pulses that were held back."""
+        sim, data = self.sim.prepared.pulses, self.data.prepared.pulses
+        surroundings, recipe, gate = begun.surroundings, begun.recipe, None
+        windows = sim.waveforms, data.waveforms
+        if surroundings.chain is not None and recipe.cyclegan.training.held_out:
+            gate = NetworkGate(*windows, sim.energy_kev, recipe, self.seed)
+            windows = sim.waveforms[gate.own], data.waveforms[gate.own_data]
+            surroundings = surroundings.of_pulses(gate.own)
+        model = train(
+            *windows,
+            recipe,
             seed=self.seed,
             device=self.device,
             init=begun.fill,
-            surroundings=begun.surroundings,
+            surroundings=surroundings,
             listener=listener,
             hooks=hooks,
             team=self.team,
         )
+        if gate is None or surroundings.chain is None:
+            return model, None
+        return model, gate.judge(model, surroundings.chain)
 
     def _fingerprint(self) -> dict[str, Any]:
         """All that determines the weights."""
