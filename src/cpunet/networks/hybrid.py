@@ -9,8 +9,6 @@ added: where nothing moves, nothing is, so that baseline, top and tail stay the 
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
@@ -43,12 +41,11 @@ class EdgeResidual(RecordCorrection):
     Parameters
     ----------
     config
-        Its width, and over how many samples its times are smoothed.
+        Its width.
     """
 
     position: Tensor
     taper: Tensor
-    kernel: Tensor
     used: Tensor
 
     def __init__(self, config: ResidualConfig) -> None:
@@ -72,9 +69,6 @@ class EdgeResidual(RecordCorrection):
             nn.init.zeros_(self.outlet.bias)
         self.register_buffer("position", positional_map(width, steps, 0), persistent=False)
         self.register_buffer("taper", _taper(), persistent=False)
-        # neighbouring samples come from different channels, and nothing else makes them agree
-        self.smoothing = config.smoothing_samples
-        self.register_buffer("kernel", _gaussian(self.smoothing), persistent=False)
         # whether there is anything to add: a network of zeros is not run
         self.register_buffer("used", torch.zeros((), dtype=torch.bool))
 
@@ -125,12 +119,7 @@ class EdgeResidual(RecordCorrection):
         coarse = self.down(nn.functional.avg_pool1d(fine, 2))
         wide = nn.functional.interpolate(coarse, scale_factor=2, mode="nearest")
         out: Tensor = self.outlet(self.up(torch.cat([fine, wide], dim=1)))
-        times = out.transpose(1, 2).flatten(1)
-        if self.smoothing:
-            half = self.kernel.shape[2] // 2
-            times = nn.functional.pad(times[:, None], (half, half), mode="replicate")
-            times = nn.functional.conv1d(times, self.kernel)[:, 0]
-        return times * slope * self.taper
+        return out.transpose(1, 2).flatten(1) * slope * self.taper
 
 
 class HybridGenerator(ResponseGenerator):
@@ -169,13 +158,6 @@ def _folded(stretches: Tensor) -> Tensor:
     # not by the number of pulses, which would fix it in an exported graph
     folded: Tensor = stretches.unflatten(1, (-1, FOLD))  # type: ignore[no-untyped-call]
     return folded.transpose(1, 2)
-
-
-def _gaussian(width: float) -> Tensor:
-    """A kernel of unit sum and some standard deviation in samples, shape (1, 1, samples)."""
-    half = math.ceil(3 * width)
-    kernel = torch.exp(-0.5 * (torch.arange(-half, half + 1) / max(width, 1e-3)) ** 2)
-    return (kernel / kernel.sum())[None, None]
 
 
 def _taper() -> Tensor:

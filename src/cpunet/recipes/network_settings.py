@@ -48,17 +48,15 @@ FORMER_RESIDUAL = ("projections", "amplitude_weight", "size_weight", "slope_weig
 class ResidualConfig(Config):
     """A small network beside a matched response, see `cpunet.training.residual`.
 
-    ``width`` is that of its first layer; the times it tells are smoothed by a Gaussian of
-    ``smoothing_samples`` (standard deviation; 0 for not at all).  ``iterations`` of
-    ``batch_size`` pulses, with a ``rate`` that falls to zero and a ``weight_decay``; the kept
-    weights are a running average with ``average_decay`` per iteration.  ``roughness_weight``
-    weighs, against a chi-square per function, the mean square of the second differences of
-    what is added, in thousandths of a pulse's height.  A ``held_out`` part of both sets judges:
-    the chi-square of these must fall by the fraction ``least_fall``, and by more than chance.
+    ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
+    ``rate`` that falls to zero and a ``weight_decay``; the kept weights are a running average
+    with ``average_decay`` per iteration.  ``roughness_weight`` weighs, against a chi-square per
+    function, the mean square of the second differences of what is added, in thousandths of a
+    pulse's height.  A ``held_out`` part of both sets judges: the chi-square of these must fall
+    by the fraction ``least_fall``, and by more than chance.
     """
 
     width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
-    smoothing_samples: Annotated[float, Field(ge=0, le=20)] = 0.0
     iterations: Count
     batch_size: Annotated[int, Field(ge=16, le=100_000)]
     rate: Positive

@@ -114,8 +114,12 @@ class EdgeFunctions:
         stretches = (aligned @ self.segments - self.centres) / self.spreads
         shape = (aligned - self.middle) @ self.components
         slope = (self._slopes(aligned) - self.mean_slope) @ self.axes
-        clipped = (values.clamp(-clip, clip) for values in (stretches, shape, slope))
-        return Readings(*clipped, self._log_amplitudes(aligned))
+        return Readings(
+            stretches.clamp(-clip, clip),
+            shape.clamp(-clip, clip),
+            slope.clamp(-clip, clip),
+            self._log_amplitudes(aligned),
+        )
 
     def _functions(self, read: Readings) -> Tensor:
         wide = _density(read.log_amplitude, self.wide)
