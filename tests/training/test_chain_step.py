@@ -20,6 +20,7 @@ from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.loop import CheckpointHooks, train
+from cpunet.training.network_gate import NetworkGate
 from cpunet.training.outside import Outside
 from cpunet.training.pairs import learn_pairs
 from cpunet.training.run_folder import write_run
@@ -185,6 +186,36 @@ def test_nothing_is_added_where_the_pulse_does_not_move(surroundings):
     moves = torch.diff(record[0], prepend=torch.zeros(1)) != 0
     assert bool(change[moves].any())
     assert not bool(change[~moves].any())
+
+
+def moving(surroundings: Surroundings) -> CycleGan:
+    """Networks whose REN moves samples by a good part of the edge."""
+    torch.manual_seed(0)
+    model = CycleGan(RECIPE, surroundings).eval()
+    torch.nn.init.constant_(model.ren.outlet.bias, 0.0)
+    torch.nn.init.normal_(model.ren.outlet.weight, std=3.0)
+    return model
+
+
+@pytest.mark.parametrize("helps", [False, True])
+def test_a_network_stays_only_if_held_out_pulses_gain(helps, sim, data, surroundings):
+    model = moving(surroundings)
+    if helps:  # the data are what it makes
+        torch.manual_seed(5)
+        step = chain_step(model, surroundings)
+        with torch.no_grad():
+            records = step.records(torch.from_numpy(sim.waveforms))
+            rows = torch.arange(len(sim))
+            data = surroundings.outside.dress(records, rows).windows[:, 0].numpy()
+    recipe = RECIPE.model_copy(
+        update={"training": RECIPE.training.model_copy(update={"held_out": 0.4})}
+    )
+    gate = NetworkGate(sim.waveforms, data, sim.energy_kev, recipe, seed=0)
+    assert len(gate.own) == len(gate.own_data) == 0.6 * N
+    kept = gate.judge(model, surroundings.chain)
+    assert kept.kept == helps == bool(model.ren.outlet.weight.any())
+    assert (kept.held_out_after < kept.held_out_before) == helps
+    assert (kept.rms > 0) == helps
 
 
 @pytest.fixture(scope="module")

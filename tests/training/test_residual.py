@@ -16,8 +16,9 @@ from cpunet.networks.hybrid import EdgeResidual
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes import load_recipe
-from cpunet.training.residual import Kept, directions_of, fit_residual, quantiles
+from cpunet.recipes import load_recipe, recipe_from
+from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
+from cpunet.training.residual import Kept, fit_residual
 from cpunet.training.run_folder import write_run
 from cpunet.translation.translator import REN
 
@@ -30,9 +31,7 @@ RECIPE = load_recipe(
         "generator.residual.batch_size=200",
         "generator.residual.rate=0.01",
         "generator.residual.average_decay=0.9",
-        "generator.residual.size_weight=1",
-        "generator.residual.slope_weight=0",
-        "generator.residual.amplitude_weight=0.1",
+        "generator.residual.roughness_weight=1",
     ],
 )
 
@@ -132,16 +131,25 @@ def test_recipes_without_a_residual(chain):
         _ = load_recipe("fast").residual
 
 
-def test_quantiles_are_numpys():
-    values = np.random.default_rng(0).normal(size=(700, 3)).astype(np.float32)
-    found = quantiles(torch.from_numpy(values)).numpy()
-    at = (np.arange(len(found)) + 0.5) / len(found)
-    np.testing.assert_allclose(
-        found, np.quantile(values, at, axis=0, method="hazen"), atol=1e-5
+def test_same_physics_are_as_far_apart_as_chance(chain):
+    functions = EdgeFunctions(measured(chain, charge(N, 2)), RECIPE)
+    first, second = (functions.of_windows(measured(chain, charge(N, seed))) for seed in (2, 3))
+    wider = functions.of_windows(measured(chain, charge(N, 3, 1.3)))
+    misfit = EdgeMisfit(first, RECIPE.matching.training.ridge)
+    same, other = (
+        float(misfit(values.mean(dim=0), first.mean(dim=0), N / 2))
+        for values in (second, wider)
     )
+    assert 0.5 < same < 1.5
+    assert other > 3 * same
 
 
-def test_directions_mix_few_features():
-    directions = directions_of(300, 41, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(directions.norm(dim=0), torch.ones(300))
-    assert set((directions != 0).sum(dim=0).tolist()) == {1, 2, 3}
+def test_recipes_of_former_versions_are_read():
+    settings = RECIPE.model_dump(mode="json")
+    residual = settings["generator"]["residual"]
+    del residual["roughness_weight"], residual["weight_decay"]
+    residual |= {"projections": 64, "size_weight": 1000.0, "slope_weight": 30.0}
+    assert recipe_from(settings, "run").residual.width == RECIPE.residual.width
+    residual["projection"] = 3
+    with pytest.raises(CpunetError, match=r"generator\.residual\.projection"):
+        recipe_from(settings, "run")

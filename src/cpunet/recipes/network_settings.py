@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -42,29 +42,37 @@ class ResponseConfig(Config):
     ringing_ns: Positive
 
 
+FORMER_RESIDUAL = ("projections", "amplitude_weight", "size_weight", "slope_weight")
+
+
 class ResidualConfig(Config):
     """A small network beside a matched response, see `cpunet.training.residual`.
 
     ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
-    ``rate`` that falls to zero; the kept weights are a running average with
-    ``average_decay`` per iteration.  ``projections`` are the directions along which sets are
-    compared in an iteration, ``amplitude_weight`` weighs the density of the current
-    amplitude, ``size_weight`` the mean square of what is added, and ``slope_weight`` that of
-    its steps from sample to sample.  A ``held_out`` part of both sets judges: the distance of
-    these must fall by the fraction ``least_fall``, and by more than chance.
+    ``rate`` that falls to zero and a ``weight_decay``; the kept weights are a running average
+    with ``average_decay`` per iteration.  ``roughness_weight`` weighs, against a chi-square per
+    function, the mean square of the second differences of what is added, in thousandths of a
+    pulse's height.  A ``held_out`` part of both sets judges: the chi-square of these must fall
+    by the fraction ``least_fall``, and by more than chance.
     """
 
     width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
     iterations: Count
     batch_size: Annotated[int, Field(ge=16, le=100_000)]
     rate: Positive
+    weight_decay: NonNegative = 0.0
     average_decay: Fraction
-    projections: Annotated[int, Field(ge=1, le=10_000)]
-    amplitude_weight: NonNegative
-    size_weight: NonNegative
-    slope_weight: NonNegative
+    roughness_weight: NonNegative = 0.0
     held_out: Annotated[float, Field(gt=0, lt=1)]
     least_fall: Fraction
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_former(cls, settings: Any) -> Any:
+        """Runs of former versions have settings of a loss that is no more."""
+        if not isinstance(settings, dict):
+            return settings
+        return {key: value for key, value in settings.items() if key not in FORMER_RESIDUAL}
 
 
 class HybridConfig(ResponseConfig):

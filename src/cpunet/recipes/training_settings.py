@@ -57,6 +57,8 @@ class TrainingConfig(Config):
     ``precision`` is that of the generators' passes; ``compiled`` has torch.compile fuse them.
     With ``noise`` from ``baselines`` it is none of the generators' business: noise drawn from
     the data's own baselines is added to whatever a judge or a score sees.
+    Behind a chain, a ``held_out`` part of both sets says after the training whether REN's
+    network helps pulses that it has not seen; else it is left out (0: it stays in any case).
     """
 
     method: Literal["cyclegan"]
@@ -79,6 +81,7 @@ class TrainingConfig(Config):
     noise: Literal["none", "baselines"]
     pairs: PairsConfig
     losses: LossConfig
+    held_out: Annotated[float, Field(ge=0, le=0.5)] = 0.0
 
 
 class MatchingConfig(Config):

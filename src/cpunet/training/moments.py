@@ -229,6 +229,11 @@ class Moments:
         return np.array(errors)
 
     @property
+    def stretches(self) -> FloatArray:
+        """Means over stretches as a matrix, shape (samples, stretches)."""
+        return _segments(self.config, len(self.mean))
+
+    @property
     def slope(self) -> float:
         """Median slope per sample of the logarithm of the data's tails."""
         return float(self.centres[-1])

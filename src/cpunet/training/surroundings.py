@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.response_generator import ResponseGenerator
@@ -34,6 +37,13 @@ class Surroundings:
     outside: Outside | None = None
     chain: MatchedChain | None = None
     teacher: tuple[ResponseGenerator, Outside] | None = None
+
+    def of_pulses(self, rows: npt.NDArray[np.int64]) -> Surroundings:
+        """Those of some of the simulated pulses; a teacher has to go with all."""
+        if self.outside is None:
+            return self
+        outside = replace(self.outside, energy_kev=self.outside.energy_kev[rows])
+        return replace(self, outside=outside)
 
 
 NONE = Surroundings()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
 from cpunet.recipes.schema import Recipe
+from cpunet.training.held_out import Kept
 from cpunet.training.judges import judges_noted
 from cpunet.training.loop import CheckpointHooks, Listener, Record, train
+from cpunet.training.network_gate import NetworkGate
 from cpunet.training.run_folder import read_losses, weights_sha256
 from cpunet.training.team import Team
 from cpunet.training.team_state import require_same_everywhere, share_state
@@ -92,12 +95,18 @@ class CycleGanTrainer:
                 advance(len(records))
 
             hooks = CheckpointHooks(run.save, state, stop)
-            model = self._trained(job, start, hooks, listen)
+            model, kept = self._trained(job, start, hooks, listen)
         run.finish()
+        if kept is not None and not kept.kept:
+            job.monitor.note(
+                "the network does not help held-out pulses and is left out; the chain stays"
+            )
         for line in judges_noted(read_losses(job.folder)):
             job.monitor.note(f"warning: {line}")
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
         info = job.info(run.started, run.seconds) | resumed | start.told
+        if kept is not None:
+            info["network"] = asdict(kept)
         return Trained(model, info, start.recipe)
 
     def _start(self, job: TrainingJob) -> NetworkStart:
@@ -109,19 +118,29 @@ class CycleGanTrainer:
         start: NetworkStart,
         hooks: CheckpointHooks,
         listener: Listener | None,
-    ) -> nn.Module:
-        return train(
-            job.sim.prepared.pulses.waveforms,
-            job.data.prepared.pulses.waveforms,
-            start.recipe,
+    ) -> tuple[nn.Module, Kept | None]:
+        """Train; behind a chain, see whether that helps pulses that were held back."""
+        sim, data = job.sim.prepared.pulses, job.data.prepared.pulses
+        surroundings, recipe, gate = start.surroundings, start.recipe, None
+        windows = sim.waveforms, data.waveforms
+        if surroundings.chain is not None and recipe.cyclegan.training.held_out:
+            gate = NetworkGate(*windows, sim.energy_kev, recipe, job.seed)
+            windows = sim.waveforms[gate.own], data.waveforms[gate.own_data]
+            surroundings = surroundings.of_pulses(gate.own)
+        model = train(
+            *windows,
+            recipe,
             seed=job.seed,
             device=job.device,
             init=start.fill,
-            surroundings=start.surroundings,
+            surroundings=surroundings,
             listener=listener,
             hooks=hooks,
             team=job.team,
         )
+        if gate is None or surroundings.chain is None:
+            return model, None
+        return model, gate.judge(model, surroundings.chain)
 
 
 def _fingerprint(job: TrainingJob) -> dict[str, Any]:

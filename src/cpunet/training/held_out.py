@@ -1,0 +1,111 @@
+"""Whether a network beside a chain helps pulses that it was not trained on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from cpunet.networks.hybrid import RecordCorrection
+from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
+
+RESAMPLED = 60  # times, to tell a fall of chi-square from chance
+SURE = 2.5  # of its standard deviations
+
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What became of a correction.
+
+    Parameters
+    ----------
+    kept
+        Whether it is used.
+    rms
+        Of what it adds to the stretch about the half maximum, in pulse heights; 0 if unused.
+    held_out_before, held_out_after
+        Chi-square per function of the held-out sets without and with it.
+    """
+
+    kept: bool
+    rms: float
+    held_out_before: float
+    held_out_after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Functions of measured pulses, and what translations are compared with them by.
+
+    Parameters
+    ----------
+    functions, misfit
+        Drawn up from measured pulses.
+    measured
+        Functions of those that are compared, shape (pulses, functions).
+    """
+
+    functions: EdgeFunctions
+    misfit: EdgeMisfit
+    measured: Tensor
+
+    def chi_square(self, made: Tensor) -> Tensor:
+        """Per function, of those of translated pulses."""
+        return self._of(made, self.measured)
+
+    def resampled(self, made: list[Tensor], rng: np.random.Generator) -> list[float]:
+        """The same of several translations of one set, with pulses drawn with replacement."""
+        n, m = len(made[0]), len(self.measured)
+        rows, others = (torch.from_numpy(rng.integers(0, size, size)) for size in (n, m))
+        return [float(self._of(values[rows], self.measured[others])) for values in made]
+
+    def _of(self, made: Tensor, measured: Tensor) -> Tensor:
+        pairs = 1 / (1 / max(len(made), 1) + 1 / len(measured))
+        return self.misfit(made.mean(dim=0), measured.mean(dim=0), pairs)
+
+
+def split_rows(n: int, share: float, rng: np.random.Generator) -> tuple[Rows, Rows]:
+    """Rows to train on, and rows held out."""
+    order = rng.permutation(n)
+    held = max(1, round(share * n))
+    return np.sort(order[held:]), np.sort(order[:held])
+
+
+@torch.no_grad()
+def judge(
+    network: RecordCorrection,
+    held_out: Aim,
+    records: Tensor,
+    noise: Tensor,
+    least_fall: float,
+    rng: np.random.Generator,
+) -> Kept:
+    """Compare held-out sets with and without a correction, chance allowed for.
+
+    Parameters
+    ----------
+    network
+        The correction, as it would be used.
+    held_out
+        Measured pulses that it has not seen.
+    records, noise
+        Of simulated pulses that it has not seen, each (pulses, samples).
+    least_fall
+        Fraction by which chi-square must fall, and by more than `SURE` standard deviations.
+    rng
+        Of the pulses drawn with replacement.
+    """
+    corrected, added = network.corrected(records)
+    made = [held_out.functions.of_records(of_one + noise) for of_one in (records, corrected)]
+    before, after = (float(held_out.chi_square(values)) for values in made)
+    kept = len(made[0]) == len(made[1]) and after < (1 - least_fall) * before
+    if kept:
+        falls = [a - b for a, b in (held_out.resampled(made, rng) for _ in range(RESAMPLED))]
+        kept = before - after > SURE * float(np.std(falls, ddof=1))
+    rms = float(added.square().mean().sqrt()) if kept else 0.0
+    return Kept(kept, rms, before, after)
