@@ -46,6 +46,10 @@ Remains = Annotated[
         "--remains", help="Remains of earlier pulses: learned, none, or a rate in kHz."
     ),
 ]
+PileUpKhz = Annotated[
+    float,
+    typer.Option("--pile-up-khz", min=0, help="Pulses per ms within a trace besides its own."),
+]
 Realisations = Annotated[
     int | None,
     typer.Option(
@@ -118,6 +122,7 @@ def translate(
     inverse: Inverse = False,
     noise: Noise = True,
     remains: Remains = "none",
+    pile_up_khz: PileUpKhz = 0.0,
     seed: options.Seed = 0,
     realisations: Realisations = None,
     table: Table = None,
@@ -153,7 +158,15 @@ def translate(
     place = Path(out_name)
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
         form = TranslateOptions(
-            inverse, noise, seed, out_table, append_column, realisations, adc, remains
+            inverse,
+            noise,
+            seed,
+            out_table,
+            append_column,
+            realisations,
+            adc,
+            remains,
+            pile_up_khz,
         )
         told = translate_files(
             run,
@@ -179,6 +192,7 @@ def translate(
             realisations=realisations,
             adc=adc,
             remains=remains,
+            pile_up_khz=pile_up_khz,
             device=device,
             resume=resume,
             force=force,

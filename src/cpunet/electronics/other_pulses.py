@@ -11,6 +11,7 @@ from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import LIFETIMES, earlier_pulses
 from cpunet.electronics.response import linear_response
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.pulses.container import Pulses
 
 
@@ -83,19 +84,18 @@ def _add_second(
     pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Add second pulses anywhere in the record, with shapes of randomly chosen pulses."""
-    n, dt_ns = len(pulses), electronics.dt_ns
-    length_us = 1e-3 * electronics.length * dt_ns
-    row, kev, time_us = earlier_pulses(
-        n, electronics.pile_up.rate_kHz, length_us, electronics.other_pulses_kev, rng
+    dt_ns = electronics.dt_ns
+    second = SecondPulses.draw(
+        len(pulses),
+        electronics.pile_up.rate_kHz,
+        electronics.other_pulses_kev,
+        electronics.n_pre * dt_ns,
+        electronics.length * dt_ns,
+        rng,
     )
-    after_ns = 1e3 * time_us - electronics.n_pre * dt_ns
-    which = rng.integers(max(n, 1), size=len(row))
-    shapes = linear_response(pulses[which], electronics, after_ns)
-    np.add.at(added_kev, row, kev[:, np.newaxis] * shapes)
-    piled_kev, piled_ns = np.full(n, np.nan), np.full(n, np.nan)
-    order = np.argsort(kev, kind="stable")  # the largest is written last
-    piled_kev[row[order]], piled_ns[row[order]] = kev[order], after_ns[order]
-    return np.bincount(row, minlength=n), piled_kev, piled_ns
+    shapes = linear_response(pulses[second.partner], electronics, second.after_ns)
+    np.add.at(added_kev, second.row, second.kev[:, np.newaxis] * shapes)
+    return second.largest()
 
 
 def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
