@@ -213,6 +213,7 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
     told = fit["remains"]
+    assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
     assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
     assert any(note.startswith("remains of earlier pulses: ") for note in monitor.notes)
     ren = REN.load(tmp_path / "run")

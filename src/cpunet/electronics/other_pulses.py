@@ -1,4 +1,4 @@
-"""Disturbances of a trace: tails of earlier pulses, second pulses and mains hum."""
+"""Disturbances of a trace: other pulses, mains hum and wandering baselines."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, Wander
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import LIFETIMES, earlier_pulses
 from cpunet.electronics.response import linear_response
@@ -60,6 +61,11 @@ def draw_other_pulses(
     n_piled, piled_kev, piled_ns = _add_second(pulses, electronics, added_kev, second)
     if electronics.hum is not None:
         added_kev += _hum(len(pulses), electronics, slow)
+    if electronics.wander is not None:
+        wander, dt_ns = electronics.wander, electronics.dt_ns
+        # of its own generator: the others stay as they are without it
+        (drift,) = rng.spawn(1)
+        added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
     return OtherPulses(added_kev, remains_kev, n_piled, piled_kev, piled_ns)
 
 
@@ -105,3 +111,13 @@ def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArr
     turns = np.arange(electronics.length) * electronics.dt_ns * 1e-9
     wave = np.sin(2 * np.pi * electronics.hum.frequency_Hz * turns + phase)
     return np.asarray(electronics.hum.amplitude_kev * wave, float)
+
+
+def _wander(
+    n: int, length: int, dt_ns: float, wander: Wander, rng: np.random.Generator
+) -> FloatArray:
+    """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
+    kept = np.exp(-1e-3 * dt_ns / wander.time_us)
+    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(2 * np.log(kept))), (n, length))
+    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # as likely at any time
+    return np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=1), float)

@@ -16,6 +16,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 BLOCK = 4096  # traces per block
+LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is kept
 MAX_BLOCKS = 16  # blocks searched for traces that passed the cuts
 
 
@@ -83,4 +84,12 @@ def told_of(
     """Entry of ``run.json`` on remains; `drawn` can exist even if no remains are certain."""
     if remains is None or drawn is None:
         return {"missing": reason}
-    return remains.describe() | {"drawn": drawn.describe()}
+    return remains.describe() | {"sizes": _sizes(remains), "drawn": drawn.describe()}
+
+
+def _sizes(remains: Remains) -> dict[str, list[float]]:
+    """Percentages of the traces above sizes in keV, for a figure."""
+    kev = np.geomspace(max(remains.error_kev, 0.01), LARGEST_KEV, SIZES)
+    told = np.sort(remains.kev[np.isfinite(remains.kev)])
+    above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
+    return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}
