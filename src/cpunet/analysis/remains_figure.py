@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.style import COLOURS, DATA_FILL, styled
-from cpunet.electronics.remains import Remains, read_baselines
+from cpunet.electronics.baseline_tails import read_baselines
+from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.pulses.container import FloatArray, Pulses
 

@@ -132,7 +132,11 @@ class SecondPulses:
         return int(np.ceil(-min(earliest, 0.0) / dt_ns)) + 1
 
     def added(
-        self, shapes: FloatArray, energy_kev: FloatArray, dt_ns: float, length: int
+        self,
+        shapes: npt.NDArray[np.floating],
+        energy_kev: FloatArray,
+        dt_ns: float,
+        length: int,
     ) -> FloatArray:
         """Sum of the second pulses at each sample, relative to the trace's own pulse.
 

@@ -9,7 +9,8 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from cpunet.electronics.extension import with_room
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
 from cpunet.electronics.finishing import finish_with_codes
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
@@ -25,6 +26,10 @@ from cpunet.recipes.schema import PreparationConfig
 
 Energies = npt.NDArray[np.float64]
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+
+NO_OTHERS = (
+    "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
+)
 
 
 class Backend(ABC):
@@ -102,13 +107,19 @@ class NoisyNetworkBackend(NetworkBackend):
         Of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
+    remains
+        Distribution of the remains of earlier pulses under the data, if known.
     """
 
     def __init__(
-        self, network: PositionalUNet, noise: KeptNoise, config: PreparationConfig
+        self,
+        network: PositionalUNet,
+        noise: KeptNoise,
+        config: PreparationConfig,
+        remains: DrawnRemains | None = None,
     ) -> None:
         super().__init__(network)
-        self.noise, self.config = noise, config
+        self.noise, self.config, self.remains = noise, config, remains
 
     def __call__(
         self,
@@ -128,19 +139,31 @@ class NoisyNetworkBackend(NetworkBackend):
         """
         if noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
-        clean, codes = super().__call__(windows, None, noise, generator, remains_kev, second)
-        if not noise:
+        if not noise and (remains_kev is not None or second is not None):
+            raise CpunetError(NO_OTHERS)
+        clean, codes = super().__call__(windows, None, noise, generator)
+        if energy_kev is None or not noise:
             return clean, codes
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
         dt_ns = self.noise.noise_dt_ns
+        records = with_room(clean, self.config, dt_ns)
+        added = None
+        if remains_kev is not None or second is not None:
+            added = _left(self.remains, records, energy_kev, remains_kev)
+        if second is not None and added is not None:
+            length = records.shape[1] + second.reach(dt_ns)
+            before = PADDING_BEFORE + self.config.samples_before
+            shapes = extended(clean[second.partner], self.config, dt_ns, length, before)
+            added += second.added(shapes, energy_kev, dt_ns, records.shape[1])
         return finish_with_codes(
-            with_room(clean, self.config, dt_ns),
+            records,
             self.config,
             dt_ns=dt_ns,
             noise=self.noise.noise,
             energy_kev=energy_kev,
             seed=int(seed),
+            added=added,
         )
 
 
@@ -176,11 +199,8 @@ class ResponseBackend(Backend):
         added = None
         if remains_kev is not None or second is not None:
             if energy_kev is None or not noise:
-                raise CpunetError(
-                    "other pulses are drawn with the noise, by energies; leave out remains_kev "
-                    "and second"
-                )
-            added = self._added(records, energy_kev, remains_kev)
+                raise CpunetError(NO_OTHERS)
+            added = _left(self.chain.remains, records, energy_kev, remains_kev)
             if second is not None and len(second.row):
                 added += self._second(windows, energy_kev, second, records.shape[1])
         return finish_with_codes(
@@ -192,20 +212,6 @@ class ResponseBackend(Backend):
             seed=int(seed),
             added=added,
         )
-
-    def _added(
-        self, records: FloatArray, energy_kev: Energies, remains_kev: Energies | None
-    ) -> npt.NDArray[np.float64]:
-        """Remains of earlier pulses at each sample of the records, in prepared units."""
-        if remains_kev is None:
-            return np.zeros(records.shape)
-        remains = self.chain.remains
-        if remains is None:
-            raise CpunetError(
-                "the run does not tell of remains of earlier pulses; leave out remains_kev"
-            )
-        left = remains_kev * remains.height / energy_kev
-        return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))
 
     def _second(
         self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
@@ -251,3 +257,20 @@ class InverseBackend(Backend):
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms
         return result, prepared.codes
+
+
+def _left(
+    remains: DrawnRemains | None,
+    records: FloatArray,
+    energy_kev: Energies,
+    remains_kev: Energies | None,
+) -> npt.NDArray[np.float64]:
+    """Remains of earlier pulses at each sample of the records, in prepared units."""
+    if remains_kev is None:
+        return np.zeros(records.shape)
+    if remains is None:
+        raise CpunetError(
+            "the run does not tell of remains of earlier pulses; leave out remains_kev"
+        )
+    left = remains_kev * remains.height / energy_kev
+    return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))

@@ -160,6 +160,11 @@ class AdcForm:
     ) -> None:
         self.ren, self.scale, self.remains, self.pile_up = ren, scale, remains, pile_up
         self.config = ren.recipe.preparation
+        if pile_up is not None and not isinstance(ren.backend, ResponseBackend):
+            raise CpunetError(
+                "a network knows no shapes beyond its windows, so it gives no raw traces with "
+                "second pulses; leave out --pile-up-khz, or --output adc"
+            )
         self.length = self.config.length if length is None else length
         self.n_pre = self.config.samples_before if n_pre is None else n_pre
         if not 0 <= self.n_pre < self.length:

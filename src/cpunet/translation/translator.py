@@ -121,7 +121,8 @@ class Translator:
                 return NetworkBackend(network)
             noise = KeptNoise(dt_ns)
             load_network(run, NOISE, noise, device)
-            return NoisyNetworkBackend(network, noise, recipe.preparation)
+            remains = remains_of(read_info(run))
+            return NoisyNetworkBackend(network, noise, recipe.preparation, remains)
         if cls.part == REN.part:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
@@ -265,6 +266,8 @@ class Translator:
     def remains(self) -> DrawnRemains | None:
         """Remains of earlier pulses as learned by the run; None if it has no information."""
         backend = self.backend
+        if isinstance(backend, NoisyNetworkBackend):
+            return backend.remains
         return backend.chain.remains if isinstance(backend, ResponseBackend) else None
 
     @property
