@@ -54,12 +54,13 @@ def test_the_folder_is_read_and_prepared(made: Path):
 
 
 def test_rates_are_options_and_are_told(command, tmp_path: Path):
-    rates = ("--rate-khz", 0, "--pile-up-khz", 40, "--hum", "50=2")
+    rates = ("--rate-khz", 0, "--pile-up-khz", 40, "--hum", "50=2", "--wander", "500=3")
     words = ("stand", "--preset", "ornl", "--events", "DEP=40", *rates)
     assert command(*words, "--out", tmp_path / "stand").code == 0
     electronics = json.loads((tmp_path / "stand" / "stand.json").read_text())["electronics"]
     assert electronics["earlier_pulses"] == {"rate_kHz": 0}
     assert electronics["hum"] == {"frequency_Hz": 50, "amplitude_kev": 2}
+    assert electronics["wander"] == {"time_us": 500, "rms_kev": 3}
     with np.load(tmp_path / "stand" / "data_labels.npz") as known:
         assert (known["remains_kev"] == 0).all()
         assert 0.3 < (known["flag"] & 2 > 0).mean() < 0.9
@@ -94,6 +95,7 @@ def test_it_is_replaced_with_force_only(command, made: Path):
     [
         (("--preset", "ornl", "--events", "FEP=0"), "FEP=0: give at least 1 event"),
         (("--preset", "ornl", "--hum", "50"), "--hum 50: expected HZ=KEV"),
+        (("--preset", "ornl", "--wander", "500=x"), "--wander 500=x: expected US=KEV"),
         (("--preset", "ornl", "--events", "FEP"), "expected FEP=N"),
         (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
         (("--preset", "orln"), "legend200, ornl, ringing"),

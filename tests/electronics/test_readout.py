@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum
+from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum, Wander
 from cpunet.electronics.noise import coloured_noise, cut_noise, noise_power, read_baselines
 from cpunet.electronics.other_pulses import draw_other_pulses
 from cpunet.electronics.presets import read_electronics
@@ -144,6 +144,23 @@ def test_hum_is_a_wave_of_its_size():
     traces = read_out(steps, chain, seed=2)
     level = traces.waveforms[:, :400].mean(axis=1) - traces.baseline_adc
     assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
+
+
+def test_wandering_is_recovered_from_levels_and_their_changes():
+    quiet = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 0)
+    chain = quiet.disturbed(wander=Wander(time_us=200, rms_kev=20))
+    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
+    traces = read_out(steps, chain, seed=2)
+    level = (traces.waveforms - traces.baseline_adc[:, None]) / chain.gain_adc_per_kev
+    first, later = level[:, 0], level[:, 450]
+    assert first.std() == pytest.approx(20, rel=0.1)
+    # 2 sigma^2 (1 - exp(-t / T)) after 7.2 us
+    change = 20 * np.sqrt(2 * -np.expm1(-7.2 / 200))
+    assert (later - first).std() == pytest.approx(change, rel=0.12)
+    # all else is drawn as without it
+    plain = read_out(steps, quiet, seed=2)
+    assert np.array_equal(plain.energy_kev, traces.energy_kev)
+    assert np.array_equal(plain.response, traces.response)
 
 
 def test_quantiles_of_energies_that_fall_are_refused():

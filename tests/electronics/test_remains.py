@@ -128,6 +128,12 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.remains_kev > 100)
     ratio = np.median(found.kev[large] / busy.remains_kev[large])
     assert ratio == pytest.approx(1, abs=0.1)
+    # noise is measured where slopes are negative: it has all its power, and few remains
+    empty = found.empty(blocks[0])
+    assert (busy.remains_kev[empty] > found.error_kev).mean() < 0.05
+    told = np.isfinite(found.kev) & (busy.remains_kev < 0.2 * found.error_kev)
+    square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
+    assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
 
 
 def test_traces_that_all_lie_on_remains_are_told():

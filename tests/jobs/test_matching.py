@@ -15,11 +15,14 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
+from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.training.matching import Sides
+from cpunet.jobs.training.network_start import network_start
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
@@ -213,6 +216,7 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
     told = fit["remains"]
+    assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
     assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
     assert any(note.startswith("remains of earlier pulses: ") for note in monitor.notes)
     ren = REN.load(tmp_path / "run")
@@ -221,6 +225,18 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     # without remains the noise is that of empty baselines
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
+    # networks with noise outside are prepared alike
+    paper = load_recipe("paper-noise", ["generator.width=2"])
+    chosen = parse_selection("FEP", paper.peaks)
+    sim = load_simulated(files.sim, paper, chosen, monitor).prepared.pulses
+    measured = load_measured(data, paper, chosen, monitor)
+    sides = Sides(sim, measured.prepared.pulses, data, measured)
+    start = network_start(sides, paper, 0, None, monitor)
+    outside = start.surroundings.outside
+    assert outside is not None
+    assert outside.noise.remains is not None
+    assert outside.noise.remains.law.rate_khz == told["rate_khz"]
+    assert start.told["fit"]["remains"]["rate_khz"] == told["rate_khz"]
 
 
 def test_data_without_remains_are_given_none(run: Run) -> None:

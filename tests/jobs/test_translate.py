@@ -40,6 +40,7 @@ from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
+from cpunet.translation.ensemble import EnsembleREN
 from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
 
@@ -568,9 +569,57 @@ def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
     assert begin == pytest.approx(wanted * np.exp(-2.4 / 50), abs=25)
 
 
+def piled(out):
+    return [
+        lh5.read(f"geds/ren/{name}", out).nda for name in ("n_piled", "piled_kev", "piled_ns")
+    ]
+
+
+def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    options = {"adc": ADC, "seed": 3, "device": "cpu", "realisations": 5}
+    translate_file(busy, source, tmp_path / "none.lh5", **options)
+    translate_file(busy, source, tmp_path / "some.lh5", pile_up_khz=20, **options)
+    with h5py.File(tmp_path / "none.lh5") as file:
+        assert "n_piled" not in file["geds/ren"]
+    count, kev, after_ns = piled(tmp_path / "some.lh5")
+    assert 0 < (count > 0).sum() < 5 * N
+    assert np.array_equal(np.isnan(kev), count == 0)
+    clean, more = (values(tmp_path / f"{name}.lh5").astype(float) for name in ("none", "some"))
+    # away from the pulse, the trace rises by the second pulse's energy where it is said
+    single = (count == 1) & (np.abs(after_ns) > 1500) & (np.abs(after_ns) < 7000)
+    assert single.sum() >= 3
+    for row in np.flatnonzero(single):
+        added = more[row] - clean[row]
+        at = ADC.n_pre + int(after_ns[row] / DT_NS)
+        assert added[at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
+        wanted = kev[row] * 0.9 * 26145.11 / 2614.511
+        assert added[at + 5 : at + 15].mean() == pytest.approx(wanted, rel=0.1, abs=40)
+
+
+def test_second_pulses_are_within_windows(busy, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    out, options = tmp_path / "some.lh5", {"seed": 3, "device": "cpu", "realisations": 10}
+    translate_file(busy, source, out, pile_up_khz=20, **options)
+    count, kev, after_ns = piled(out)
+    assert len(count) == 10 * N
+    # 20 kHz for a record of 1,400 samples of 16 ns
+    assert count.mean() == pytest.approx(0.448, abs=0.1)
+    # baselines are flat but behind a second pulse, or on its edge
+    tilt = np.abs(values(out)[:, :50].mean(axis=1) - values(out)[:, 100:150].mean(axis=1))
+    assert tilt[count == 0].max() < 0.03
+    inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
+    assert inside.sum() >= 3
+    assert (values(out)[inside].max(axis=1) > 0.05).all()
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        ({"pile_up_khz": -1.0}, "expected a rate in kHz, 0 or more"),
+        ({"pile_up_khz": 1e6}, "give a lower rate"),
+        ({"pile_up_khz": 1.0, "noise": False}, "leave out --no-noise"),
+        ({"pile_up_khz": 1.0, "inverse": True}, "leave out --pile-up-khz"),
         ({"remains": "many"}, "--remains many: expected learned, none, or a rate in kHz"),
         ({"remains": "-1"}, "expected learned, none, or a rate"),
         ({"remains": "learned", "noise": False}, "leave out --no-noise"),
@@ -583,11 +632,24 @@ def test_remains_that_cannot_be(busy, tmp_path, options, said):
         translate_file(busy, source, tmp_path / "out.lh5", device="cpu", **options)
 
 
+def test_an_ensemble_has_the_remains_of_its_members(busy):
+    ensemble = EnsembleREN([REN.load(busy), REN.load(busy)])
+    assert ensemble.remains is not None
+    options = {"energy_kev": 2000.0, "seed": 1}
+    none = ensemble.translate(charge(20), **options)
+    left = ensemble.translate(charge(20), remains_kev=100.0, **options)
+    # a baseline on 100 keV falls from 4.5 % of the height to 0.9 of that in 200 samples
+    fall = (left - none)[:, :20].mean(axis=1) - (left - none)[:, 180:200].mean(axis=1)
+    assert fall.mean() == pytest.approx(0.9 * 0.05 * (1 - np.exp(-2.9 / 50)), rel=0.5)
+
+
 def test_runs_that_tell_of_no_remains(run, network, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of remains"):
             translate_file(folder, source, tmp_path / "o.lh5", remains="1", device="cpu")
+        with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
+            translate_file(folder, source, tmp_path / "o.lh5", pile_up_khz=1, device="cpu")
 
 
 def test_adc_needs_to_be_known(network, tmp_path):

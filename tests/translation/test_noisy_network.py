@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
+from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.pulses.container import FloatArray, Pulses
@@ -36,7 +38,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model.ren.skip.set(torch.from_numpy(decay).float(), 0)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": "paper-noise", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
-    write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
+    drawn = DrawnRemains(RemainsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
+    fit = {"remains": {"rate_khz": 2.0, "drawn": drawn.describe()}}
+    write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu", "fit": fit})
     return folder
 
 
@@ -67,6 +71,29 @@ def test_noise_is_of_the_seed_and_may_be_left_out(run, sim):
     clean = ren.translate(sim, noise=False)
     assert not clean[:, :200].any()
     assert np.array_equal(clean, ren.translate(sim, noise=False))
+
+
+def test_other_pulses_are_added_with_the_noise(run, sim):
+    ren = REN.load(run)
+    assert ren.remains is not None
+    energies = {"energy_kev": np.full(len(sim), 2000.0)}
+    plain = ren.apply(sim, generator=ren.seeded(1), **energies)
+    left = np.full(len(sim), 500.0)
+    lifted = ren.apply(sim, generator=ren.seeded(1), remains_kev=left, **energies)
+    fall = (lifted - plain)[:, :20].mean() - (lifted - plain)[:, 180:200].mean()
+    # 500 keV begin 200 samples before the window and fall within it
+    wanted = 0.25 * np.exp(-210 * 0.016 / 50) * -np.expm1(-180 * 0.016 / 50)
+    assert fall == pytest.approx(wanted, rel=0.2)
+    second = SecondPulses(
+        len(sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
+    )
+    result, _ = ren.apply_with_codes(sim, generator=ren.seeded(1), second=second, **energies)
+    step = result[4] - plain[4]
+    # 0.2 of the height of 1, less by the scale: the tail is higher too
+    assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
+    assert np.array_equal(result[5], plain[5])
+    with pytest.raises(CpunetError, match="drawn with the noise"):
+        ren.apply(sim, noise=False, remains_kev=left, **energies)
 
 
 def test_pulses_without_an_energy_get_no_noise_and_a_code(run, sim):

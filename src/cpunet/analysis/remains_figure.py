@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.style import COLOURS, DATA_FILL, styled
-from cpunet.electronics.remains import Remains, read_baselines
+from cpunet.electronics.baseline_tails import read_baselines
+from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.pulses.container import FloatArray, Pulses
 
@@ -81,6 +84,45 @@ def remains_figure(raw: Pulses, remains: Remains) -> Figure:
     _sizes(sizes, kev[np.isfinite(kev)], remains.fit.law, remains.error_kev)
     _slopes(slopes, Slopes.of(raw, remains))
     _traces(traces, raw, remains, kev)
+    return figure
+
+
+@styled
+def sizes_figure(
+    told: Mapping[str, Any], sizes: Mapping[str, Sequence[float]], energies_kev: Sequence[float]
+) -> Figure:
+    """Distribution of the remains with the law, as a training keeps them.
+
+    Parameters
+    ----------
+    told
+        Result of `Remains.describe`.
+    sizes
+        ``kev``: sizes in keV; ``percent_above``: percentages of the traces above each.
+    energies_kev
+        Quantiles of the energies of earlier pulses in keV.
+    """
+    figure = Figure(figsize=(5.2, 3.4))
+    axes = figure.subplots()
+    kev = np.asarray(sizes["kev"], float)
+    # one-sided: a fraction of n traces is known to its binomial error
+    share, n = np.asarray(sizes["percent_above"], float) / 100, max(int(told["traces"]), 1)
+    error = np.sqrt(share * (1 - share) / n)
+    axes.fill_between(
+        kev, 100 * (share - error), 100 * (share + error), color=COLOURS["data"], alpha=0.3
+    )
+    axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
+    law = RemainsLaw(float(told["rate_khz"]), float(told["decay_us"]), tuple(energies_kev))
+    axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
+    axes.axvline(2 * float(told["error_kev"]), color="0.6", lw=0.8, ls=":")
+    axes.set_ylim(max(30 / n, 0.01), 100)
+    axes.set_xlabel("remainder at the first sample (keV)")
+    axes.set_ylabel("traces above (%)")
+    axes.set_title(
+        f"{told['rate_khz']:.2f} ± {told['rate_error_khz']:.2f} kHz, "
+        f"decay {told['decay_us']:.1f} µs; dotted: twice the error of a size"
+    )
+    axes.legend()
     return figure
 
 

@@ -172,6 +172,7 @@ def translate(
     seed: int = 0,
     adc: Adc | bool = False,
     remains: str = NONE,
+    pile_up_khz: float = 0.0,
     realisations: int | None = None,
     device: str = "auto",
     resume: bool = False,
@@ -196,6 +197,8 @@ def translate(
         Raw traces in ADC counts, as a digitiser writes them: True, or `Adc` with its settings.
     remains
         Of earlier pulses: ``"learned"``, ``"none"``, or a rate in kHz.
+    pile_up_khz
+        Rate in kHz of second pulses within a trace.
     realisations
         Draw the noise so many times for each pulse.
     device
@@ -219,7 +222,13 @@ def translate(
     """
     wanted = (Adc() if adc else None) if isinstance(adc, bool) else adc
     options = TranslateOptions(
-        inverse, noise, seed, realisations=realisations, adc=wanted, remains=remains
+        inverse,
+        noise,
+        seed,
+        realisations=realisations,
+        adc=wanted,
+        remains=remains,
+        pile_up_khz=pile_up_khz,
     )
     monitor = shown(progress)
     job = FileTranslation(folder_of(run), options, device)

@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
-    from cpunet.electronics.chain import Hum
+    from cpunet.electronics.chain import Hum, Wander
     from cpunet.jobs.simulation.stand import StandSummary
 
 
@@ -73,6 +73,10 @@ PileUpKhz = Annotated[
 HumOption = Annotated[
     str | None, typer.Option("--hum", help="Wave of the mains: HZ=KEV, such as 50=2.")
 ]
+WanderOption = Annotated[
+    str | None,
+    typer.Option("--wander", help="Slow wandering of the baseline: US=KEV, such as 500=3."),
+]
 WindowKev = Annotated[
     float,
     typer.Option(help="Half-width about a peak.", callback=options.within(-1e4, 1e4)),
@@ -92,6 +96,7 @@ def stand(
     rate_khz: RateKhz = None,
     pile_up_khz: PileUpKhz = None,
     hum: HumOption = None,
+    wander: WanderOption = None,
     window_kev: WindowKev = 0.5,
     seed: options.Seed = 0,
     force: options.Force = False,
@@ -115,7 +120,9 @@ def stand(
     refuse_inputs(out_folder, preset, detector)
     names, numbers = wanted_events(events)
     overrides, values = split_overrides(set_values or ())
-    electronics = read_electronics(preset).disturbed(rate_khz, pile_up_khz, wanted_hum(hum))
+    electronics = read_electronics(preset).disturbed(
+        rate_khz, pile_up_khz, wanted_hum(hum), wanted_wander(wander)
+    )
     summary = make_stand(
         electronics,
         read_detector(detector, overrides, crystal),
@@ -156,6 +163,19 @@ def wanted_hum(hum: str | None) -> Hum | None:
         return Hum(frequency_Hz=frequency, amplitude_kev=amplitude)
     except ValueError as error:
         raise CpunetError(f"--hum {hum}: expected HZ=KEV, such as 50=2") from error
+
+
+def wanted_wander(wander: str | None) -> Wander | None:
+    """The wandering of ``"500=3"``: 3 keV RMS, correlated over 500 us."""
+    from cpunet.electronics.chain import Wander
+
+    if wander is None:
+        return None
+    try:
+        time, rms = map(float, wander.split("="))
+        return Wander(time_us=time, rms_kev=rms)
+    except ValueError as error:
+        raise CpunetError(f"--wander {wander}: expected US=KEV, such as 500=3") from error
 
 
 def _lines(summary: StandSummary) -> list[str]:

@@ -47,6 +47,10 @@ Remains = Annotated[
         "--remains", help="Remains of earlier pulses: learned, none, or a rate in kHz."
     ),
 ]
+PileUpKhz = Annotated[
+    float,
+    typer.Option("--pile-up-khz", min=0, help="Pulses per ms within a trace besides its own."),
+]
 Realisations = Annotated[
     int | None,
     typer.Option(
@@ -121,6 +125,7 @@ def translate(
     inverse: Inverse = False,
     noise: Noise = True,
     remains: Remains = "none",
+    pile_up_khz: PileUpKhz = 0.0,
     seed: options.Seed = 0,
     realisations: Realisations = None,
     table: Table = None,
@@ -182,7 +187,15 @@ def translate(
         return
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
         form = TranslateOptions(
-            inverse, noise, seed, out_table, append_column, realisations, adc, remains
+            inverse,
+            noise,
+            seed,
+            out_table,
+            append_column,
+            realisations,
+            adc,
+            remains,
+            pile_up_khz,
         )
         told = translate_files(
             run,
@@ -208,6 +221,7 @@ def translate(
             realisations=realisations,
             adc=adc,
             remains=remains,
+            pile_up_khz=pile_up_khz,
             device=device,
             resume=resume,
             force=force,

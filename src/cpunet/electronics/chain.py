@@ -135,6 +135,17 @@ class Hum(_Figures):
     amplitude_kev: Positive
 
 
+class Wander(_Figures):
+    r"""A baseline that wanders slowly: an Ornstein-Uhlenbeck process under every trace.
+
+    Its covariance is :math:`\sigma^2 e^{-|t - t'| / T}`, with the RMS :math:`\sigma` of
+    `rms_kev` and the correlation time :math:`T` of `time_us`.
+    """
+
+    time_us: Positive
+    rms_kev: Positive
+
+
 class Electronics(_Figures):
     """A readout chain.
 
@@ -169,6 +180,8 @@ class Electronics(_Figures):
         the minimum to the maximum. The logarithm is interpolated linearly between them.
     hum
         Mains hum, or null.
+    wander
+        Slow wandering of the baseline, or null.
     adc_bits
         Resolution of the digitiser. Samples saturate at ``2**adc_bits - 1``.
     resolution_fwhm_kev
@@ -197,6 +210,7 @@ class Electronics(_Figures):
     pile_up: PileUp
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
     hum: Hum | None = None
+    wander: Wander | None = None
     adc_bits: Annotated[int, Field(ge=8, le=16)]
     resolution_fwhm_kev: NonNegative
     n_pre: Samples
@@ -227,8 +241,9 @@ class Electronics(_Figures):
         rate_khz: float | None = None,
         pile_up_khz: float | None = None,
         hum: Hum | None = None,
+        wander: Wander | None = None,
     ) -> Electronics:
-        """Copy of the chain with other rates of earlier and second pulses, or with hum.
+        """Copy of the chain with other rates of other pulses, with hum, or wandering.
 
         Parameters
         ----------
@@ -236,6 +251,8 @@ class Electronics(_Figures):
             Rates of earlier and of second pulses in kHz. None keeps the chain's own.
         hum
             Mains hum. None keeps the chain's own.
+        wander
+            Slow wandering of the baseline. None keeps the chain's own.
 
         Examples
         --------
@@ -250,6 +267,8 @@ class Electronics(_Figures):
             changes["pile_up"] = PileUp(rate_kHz=pile_up_khz)
         if hum is not None:
             changes["hum"] = hum
+        if wander is not None:
+            changes["wander"] = wander
         return self.model_copy(update=changes)
 
     @property

@@ -1,4 +1,4 @@
-"""Disturbances of a trace: tails of earlier pulses, second pulses and mains hum."""
+"""Disturbances of a trace: other pulses, mains hum and wandering baselines."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, Wander
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import LIFETIMES, earlier_pulses
 from cpunet.electronics.response import linear_response
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.pulses.container import Pulses
 
 
@@ -59,6 +61,11 @@ def draw_other_pulses(
     n_piled, piled_kev, piled_ns = _add_second(pulses, electronics, added_kev, second)
     if electronics.hum is not None:
         added_kev += _hum(len(pulses), electronics, slow)
+    if electronics.wander is not None:
+        wander, dt_ns = electronics.wander, electronics.dt_ns
+        # of its own generator: the others stay as they are without it
+        (drift,) = rng.spawn(1)
+        added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
     return OtherPulses(added_kev, remains_kev, n_piled, piled_kev, piled_ns)
 
 
@@ -83,19 +90,18 @@ def _add_second(
     pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Add second pulses anywhere in the record, with shapes of randomly chosen pulses."""
-    n, dt_ns = len(pulses), electronics.dt_ns
-    length_us = 1e-3 * electronics.length * dt_ns
-    row, kev, time_us = earlier_pulses(
-        n, electronics.pile_up.rate_kHz, length_us, electronics.other_pulses_kev, rng
+    dt_ns = electronics.dt_ns
+    second = SecondPulses.draw(
+        len(pulses),
+        electronics.pile_up.rate_kHz,
+        electronics.other_pulses_kev,
+        electronics.n_pre * dt_ns,
+        electronics.length * dt_ns,
+        rng,
     )
-    after_ns = 1e3 * time_us - electronics.n_pre * dt_ns
-    which = rng.integers(max(n, 1), size=len(row))
-    shapes = linear_response(pulses[which], electronics, after_ns)
-    np.add.at(added_kev, row, kev[:, np.newaxis] * shapes)
-    piled_kev, piled_ns = np.full(n, np.nan), np.full(n, np.nan)
-    order = np.argsort(kev, kind="stable")  # the largest is written last
-    piled_kev[row[order]], piled_ns[row[order]] = kev[order], after_ns[order]
-    return np.bincount(row, minlength=n), piled_kev, piled_ns
+    shapes = linear_response(pulses[second.partner], electronics, second.after_ns)
+    np.add.at(added_kev, second.row, second.kev[:, np.newaxis] * shapes)
+    return second.largest()
 
 
 def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
@@ -105,3 +111,13 @@ def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArr
     turns = np.arange(electronics.length) * electronics.dt_ns * 1e-9
     wave = np.sin(2 * np.pi * electronics.hum.frequency_Hz * turns + phase)
     return np.asarray(electronics.hum.amplitude_kev * wave, float)
+
+
+def _wander(
+    n: int, length: int, dt_ns: float, wander: Wander, rng: np.random.Generator
+) -> FloatArray:
+    """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
+    kept = np.exp(-1e-3 * dt_ns / wander.time_us)
+    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(2 * np.log(kept))), (n, length))
+    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # as likely at any time
+    return np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=1), float)

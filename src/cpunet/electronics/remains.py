@@ -17,31 +17,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import (
-    MIN_N,
-    SHORTEST_SHARE,
-    SIGMA_PER_MAD,
-    samples_before_pulses,
+from cpunet.electronics.baseline_tails import (
+    lifted,
+    lower_spread,
+    mode,
+    own_decay_us,
+    read_baselines,
+    tail_shape,
+    widest,
 )
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_fit import RateFit, fit_rate
 from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.remains_traces import gathered
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-MIN_SAMPLES = 64  # minimum length of a baseline
 MOST = 16384  # traces used in the fit of the law
-# Remainders used for the decay time: minimum height in errors, and minimum number of traces.
-LARGE, MIN_LARGE = 12.0, 20
-# A baseline whose level differs by more than this factor from what its tilt implies is not
-# that of a remainder.
-COUPLED = 2.5
+LARGE = 12.0  # minimum height in errors of remainders used for the decay time
+# Fraction of the traces with remainders beyond the error from which half of the noise is given
+# up to measure it without them.
+MANY = 0.1
 LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
-# Number of Gaussian standard deviations of the residual RMS beyond which a baseline holds
-# another pulse.
-DISTURBED = 6.0
 # The rate is significant if it is SURE errors large and the log-likelihood gain is SURE_GAIN.
 SURE, SURE_GAIN = 4.0, 12.0
 MAX_FULL = 0.97  # maximum fraction of traces with a remainder larger than the error
@@ -96,14 +94,20 @@ class Remains:
     dt_ns: float
 
     def empty(self, raw: Pulses) -> npt.NDArray[np.bool_]:
-        """Select traces about as low as an empty baseline; all if levels are imprecise.
+        """Select traces without remains, from whose baselines noise can be measured.
 
-        No condition is placed on the slopes, so that noise alone determines them.
+        Where levels are precise, these are the traces about as low as an empty baseline. No
+        condition is placed on the slopes, so that noise alone determines them. Otherwise, if
+        many traces have remains, they are those whose remainder comes out below 0: by
+        symmetry, noise on this side has the power of all noise, while remains are mostly on
+        the other. If few have, all traces are taken.
         """
         if not self.coupled or self.level_weight < LEVEL_TELLS:
-            return np.ones(len(raw), bool)
+            if float(self.fit.law.share_above(self.error_kev)) < MANY:
+                return np.ones(len(raw), bool)
+            return np.asarray(np.nan_to_num(self.measure(raw), nan=np.inf) <= 0)
         level = raw.waveforms[:, : self.samples].mean(axis=1)
-        shape = _shape(self.samples, self.dt_ns, self.decay_us).mean()
+        shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
         highest = self.baseline_adc + self.level_error_kev * self.adc_per_kev * shape
         return np.asarray(level < highest)
 
@@ -141,26 +145,28 @@ class Remains:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        seen = _gathered(blocks, config, most)
+        seen = gathered(blocks, config, most)
         decay = decay_us or seen.tail_decay_us
         mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay)
-        widest = _widest(width)
-        quiet = width <= widest
-        level = _mode(mean[quiet])
-        tilted = left > LARGE * _lower_spread(left[quiet], 0.0)
+        broadest = widest(width)
+        quiet = width <= broadest
+        level = mode(mean[quiet])
+        tilted = left > LARGE * lower_spread(left[quiet], 0.0)
         large = seen.baselines[quiet & tilted] - level
-        coupled = _lifted(large, left[quiet & tilted])
-        own = _own_decay_us(large, seen.dt_ns) if coupled else None
+        coupled = lifted(large, left[quiet & tilted])
+        own = own_decay_us(large, seen.dt_ns) if coupled else None
         error: float | None = None
         if own is not None and decay_us is None:
             decay, error = own
             mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay)
-            widest = _widest(width)
-            quiet = width <= widest
-        height = _shape(seen.baselines.shape[1], seen.dt_ns, decay).mean() * seen.adc_per_kev
+            broadest = widest(width)
+            quiet = width <= broadest
+        height = (
+            tail_shape(seen.baselines.shape[1], seen.dt_ns, decay).mean() * seen.adc_per_kev
+        )
         of_slope, of_level = left / seen.adc_per_kev, (mean - level) / height
-        slope_error = _lower_spread(of_slope[quiet], 0.0)
-        level_error = _lower_spread(of_level[quiet], 0.0) if coupled else np.inf
+        slope_error = lower_spread(of_slope[quiet], 0.0)
+        level_error = lower_spread(of_level[quiet], 0.0) if coupled else np.inf
         weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
@@ -176,7 +182,7 @@ class Remains:
             decay_error_us=error,
             baseline_adc=level + (fit.level_kev / weight * height if coupled else 0.0),
             adc_per_kev=seen.adc_per_kev,
-            widest_adc=widest,
+            widest_adc=broadest,
             fit=fit,
             samples=seen.baselines.shape[1],
             dt_ns=seen.dt_ns,
@@ -196,7 +202,7 @@ class Remains:
         mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
         kev = (1 - self.level_weight) * left / self.adc_per_kev
         if self.coupled:
-            shape = _shape(self.samples, self.dt_ns, self.decay_us)
+            shape = tail_shape(self.samples, self.dt_ns, self.decay_us)
             height = shape.mean() * self.adc_per_kev
             kev += self.level_weight * (mean - self.baseline_adc) / height
         else:
@@ -233,50 +239,10 @@ class Remains:
 
     def subtracted_from(self, raw: Pulses) -> Pulses:
         """Traces with their remainders subtracted; unchanged where these are undetermined."""
-        decay = _shape(raw.length, self.dt_ns, self.decay_us)
+        decay = tail_shape(raw.length, self.dt_ns, self.decay_us)
         heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
         less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
         return raw.with_waveforms(less)
-
-
-@dataclass(frozen=True, eq=False)
-class _Gathered:
-    """What is kept of the traces: their first samples and scalar properties."""
-
-    baselines: FloatArray
-    energy_kev: FloatArray
-    adc_per_kev: float
-    tail_decay_us: float
-    dt_ns: float
-
-
-def _gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) -> _Gathered:
-    """Read blocks until there are enough traces."""
-    baselines: list[npt.NDArray[np.float32]] = []
-    energies, heights, scales, slopes = [], [], [], []
-    samples = dt_ns = 0.0
-    for raw in blocks:
-        prepared = prepare(raw, config, "measured")
-        samples = samples or _length(raw, prepared, config)
-        dt_ns = raw.dt_ns
-        baselines.append(np.array(raw.waveforms[:, : int(samples)]))
-        energies.append(raw.energy_kev)
-        height = prepared.pulses.waveforms.max(axis=1) * prepared.scale
-        heights.append(height / prepared.pulses.energy_kev)
-        scales.append(prepared.scale)
-        slopes.append(prepared.tail_slope)
-        if sum(map(len, baselines)) >= most:
-            break
-    if not baselines:
-        raise CpunetError("there are no traces to tell remains of earlier pulses from")
-    scale, slope = np.concatenate(scales), np.concatenate(slopes)
-    return _Gathered(
-        np.concatenate(baselines).astype(float),
-        np.concatenate(energies),
-        _gain(np.concatenate(heights)),
-        _tail_decay_us(slope[scale >= np.median(scale)]),
-        float(dt_ns),
-    )
 
 
 def _require_empty(fit: RateFit) -> None:
@@ -288,145 +254,3 @@ def _require_empty(fit: RateFit) -> None:
             "nearly all traces lie on remains of earlier pulses, so that the level of an empty "
             "baseline is not seen and nothing is told of them; measure at a lower rate"
         )
-
-
-def _length(raw: Pulses, prepared: Prepared, config: PreparationConfig) -> int:
-    """Number of initial samples that precede nearly all pulses."""
-    if len(prepared) < MIN_N:
-        raise CpunetError(
-            f"only {len(prepared)} of {len(raw)} traces can be prepared "
-            f"({_reasons(prepared)}); {MIN_N} or more are needed to tell remains of earlier "
-            "pulses"
-        )
-    free = samples_before_pulses(prepared, config)
-    length = int(np.quantile(free, SHORTEST_SHARE))
-    if length < MIN_SAMPLES:
-        raise CpunetError(
-            f"the traces have {max(length, 0)} samples before the pulse; remains of earlier "
-            f"pulses need {MIN_SAMPLES} or more, so give traces with a longer baseline"
-        )
-    return length
-
-
-def _reasons(prepared: Prepared) -> str:
-    """Counts of the reasons why traces cannot be prepared."""
-    told = [f"{n} {reason}" for reason, n in prepared.rejections.items()]
-    return ", ".join(told) or "there are no more"
-
-
-def _gain(ratios: FloatArray) -> float:
-    """Gain in ADC counts per keV from the heights of the pulses."""
-    known = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(known) < MIN_N:
-        raise CpunetError(
-            f"only {len(known)} traces have a known energy and can be prepared; {MIN_N} or "
-            "more are needed to tell remains of earlier pulses in keV"
-        )
-    return float(np.median(known))
-
-
-def _tail_decay_us(slopes: FloatArray) -> float:
-    """Decay time in us of the tails of pulses."""
-    slope = float(np.median(slopes))
-    if not slope < 0:
-        raise CpunetError(
-            "the tails of the traces do not decay, so nothing of earlier pulses can be told; "
-            "are these measured traces?"
-        )
-    return -1e3 / slope
-
-
-def _shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:
-    """Decay of a remainder that is 1 at the first sample, shape ``(length,)``."""
-    return np.asarray(np.exp(-np.arange(length) * dt_ns * 1e-3 / decay_us), float)
-
-
-def read_baselines(
-    baselines: FloatArray, dt_ns: float, decay_us: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    r"""Mean of each baseline, the remainder from its tilt, and the residual RMS.
-
-    The remainder is the least-squares height :math:`A` of
-
-    .. math:: b_j = c + A e^{-t_j / \tau},
-
-    with a free level :math:`c`. Its height refers to the first sample.
-
-    Parameters
-    ----------
-    baselines
-        First samples of the traces, shape ``(n, samples)``.
-    dt_ns
-        Sampling period in ns.
-    decay_us
-        Decay time in us.
-
-    Returns
-    -------
-    tuple of array
-        Mean, remainder and RMS in the units of the baselines, each of shape ``(n,)``.
-
-    Examples
-    --------
-    >>> tail = 100 + 7 * np.exp(-np.arange(500) * 0.016 / 50)
-    >>> _, left, width = read_baselines(tail[np.newaxis], 16.0, 50.0)
-    >>> round(float(left[0]), 6), bool(width[0] < 1e-9)
-    (7.0, True)
-    """
-    shape = _shape(baselines.shape[1], dt_ns, decay_us)
-    lever = shape - shape.mean()
-    with np.errstate(invalid="ignore", over="ignore"):
-        mean = baselines.mean(axis=1)
-        left = baselines @ lever / (lever @ lever)
-        width = (baselines - mean[:, np.newaxis] - left[:, np.newaxis] * lever).std(axis=1)
-    return mean, left, np.where(np.isfinite(width), width, np.inf)
-
-
-def _widest(width: FloatArray) -> float:
-    """RMS beyond which a baseline holds another pulse."""
-    finite = width[np.isfinite(width)]
-    if len(finite) < MIN_N:
-        raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
-    centre = float(np.median(finite))
-    sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
-    return centre + max(DISTURBED * sigma, 0.1 * centre)
-
-
-def _mode(values: FloatArray) -> float:
-    """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
-    ordered = np.sort(values)
-    while len(ordered) > 8:
-        half = len(ordered) // 2
-        first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
-        ordered = ordered[first : first + half + 1]
-        if ordered[-1] == ordered[0]:
-            break
-    return float(ordered.mean())
-
-
-def _lower_spread(values: FloatArray, centre: float) -> float:
-    """Standard deviation of the side below the centre, which remainders do not affect."""
-    below = centre - values[values <= centre]
-    return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
-
-
-def _lifted(above: FloatArray, left: FloatArray) -> bool:
-    """Whether tilted baselines are as high as their tilt implies, as with DC coupling."""
-    if len(above) < MIN_LARGE:
-        return False
-    ratio = float(np.median(above[:, : above.shape[1] // 4].mean(axis=1) / left))
-    return 1 / COUPLED < ratio < COUPLED
-
-
-def _own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
-    """Decay time from the two halves of tilted baselines, and its error, in us."""
-    half = above.shape[1] // 2
-    first, second = above[:, :half].mean(axis=1), above[:, half : 2 * half].mean(axis=1)
-    whole = (first > 0) & (second > 0)
-    fall = np.log(first[whole] / second[whole])
-    middle = float(np.median(fall)) if whole.sum() >= MIN_LARGE else 0.0
-    if not middle > 0:
-        return None
-    error = 1.2533 * SIGMA_PER_MAD * float(np.median(np.abs(fall - middle)))
-    decay = half * dt_ns * 1e-3 / middle
-    return decay, decay * error / middle / float(np.sqrt(len(fall)))

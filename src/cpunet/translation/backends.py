@@ -9,8 +9,10 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from cpunet.electronics.extension import with_room
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
 from cpunet.electronics.finishing import finish_with_codes
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.chain_unet import InverseUNet
 from cpunet.networks.kept_noise import KeptNoise
@@ -24,6 +26,10 @@ from cpunet.recipes.schema import PreparationConfig
 
 Energies = npt.NDArray[np.float64]
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+
+NO_OTHERS = (
+    "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
+)
 
 
 class Backend(ABC):
@@ -45,6 +51,7 @@ class Backend(ABC):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
@@ -64,12 +71,13 @@ class NetworkBackend(Backend):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Run the network; its output is a prepared window already."""
-        if remains_kev is not None:
+        if remains_kev is not None or second is not None:
             raise CpunetError(
-                "a network has what it was shown; remains of earlier pulses belong to readout "
-                "chains, so leave out remains_kev"
+                "a network has what it was shown; other pulses belong to readout chains, so "
+                "leave out remains_kev and second"
             )
         del energy_kev
         batch = torch.from_numpy(windows).to(self.device)
@@ -99,13 +107,19 @@ class NoisyNetworkBackend(NetworkBackend):
         Of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
+    remains
+        Distribution of the remains of earlier pulses under the data, if known.
     """
 
     def __init__(
-        self, network: PositionalUNet, noise: KeptNoise, config: PreparationConfig
+        self,
+        network: PositionalUNet,
+        noise: KeptNoise,
+        config: PreparationConfig,
+        remains: DrawnRemains | None = None,
     ) -> None:
         super().__init__(network)
-        self.noise, self.config = noise, config
+        self.noise, self.config, self.remains = noise, config, remains
 
     def __call__(
         self,
@@ -114,6 +128,7 @@ class NoisyNetworkBackend(NetworkBackend):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Run the network, add noise in proportion to 1/energy, and prepare like data.
 
@@ -124,19 +139,31 @@ class NoisyNetworkBackend(NetworkBackend):
         """
         if noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
-        clean, codes = super().__call__(windows, None, noise, generator, remains_kev)
-        if not noise:
+        if not noise and (remains_kev is not None or second is not None):
+            raise CpunetError(NO_OTHERS)
+        clean, codes = super().__call__(windows, None, noise, generator)
+        if energy_kev is None or not noise:
             return clean, codes
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
         dt_ns = self.noise.noise_dt_ns
+        records = with_room(clean, self.config, dt_ns)
+        added = None
+        if remains_kev is not None or second is not None:
+            added = _left(self.remains, records, energy_kev, remains_kev)
+        if second is not None and added is not None:
+            length = records.shape[1] + second.reach(dt_ns)
+            before = PADDING_BEFORE + self.config.samples_before
+            shapes = extended(clean[second.partner], self.config, dt_ns, length, before)
+            added += second.added(shapes, energy_kev, dt_ns, records.shape[1])
         return finish_with_codes(
-            with_room(clean, self.config, dt_ns),
+            records,
             self.config,
             dt_ns=dt_ns,
             noise=self.noise.noise,
             energy_kev=energy_kev,
             seed=int(seed),
+            added=added,
         )
 
 
@@ -154,6 +181,7 @@ class ResponseBackend(Backend):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data.
 
@@ -168,8 +196,13 @@ class ResponseBackend(Backend):
         drawn = self.chain.noise if noise else None
         device = self.device if generator is None else generator.device
         seed = torch.randint(2**62, (), generator=generator, device=device)
-        if remains_kev is not None:
-            return self._with_remains(records, energy_kev, noise, int(seed), remains_kev)
+        added = None
+        if remains_kev is not None or second is not None:
+            if energy_kev is None or not noise:
+                raise CpunetError(NO_OTHERS)
+            added = _left(self.chain.remains, records, energy_kev, remains_kev)
+            if second is not None and len(second.row):
+                added += self._second(windows, energy_kev, second, records.shape[1])
         return finish_with_codes(
             records,
             self.config,
@@ -177,33 +210,24 @@ class ResponseBackend(Backend):
             noise=drawn,
             energy_kev=energy_kev if noise else None,
             seed=int(seed),
+            added=added,
         )
 
-    def _with_remains(
-        self,
-        records: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        seed: int,
-        remains_kev: Energies,
-    ) -> tuple[FloatArray, Codes]:
-        """The same, with the remains of earlier pulses added to each record."""
-        remains = self.chain.remains
-        if remains is None or energy_kev is None or not noise:
-            raise CpunetError(
-                "remains of earlier pulses are drawn with the noise, by energies, and by a run "
-                "that tells of them; leave out remains_kev"
-            )
-        left = remains_kev * remains.height / energy_kev
-        return finish_with_codes(
-            records,
-            self.config,
-            dt_ns=float(self.chain.response.dt_ns),
-            noise=self.chain.noise,
-            energy_kev=energy_kev,
-            seed=seed,
-            added=left[:, np.newaxis] * remains.decay(records.shape[1]),
+    def _second(
+        self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
+    ) -> npt.NDArray[np.float64]:
+        """Second pulses with shapes of the same batch, at each sample in prepared units."""
+        dt_ns = float(self.chain.response.dt_ns)
+        # those that come early are followed for longer
+        chosen = np.pad(
+            windows[second.partner], ((0, 0), (0, second.reach(dt_ns))), mode="edge"
         )
+        shapes = self.network(torch.from_numpy(chosen).to(self.device)).cpu().numpy()
+        config = self.config.model_copy(update={"saturation_run": shapes.shape[1] + 1})
+        clean = prepare(Pulses.of(shapes, dt_ns=dt_ns), config, "measured")
+        scale = np.full(len(shapes), np.median(clean.scale))
+        scale[clean.index] = clean.scale
+        return second.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
 
 
 class InverseBackend(Backend):
@@ -223,12 +247,30 @@ class InverseBackend(Backend):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Invert the response and suppress the noise; deterministic."""
-        del energy_kev, noise, generator, remains_kev
+        del energy_kev, noise, generator, remains_kev, second
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms
         return result, prepared.codes
+
+
+def _left(
+    remains: DrawnRemains | None,
+    records: FloatArray,
+    energy_kev: Energies,
+    remains_kev: Energies | None,
+) -> npt.NDArray[np.float64]:
+    """Remains of earlier pulses at each sample of the records, in prepared units."""
+    if remains_kev is None:
+        return np.zeros(records.shape)
+    if remains is None:
+        raise CpunetError(
+            "the run does not tell of remains of earlier pulses; leave out remains_kev"
+        )
+    left = remains_kev * remains.height / energy_kev
+    return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))

@@ -11,6 +11,8 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.half_maximum import Splines, last_below_half
@@ -73,6 +75,11 @@ class EnsembleREN(REN):
         """Whether the noise depends on the energies."""
         return self.members[0].needs_energies
 
+    @property
+    def remains(self) -> DrawnRemains | None:
+        """Remains of earlier pulses as learned; seeds of a training measure the same data."""
+        return self.members[0].remains
+
     def mean_and_spread(self, windows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the members' noise-free translations.
 
@@ -116,6 +123,7 @@ class _Draw(Backend):
         noise: bool,
         generator: torch.Generator | None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Assign pulses to random backends and translate them."""
         device = self.device if generator is None else generator.device
@@ -129,7 +137,12 @@ class _Draw(Backend):
                 energies = None if energy_kev is None else energy_kev[rows]
                 left = None if remains_kev is None else remains_kev[rows]
                 result[rows], codes[rows] = backend(
-                    windows[rows], energies, noise, generator, left
+                    windows[rows],
+                    energies,
+                    noise,
+                    generator,
+                    left,
+                    None if second is None else second.of_rows(rows),
                 )
         return result, codes
 

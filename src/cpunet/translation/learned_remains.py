@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.second_pulses import DrawnPileUp
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
@@ -61,6 +62,35 @@ def wanted_remains(
     elif raw:
         known = known.uncut()
     return known if known.law.rate_khz > 0 else None
+
+
+def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
+    """Second pulses to add to translations, with the energies learned by a run.
+
+    Parameters
+    ----------
+    translator
+        Trained run.
+    rate_khz
+        Rate in kHz; 0 for none.
+
+    Raises
+    ------
+    CpunetError
+        If the rate is no such number, or the run does not know the energies.
+    """
+    if not (np.isfinite(rate_khz) and rate_khz >= 0):
+        raise CpunetError(f"--pile-up-khz {rate_khz:g}: expected a rate in kHz, 0 or more")
+    if rate_khz == 0:
+        return None
+    known = translator.remains
+    if known is None:
+        raise CpunetError(
+            f"--pile-up-khz {rate_khz:g}: the run does not tell the energies of other pulses "
+            "(a network, trained before they were told, or without raw traces); train a "
+            "readout chain on raw traces, or leave it out"
+        )
+    return DrawnPileUp(rate_khz, known.law.energies_kev, translator.dt_ns)
 
 
 def _rate(wanted: str | float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy.typing as npt
 import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.second_pulses import Columns, DrawnPileUp, SecondPulses
+from cpunet.networks.response import PADDING_BEFORE, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes
 from cpunet.translation.translator import Translator
@@ -27,14 +29,16 @@ class Formed:
         A `Rejection` for each row.
     saturated
         Mask of the rows that reach an end of the digitiser's range, shape (n,).
-    remains_kev
-        Remains of earlier pulses under each pulse in keV, shape (n,); None without remains.
+    truth
+        What is known of other pulses in each trace, arrays of shape (n,) with their units:
+        ``remains_kev`` with remains of earlier pulses; ``n_piled``, ``piled_kev`` and
+        ``piled_ns`` with second pulses, see `SecondPulses.largest`.
     """
 
     pulses: Pulses
     codes: Codes
     saturated: npt.NDArray[np.bool_]
-    remains_kev: npt.NDArray[np.float64] | None = None
+    truth: Columns = field(default_factory=dict)
 
 
 class OutputForm(Protocol):
@@ -71,13 +75,20 @@ class Normalised:
         Trained run.
     remains
         Distribution of the remains of earlier pulses; None for none.
+    pile_up
+        Rate and energies of second pulses; None for none.
     """
 
     samples: npt.DTypeLike = np.float32
     units = ""
 
-    def __init__(self, translator: Translator, remains: DrawnRemains | None = None) -> None:
-        self.translator, self.remains = translator, remains
+    def __init__(
+        self,
+        translator: Translator,
+        remains: DrawnRemains | None = None,
+        pile_up: DrawnPileUp | None = None,
+    ) -> None:
+        self.translator, self.remains, self.pile_up = translator, remains, pile_up
         self.t0_ns = -translator.recipe.preparation.samples_before * translator.dt_ns
 
     def __call__(
@@ -85,18 +96,37 @@ class Normalised:
     ) -> Formed:
         """Translate pulses, keeping their rows."""
         left = drawn_kev(self.remains, len(pulses), generator)
+        second = self._second(len(pulses), generator)
         done = self.translator.translate_pulses(
-            pulses, noise=noise, generator=generator, remains_kev=left
+            pulses, noise=noise, generator=generator, remains_kev=left, second=second
         )
-        return Formed(done.pulses, done.codes, np.zeros(len(pulses), bool), left)
+        saturated = np.zeros(len(pulses), bool)
+        return Formed(done.pulses, done.codes, saturated, truth_of(left, second))
+
+    def _second(self, n: int, generator: torch.Generator | None) -> SecondPulses | None:
+        """Draw second pulses within the records that are prepared to windows."""
+        if self.pile_up is None:
+            return None
+        config = self.translator.recipe.preparation
+        before = PADDING_BEFORE + config.samples_before
+        return self.pile_up.draw(n, before, record_length(config.length), rng_of(generator))
 
 
 def drawn_kev(
     remains: DrawnRemains | None, n: int, generator: torch.Generator | None
 ) -> npt.NDArray[np.float64] | None:
     """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
-    if remains is None:
-        return None
+    return None if remains is None else remains.draw_kev(n, rng_of(generator))
+
+
+def truth_of(left: npt.NDArray[np.float64] | None, second: SecondPulses | None) -> Columns:
+    """Columns on remains and on second pulses, as far as there are any."""
+    truth: Columns = {} if left is None else {"remains_kev": (left, "keV")}
+    return truth if second is None else truth | second.columns()
+
+
+def rng_of(generator: torch.Generator | None) -> np.random.Generator:
+    """A NumPy generator, seeded by a draw from that of torch."""
     device = "cpu" if generator is None else generator.device
     seed = torch.randint(2**62, (), generator=generator, device=device)
-    return remains.draw_kev(n, np.random.default_rng(int(seed)))
+    return np.random.default_rng(int(seed))

@@ -18,12 +18,13 @@ import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.extension import extended
+from cpunet.electronics.second_pulses import DrawnPileUp, SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import ResponseBackend
-from cpunet.translation.output_form import Formed, drawn_kev
+from cpunet.translation.output_form import Formed, drawn_kev, rng_of, truth_of
 from cpunet.translation.translator import BATCH, REN
 
 HIGHEST = int(np.iinfo(np.uint16).max)
@@ -136,6 +137,8 @@ class AdcForm:
     remains
         Distribution of the remains of earlier pulses, which raise the baseline at the start
         of a trace; None for none.
+    pile_up
+        Rate and energies of second pulses within a trace; None for none.
 
     Raises
     ------
@@ -153,9 +156,15 @@ class AdcForm:
         length: int | None = None,
         n_pre: int | None = None,
         remains: DrawnRemains | None = None,
+        pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.ren, self.scale, self.remains = ren, scale, remains
+        self.ren, self.scale, self.remains, self.pile_up = ren, scale, remains, pile_up
         self.config = ren.recipe.preparation
+        if pile_up is not None and not isinstance(ren.backend, ResponseBackend):
+            raise CpunetError(
+                "a network knows no shapes beyond its windows, so it gives no raw traces with "
+                "second pulses; leave out --pile-up-khz, or --output adc"
+            )
         self.length = self.config.length if length is None else length
         self.n_pre = self.config.samples_before if n_pre is None else n_pre
         if not 0 <= self.n_pre < self.length:
@@ -177,8 +186,11 @@ class AdcForm:
     ) -> Formed:
         """Translate pulses, keeping their rows; pulses without energy are rejected."""
         backend, left = self.ren.backend, drawn_kev(self.remains, len(pulses), generator)
+        second = None
+        if self.pile_up is not None:
+            second = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
         if isinstance(backend, ResponseBackend):
-            windows, codes = self._of_chain(backend, pulses, noise, generator)
+            windows, codes = self._of_chain(backend, pulses, noise, generator, second)
         else:
             done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
             codes = done.codes.copy()
@@ -196,7 +208,8 @@ class AdcForm:
         scale = np.where(unknown, 0.0, self.scale.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.scale.baseline)
         # single precision represents 16-bit integers exactly
-        return Formed(pulses.with_waveforms(traces.astype(np.float32)), codes, saturated, left)
+        whole = pulses.with_waveforms(traces.astype(np.float32))
+        return Formed(whole, codes, saturated, truth_of(left, second))
 
     def _of_chain(
         self,
@@ -204,6 +217,7 @@ class AdcForm:
         pulses: Pulses,
         noise: bool,
         generator: torch.Generator | None,
+        second: SecondPulses | None,
     ) -> tuple[FloatArray, Codes]:
         """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
         prepared = prepare(pulses, self.config, "simulated")
@@ -218,30 +232,48 @@ class AdcForm:
         rng = np.random.default_rng(int(seed))
         for first in range(0, len(windows), BATCH):
             rows = index[first : first + BATCH]
-            levels, codes[rows] = self._levels(backend, windows[first : first + BATCH])
+            batch = windows[first : first + BATCH]
+            levels, codes[rows] = self._levels(backend, batch, self.length)
+            energies = pulses.energy_kev[rows]
             if noise:
-                energies = pulses.energy_kev[rows]
                 levels += backend.chain.noise.draw(energies, self.length, rng)
+            if second is not None:
+                levels += self._second(backend, batch, energies, second.of_rows(rows))
             traces[rows] = levels
         return traces, codes
 
+    def _second(
+        self,
+        backend: ResponseBackend,
+        windows: FloatArray,
+        energy_kev: Floats,
+        second: SecondPulses,
+    ) -> Floats:
+        """Second pulses with shapes of the same batch, in prepared units."""
+        if not len(second.row):
+            return np.zeros((len(windows), self.length))
+        # those that come early are followed for longer
+        reached = self.length + second.reach(self.ren.dt_ns)
+        shapes, _ = self._levels(backend, windows[second.partner], reached)
+        return second.added(np.nan_to_num(shapes), energy_kev, self.ren.dt_ns, self.length)
+
     def _levels(
-        self, backend: ResponseBackend, windows: FloatArray
+        self, backend: ResponseBackend, windows: FloatArray, length: int
     ) -> tuple[FloatArray, Codes]:
         """Noise-free traces of prepared simulated windows, the 99.9 % at sample `n_pre`."""
         config, dt_ns = self.config, self.ren.dt_ns
         before = max(0, self.n_pre - config.samples_before)
-        after = max(0, self.length - self.n_pre - config.samples_after)
+        after = max(0, length - self.n_pre - config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
         long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
         with torch.inference_mode():
             records = backend.network(torch.from_numpy(long).to(backend.device)).cpu().numpy()
         config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
         clean = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
-        source = clean.align_sample[:, np.newaxis] - self.n_pre + np.arange(self.length)
+        source = clean.align_sample[:, np.newaxis] - self.n_pre + np.arange(length)
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
-        levels = np.full((len(windows), self.length), np.nan, np.float32)
+        levels = np.full((len(windows), length), np.nan, np.float32)
         levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / clean.scale[
             :, np.newaxis
         ]

@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.chain_unet import InverseUNet, UNetCorrection
 from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
@@ -120,7 +121,8 @@ class Translator:
                 return NetworkBackend(network)
             noise = KeptNoise(dt_ns)
             load_network(run, NOISE, noise, device)
-            return NoisyNetworkBackend(network, noise, recipe.preparation)
+            remains = remains_of(read_info(run))
+            return NoisyNetworkBackend(network, noise, recipe.preparation, remains)
         if cls.part == REN.part:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
@@ -210,6 +212,7 @@ class Translator:
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> Translated:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
@@ -226,6 +229,8 @@ class Translator:
             Function called with the number of pulses completed since the last call.
         remains_kev
             Remains of earlier pulses under each pulse in keV, shape ``(n,)``.
+        second
+            Second pulses within the records.
 
         Raises
         ------
@@ -253,6 +258,7 @@ class Translator:
             generator=generator,
             progress=progress,
             remains_kev=None if remains_kev is None else remains_kev[index],
+            second=None if second is None else second.of_rows(index),
         )
         return Translated(pulses.with_waveforms(waveforms), codes)
 
@@ -260,6 +266,8 @@ class Translator:
     def remains(self) -> DrawnRemains | None:
         """Remains of earlier pulses as learned by the run; None if it has no information."""
         backend = self.backend
+        if isinstance(backend, NoisyNetworkBackend):
+            return backend.remains
         return backend.chain.remains if isinstance(backend, ResponseBackend) else None
 
     @property
@@ -297,6 +305,7 @@ class Translator:
         generator: torch.Generator | None = None,
         progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
+        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Like `apply`, with a `Rejection` for each row."""
         result = np.empty_like(windows)
@@ -306,8 +315,14 @@ class Translator:
                 rows = slice(first, first + BATCH)
                 energies = None if energy_kev is None else energy_kev[rows]
                 left = None if remains_kev is None else remains_kev[rows]
+                batch = np.arange(len(windows))[rows]
                 result[rows], codes[rows] = self.backend(
-                    windows[rows], energies, noise, generator, left
+                    windows[rows],
+                    energies,
+                    noise,
+                    generator,
+                    left,
+                    None if second is None else second.of_rows(batch),
                 )
                 if progress is not None:
                     progress(len(windows[rows]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,12 +11,64 @@ from cpunet.electronics.drawn_remains import DrawnRemains, passing
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.networks.response import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 BLOCK = 4096  # traces per block
+LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is kept
 MAX_BLOCKS = 16  # blocks searched for traces that passed the cuts
+
+
+class FoundRemains(NamedTuple):
+    """Remains of a measured file.
+
+    Parameters
+    ----------
+    measured
+        Remains under its traces; None if they cannot be estimated.
+    drawn
+        Distribution to be drawn from, if there certainly are any.
+    told
+        Entry of ``run.json``; None if they were not looked for.
+    """
+
+    measured: Remains | None
+    drawn: DrawnRemains | None
+    told: dict[str, Any] | None
+
+
+def find_remains(
+    data_file: InputFile, data: InputSet, config: PreparationConfig, monitor: Monitor
+) -> FoundRemains:
+    """Measure the remains in a file for a training, and note what was found.
+
+    Parameters
+    ----------
+    data_file, data
+        Measured file, and its pulses that passed the cuts.
+    config
+        Preparation of the pulses.
+    monitor
+        Told of the rate, or why there is none.
+    """
+    found, reason = measured_remains(data_file, config)
+    if found is None:
+        monitor.note(f"remains of earlier pulses are not looked for: {reason}")
+        return FoundRemains(None, None, told_of(None, None, reason))
+    drawn = drawn_like(found, data_file, data, config)
+    told = told_of(found, drawn, None)
+    if found.law is None:
+        return FoundRemains(found, None, told)
+    tenth = told["percent_above"]["10_kev"]["law"]
+    alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
+    monitor.note(
+        f"remains of earlier pulses: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+        f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are given "
+        "them"
+    )
+    return FoundRemains(found, drawn, told)
 
 
 def measured_remains(
@@ -83,4 +135,12 @@ def told_of(
     """Entry of ``run.json`` on remains; `drawn` can exist even if no remains are certain."""
     if remains is None or drawn is None:
         return {"missing": reason}
-    return remains.describe() | {"drawn": drawn.describe()}
+    return remains.describe() | {"sizes": _sizes(remains), "drawn": drawn.describe()}
+
+
+def _sizes(remains: Remains) -> dict[str, list[float]]:
+    """Percentages of the traces above sizes in keV, for a figure."""
+    kev = np.geomspace(max(remains.error_kev, 0.01), LARGEST_KEV, SIZES)
+    told = np.sort(remains.kev[np.isfinite(remains.kev)])
+    above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
+    return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}

@@ -8,13 +8,11 @@ from typing import Any
 
 from torch import nn
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.common.remains import drawn_like, measured_remains, told_of
+from cpunet.jobs.common.remains import FoundRemains, find_remains
 from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
@@ -108,7 +106,7 @@ def match(
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    remains, drawn, told_of_remains = _remains(sides, recipe, monitor)
+    remains, drawn, told_of_remains = remains_of_sides(sides, recipe, monitor)
     noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
     if note is not None:
         monitor.note(f"warning: {note}")
@@ -185,23 +183,8 @@ def match(
     return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
 
 
-def _remains(
-    sides: Sides, recipe: Recipe, monitor: Monitor
-) -> tuple[Remains | None, DrawnRemains | None, dict[str, Any] | None]:
-    """Remains under the data, those to be drawn if there surely are any, and what to tell."""
+def remains_of_sides(sides: Sides, recipe: Recipe, monitor: Monitor) -> FoundRemains:
+    """Remains under the data; nothing if these are not to be looked at."""
     if sides.data_set is None:
-        return None, None, None
-    found, reason = measured_remains(sides.data_file, recipe.preparation)
-    if found is None:
-        monitor.note(f"remains of earlier pulses are not looked for: {reason}")
-        return None, None, told_of(None, None, reason)
-    drawn = drawn_like(found, sides.data_file, sides.data_set, recipe.preparation)
-    told = told_of(found, drawn, None)
-    if found.law is None:
-        return found, None, told
-    tenth = told["percent_above"]["10_kev"]["law"]
-    monitor.note(
-        f"remains of earlier pulses: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
-        f"kHz, {tenth:.0f} % of the traces on more than 10 keV; translations are given them"
-    )
-    return found, drawn, told
+        return FoundRemains(None, None, None)
+    return find_remains(sides.data_file, sides.data_set, recipe.preparation, monitor)

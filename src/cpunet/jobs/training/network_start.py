@@ -13,7 +13,7 @@ from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.training.matching import Sides, known_response, match
+from cpunet.jobs.training.matching import Sides, known_response, match, remains_of_sides
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.network_settings import PunetConfig, ResponseConfig
@@ -76,10 +76,13 @@ def network_start(
     if recipe.chain is not None:
         surroundings, recipe, told = _matched_chain(sides, recipe, seed, init, monitor)
         return NetworkStart(surroundings, fill, recipe, told)
-    outside = None
+    outside, told = None, {}
     if recipe.cyclegan.training.noise == "baselines":
         try:
-            noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation)
+            found = remains_of_sides(sides, recipe, monitor)
+            noise, note = measured_noise(
+                sides.data_file, sides.data, recipe.preparation, found.measured
+            )
         except CpunetError as error:
             raise CpunetError(
                 f"{sides.data_file.path}: no baselines to draw noise from ({error}); or train "
@@ -87,11 +90,15 @@ def network_start(
             ) from error
         if note is not None:
             monitor.note(f"warning: {note}")
-        outside = Outside(TraceNoise(noise), sides.sim.energy_kev, recipe.preparation)
+        outside = Outside(
+            TraceNoise(noise, found.drawn), sides.sim.energy_kev, recipe.preparation
+        )
+        if found.told is not None:
+            told = {"fit": {"remains": found.told}}
     teacher = None
     if init is not None and matched:
         teacher = _teacher(init, sides, recipe)
-    return NetworkStart(Surroundings(outside, teacher=teacher), fill, recipe, {})
+    return NetworkStart(Surroundings(outside, teacher=teacher), fill, recipe, told)
 
 
 def _matched_chain(

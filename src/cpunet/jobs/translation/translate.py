@@ -37,7 +37,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
-from cpunet.translation.learned_remains import NONE, wanted_remains
+from cpunet.translation.learned_remains import NONE, wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
@@ -144,12 +144,13 @@ class FileTranslation:
     def _form(self) -> OutputForm:
         adc = self.options.adc
         remains = wanted_remains(self.translator, self.options.remains, raw=adc is not None)
+        pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
         if adc is None or not isinstance(self.translator, REN):
-            return Normalised(self.translator, remains)
+            return Normalised(self.translator, remains, pile_up)
         scale = adc_scale(
             self.run, self.translator, adc_per_kev=adc.adc_per_kev, baseline=adc.baseline
         )
-        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains)
+        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains, pile_up)
 
     def _require_sampling(self, source: InputFile, pulses: PulseSource) -> None:
         if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
@@ -186,9 +187,7 @@ class FileTranslation:
         counts, start = Counts(), 0
         times = self.options.realisations
         for formed in self.blocks(_read(pulses, advance), noise_key):
-            columns: dict[str, Any] = {"rejection": (formed.codes, "")}
-            if formed.remains_kev is not None:
-                columns["remains_kev"] = (formed.remains_kev, "keV")
+            columns: dict[str, Any] = {"rejection": (formed.codes, ""), **formed.truth}
             given = len(formed.codes) // (times or 1)
             if times is not None:
                 columns["realisation"] = (np.tile(np.arange(times), given), "")
@@ -230,6 +229,7 @@ def translate_file(
     realisations: int | None = None,
     adc: Adc | None = None,
     remains: str = NONE,
+    pile_up_khz: float = 0.0,
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
@@ -264,6 +264,10 @@ def translate_file(
     remains
         Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
         behind the data's quality cuts), ``"none"``, or a rate in kHz.
+    pile_up_khz
+        Rate in kHz of second pulses within a trace, with the columns ``n_piled``,
+        ``piled_kev`` and ``piled_ns``: their number, and energy and time (relative to the
+        trace's own pulse) of the largest.
     resume
         Leave an output as it is that was made of this source with this run and these options.
     device, force, monitor
@@ -282,7 +286,7 @@ def translate_file(
         translated, the source changes meanwhile, or another process writes the same output.
     """
     options = TranslateOptions(
-        inverse, noise, seed, table, append_column, realisations, adc, remains
+        inverse, noise, seed, table, append_column, realisations, adc, remains, pile_up_khz
     )
     translation = FileTranslation(run, options, device)
     for note in translation.notes:

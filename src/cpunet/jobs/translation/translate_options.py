@@ -30,6 +30,7 @@ class TranslateOptions:
     realisations: int | None = None
     adc: Adc | None = None
     remains: str = NONE
+    pile_up_khz: float = 0.0
 
     def __post_init__(self) -> None:
         if self.realisations is not None and self.realisations < 1:
@@ -49,5 +50,11 @@ class TranslateOptions:
             raise CpunetError("the inverse gives charge, without remains; leave out --remains")
         if self.remains != NONE and not self.noise:
             raise CpunetError("remains are drawn with the noise; leave out --no-noise")
+        if self.pile_up_khz and self.inverse:
+            raise CpunetError(
+                "the inverse gives charge, without second pulses; leave out --pile-up-khz"
+            )
+        if self.pile_up_khz and not self.noise:
+            raise CpunetError("second pulses are drawn with the noise; leave out --no-noise")
         if self.adc is not None and self.inverse:
             raise CpunetError("the inverse gives charge, no ADC counts; leave out --output adc")

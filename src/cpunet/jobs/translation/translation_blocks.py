@@ -67,7 +67,10 @@ def interleaved(realisations: list[Formed]) -> Formed:
     n, first = len(realisations), realisations[0].pulses
     rows = np.repeat(np.arange(len(first)), n)
     waveforms = np.stack([formed.pulses.waveforms for formed in realisations], axis=1)
-    left = [one for formed in realisations if (one := formed.remains_kev) is not None]
+    truth = {
+        name: (np.stack([each.truth[name][0] for each in realisations], axis=1).ravel(), units)
+        for name, (_, units) in realisations[0].truth.items()
+    }
     return Formed(
         Pulses.of(
             waveforms.reshape(len(rows), first.length),
@@ -77,7 +80,7 @@ def interleaved(realisations: list[Formed]) -> Formed:
         ),
         np.stack([formed.codes for formed in realisations], axis=1).ravel(),
         np.stack([formed.saturated for formed in realisations], axis=1).ravel(),
-        np.stack(left, axis=1).ravel() if left else None,
+        truth,
     )
 
 

@@ -17,6 +17,7 @@ Writer = PulseWriter | ColumnAppender
 
 OWN_COLUMNS = frozenset(
     {"waveform", "energy", "event_number", "rejection", "realisation", "remains_kev"}
+    | {"n_piled", "piled_kev", "piled_ns"}
 )
 
 

@@ -28,6 +28,7 @@ from cpunet.analysis.figures import (
 )
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
+from cpunet.analysis.remains_figure import sizes_figure
 from cpunet.analysis.slice_figure import slice_figure
 from cpunet.jobs.validation.evaluation import Evaluation
 from cpunet.jobs.validation.peak_details import PeakDetails
@@ -40,6 +41,7 @@ from cpunet.translation.translator import IREN, REN
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
+REMAINS = "remains of earlier pulses"
 SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
 CYCLES = ("forward cycle", "backward cycle")
 OF_PEAKS = (
@@ -76,7 +78,7 @@ class Drawing:
 def figure_names(peaks: Iterable[str]) -> list[str]:
     """Names of all figures that a validation of these peaks can have."""
     names = [f"{peak} {figure}" for peak in peaks for figure in (*CYCLES, *OF_PEAKS)]
-    return [SPECTRUM, AE_ENERGY, *names, ROC, LOSSES]
+    return [SPECTRUM, REMAINS, AE_ENERGY, *names, ROC, LOSSES]
 
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
@@ -84,6 +86,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     made = {SPECTRUM: Drawing("spectrum", {"energy_kev": energies, "peaks": peaks})}
+    made |= _remains(found.metrics["remains"] or {})
     if methods := found.metrics["ae_energy"].get("methods"):
         made[AE_ENERGY] = Drawing(AE_ENERGY, {"methods": methods})
     scored = [peak for peak in found.sets if found.values[peak.name]]
@@ -98,6 +101,19 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     if found.losses:
         made[LOSSES] = of_losses(found.losses)
     return made
+
+
+def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
+    """Sizes of remains with their law, if a training found any and kept them."""
+    if not (told.get("rate_khz") and "sizes" in told):
+        return {}
+    wanted = ("rate_khz", "rate_error_khz", "decay_us", "error_kev", "traces")
+    values = {
+        "told": {name: told[name] for name in wanted},
+        "sizes": told["sizes"],
+        "energies_kev": told["drawn"]["energies_kev"],
+    }
+    return {REMAINS: Drawing(REMAINS, values)}
 
 
 def of_losses(records: list[Record]) -> Drawing:
@@ -259,6 +275,7 @@ def _draw_noise(noise: Mapping[str, Any], peak: str) -> Figure:
 
 _DRAW: Mapping[str, Callable[..., Figure]] = {
     "spectrum": spectrum_figure,
+    REMAINS: sizes_figure,
     "cycle": cycle_figure,
     "histograms": _draw_histograms,
     "mean pulse": _draw_mean_pulse,
