@@ -29,8 +29,8 @@ LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
 LEAST_GRID, MOST_GRID = 1024, 16384  # points of the density
 STEPS_OF_SIGMA = 4.0
-# Standard deviations of room on either side, and arguments (times the standard deviation) beyond
-# which the noise leaves nothing of a characteristic function.
+# Standard deviations of room on either side, and the argument, times the standard deviation,
+# beyond which the noise leaves nothing of a characteristic function.
 ROOM, LARGEST_ARGUMENT = 10.0, 9.0
 OUTLIERS = 2e-3  # fraction of traces that the law need not explain
 # Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
