@@ -268,6 +268,18 @@ class TestSimulated:
             )
             assert np.all(window[625 - align :] == window[-1])
 
+    def test_charge_of_the_first_sample_is_no_baseline(self) -> None:
+        """A pulse that moves from the first sample on has moved by then; an offset has not."""
+        drift = np.clip((np.arange(225) + 0.5) / 20, 0, 1)[np.newaxis]
+        prepared = prepared_of(drift, "simulated")
+        start = 400 - prepared.align_sample[0]
+        window = prepared.pulses.waveforms[0]
+        assert prepared.baseline[0] == 0.0
+        np.testing.assert_allclose(window[start : start + 225], drift[0], atol=1e-7)
+        assert not window[:start].any()
+        offset = prepared_of(3 + 2 * drift, "simulated")
+        assert offset.baseline[0] == pytest.approx(3 + 2 * drift[0, 0])
+
     def test_no_noise_has_no_chi_square_and_no_slope(self) -> None:
         prepared = prepared_of(simulated(n=5), "simulated")
         assert np.isnan(prepared.chi2).all()

@@ -17,7 +17,8 @@ from cpunet.recipes import load_recipe
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Moments
 from cpunet.training.optimal_weights import ConditionalFunctions, refine
-from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from cpunet.training.smooth_parameters import SmoothParameters
 from cpunet.training.translated import Noise, Translated
 
 DT_NS, KEV, N = 16.0, 2614.5, 800
@@ -53,11 +54,10 @@ def response(poles_ns: tuple[float, float], slow: float) -> ElectronicsResponse:
     return made
 
 
-@pytest.fixture(scope="module")
-def band() -> Band:
-    """Pulses behind poles of 60 and 40 ns, and others to be translated."""
+def band_behind(poles_ns: tuple[float, float]) -> Band:
+    """Pulses behind two poles, and others to be translated."""
     with torch.no_grad():
-        records = response((60.0, 40.0), 0.05)(torch.from_numpy(charge(1))).numpy()
+        records = response(poles_ns, 0.05)(torch.from_numpy(charge(1))).numpy()
     energies = np.full(N, KEV)
     data = finish(
         records, RECIPE.preparation, dt_ns=DT_NS, noise=WHITE, energy_kev=energies, seed=3
@@ -65,6 +65,11 @@ def band() -> Band:
     moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
     noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
     return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)), np.arange(N))
+
+
+@pytest.fixture(scope="module")
+def band() -> Band:
+    return band_behind((60.0, 40.0))
 
 
 def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
@@ -82,12 +87,41 @@ def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
     assert abs(together @ (found - truth)) < 0.01
 
 
-def test_two_equal_poles_stay_equal(band: Band) -> None:
-    """By how much they differ is hardly told, and not followed into nonsense."""
+def test_poles_are_told_apart_from_where_they_are_equal(band: Band) -> None:
+    """Where they are equal, derivatives with their difference vanish."""
     near = ResponseProblem(response((49.0, 48.9), 0.05), [band])
+    refine(near, [band], 6)
+    poles = np.sort(near.response.log_poles_ns.detach().exp().numpy())
+    np.testing.assert_allclose(poles, [40, 60], atol=6)
+
+
+def test_equal_poles_are_found_equal_from_where_they_differ() -> None:
+    """The best difference may be that of no real poles; the fit ends at the bound."""
+    band = band_behind((49.0, 49.0))
+    near = ResponseProblem(response((60.0, 40.0), 0.05), [band])
     refine(near, [band], 6)
     poles = near.response.log_poles_ns.detach().exp().numpy()
     assert np.abs(np.diff(poles)).max() < 12
+    assert np.sqrt(np.prod(poles)) == pytest.approx(49, abs=0.5)
+
+
+def test_coordinates_are_those_of_the_poles_and_back() -> None:
+    made = response((60.0, 40.0), 0.05)
+    smooth = SmoothParameters(Parameters(made))
+    place = smooth.get()
+    np.testing.assert_allclose(place[0], np.log(2400) / 2)
+    np.testing.assert_allclose(place[1], (np.log(1.5) / 2) ** 2)
+    smooth.set(place + np.array([0, -1, 0, 0]))  # below 0 there are no real poles
+    np.testing.assert_allclose(made.log_poles_ns.detach().exp(), 2400**0.5)
+    smooth.set(place)
+    np.testing.assert_allclose(made.log_poles_ns.detach().exp(), [60, 40])
+    # derivatives of the coordinates with the parameters
+    vector = smooth.parameters.vector()
+    slopes = smooth.by_parameters(np.eye(4), vector)
+    for i in range(4):
+        moved = vector.copy()
+        moved[i] += 1e-6
+        np.testing.assert_allclose((smooth.of(moved) - place) / 1e-6, slopes[:, i], atol=1e-5)
 
 
 def test_the_amplitude_is_right_after_it_and_wrong_before(band: Band) -> None:

@@ -29,6 +29,9 @@ N_COLUMNS = 7
 # The alignment moves the baseline window, and the baseline moves the 99.9 % threshold by
 # a thousandth of its own change.  Two rounds settle all but exact ties.
 _ROUNDS = 4
+# A first sample of at most so many times the rise to the second is charge that has moved within
+# it: half of a constant current is the mean of its first period.
+_MAX_FIRST = 2.0
 # A pulse has begun where it exceeds a hundredth of its height and is clear of the noise.  The
 # baseline ends some samples earlier, since the rise starts below that threshold.
 _BEGUN_FRACTION, _BEGUN_RMS, _BEGUN_MARGIN = 0.01, 8.0, 16
@@ -79,6 +82,22 @@ def _lowest(trace):  # type: ignore[no-untyped-def]
     lowest = trace[0]
     for value in trace:
         lowest = min(lowest, value)
+    return lowest
+
+
+@_compiled
+def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
+    """Level of a simulated pulse before any charge has moved.
+
+    That is its lowest value, unless the pulse is moving from the first sample on: then what is
+    in this sample has come within it, and taken off as a baseline it would be lost.
+    """
+    first = max(start, 0)
+    lowest = np.float64(_lowest(trace[first:stop]))
+    if first == 0 and len(trace) > 1 and lowest == trace[0]:
+        rise = np.float64(trace[1]) - lowest
+        if 0 < lowest <= _MAX_FIRST * rise:
+            return 0.0
     return lowest
 
 
@@ -193,7 +212,7 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
     """Align, compute the baseline of that window, and repeat until nothing moves."""
     length = len(trace)
     if s.simulated:
-        base = np.float64(_lowest(trace))
+        base = _charge_before(trace, 0, length)
     else:
         base = _mean(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = -1
@@ -209,7 +228,7 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
             top = np.float64(_highest(trace[align:stop]))
             top_sample = align + _first_at(trace[align:stop], top)
         if s.simulated:
-            base = np.float64(_lowest(trace[max(start, 0) : stop]))
+            base = _charge_before(trace, start, stop)
         else:
             first, last = _baseline_stretch(length, start, s)
             base = _mean(trace[first:last])

@@ -21,20 +21,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
-from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.smooth_parameters import SmoothParameters
 
 # Bins of the current amplitude are no narrower than twice its noise.
 MIN_BIN = 0.006
 RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
-# A direction counts if pulses tell it this many times better than its prior.
-MIN_TOLD = 10.0
 # Passes over all pulses at most, the fall of the sum of squares with which they end, and the
-# factor of the damping.
-PASSES, CONVERGED, DAMPING_UP = 8, 0.1, 10.0
+# first damping and its factor.
+PASSES, CONVERGED, FIRST_DAMPING, DAMPING_UP = 8, 0.1, 100.0, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +84,8 @@ class ConditionalFunctions:
 def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     """Move a response to where the optimally weighted means of both sides agree.
 
-    Weights and derivatives are those of where the response is, to which the end is near.  What
-    the pulses hardly tell, such as by how much two equal poles differ, stays as it is.
+    Weights and derivatives are those of where the response is, to which the end is near; see
+    `SmoothParameters` for the coordinates of the steps.
 
     Parameters
     ----------
@@ -101,50 +101,63 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     array
         Covariance of the parameters.
     """
-    parameters = near.parameters
-    weighted = [_Weighted(band, parameters, bins) for band in bands]
+    smooth = SmoothParameters(near.parameters)
+    weighted = [_Weighted(band, smooth, near.response, bins) for band in bands]
     slopes = np.concatenate([w.slopes for w in weighted])
-    widths = parameters.widths
-    _, sizes, directions = np.linalg.svd(slopes * widths, full_matrices=False)
-    # what is told well, in units of the priors' widths
-    told = directions[sizes > MIN_TOLD].T * widths[:, np.newaxis]
-    columns = np.concatenate([slopes, np.diag(1 / widths)]) @ told
 
-    def residuals(vector: Values) -> Values:
-        parameters.set(vector)
-        found = [w.deviations(parameters.response) for w in weighted]
-        return np.concatenate([*found, (vector - parameters.centre) / widths])
+    def residuals(place: Values) -> Values:
+        smooth.set(place)
+        found = [w.deviations(near.response) for w in weighted]
+        return np.concatenate([*found, (place - smooth.centre) / smooth.widths])
 
-    parameters.set(_descend(residuals, parameters.vector(), told, columns))
+    columns = np.concatenate([slopes, np.diag(1 / smooth.widths)])
+    smooth.set(_descend(residuals, smooth, columns))
+    vector, widths = near.parameters.vector(), near.parameters.widths
+    slopes = smooth.by_parameters(slopes, vector)
     return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(widths**-2.0)))
 
 
 def _descend(
-    residuals: Callable[[Values], Values], vector: Values, told: Values, columns: Values
+    residuals: Callable[[Values], Values], smooth: SmoothParameters, columns: Values
 ) -> Values:
-    """Levenberg's steps along the directions that are told, with the same derivatives."""
-    left, damping = residuals(vector), 0.0
+    """Levenberg's steps from where the response is.
+
+    A pass over all pulses is dear, so that derivatives are not taken again: each step, whether
+    it lowers the sum of squares or not, corrects them along its way (Broyden).
+    """
+    place, damping = smooth.get(), 0.0
+    left = residuals(place)
     for _ in range(PASSES):
-        curvature = columns.T @ columns + damping * np.eye(columns.shape[1])
-        tried = vector - told @ np.linalg.solve(curvature, columns.T @ left)
+        damped = np.concatenate([columns, np.diag(np.sqrt(damping) / smooth.widths)])
+        wanted = np.concatenate([-left, np.zeros(len(place))])
+        bounds = smooth.lowest - place - 1e-12, np.inf
+        move = scipy.optimize.lsq_linear(damped, wanted, bounds, method="bvls").x
+        promised = left + columns @ move
+        if left @ left - promised @ promised < CONVERGED:
+            break
+        tried = place + move
         found = residuals(tried)
         fall = left @ left - found @ found
+        way = move / smooth.widths
+        columns = columns + np.outer(found - promised, way / smooth.widths / (way @ way))
         if fall <= 0:
-            damping = max(DAMPING_UP * damping, MIN_TOLD**2)
+            damping = max(DAMPING_UP * damping, FIRST_DAMPING)
             continue
-        vector, left, damping = tried, found, damping / DAMPING_UP
+        place, left, damping = tried, found, damping / DAMPING_UP
         if fall < CONVERGED:
             break
-    return vector
+    return place
 
 
 class _Weighted:
     """Optimally weighted functions of one band."""
 
-    def __init__(self, band: Band, parameters: Parameters, bins: int) -> None:
+    def __init__(
+        self, band: Band, smooth: SmoothParameters, response: ElectronicsResponse, bins: int
+    ) -> None:
         self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
-        slopes = _slopes(band, self.functions, parameters)
-        covariance = _covariance(band, self.functions, parameters.response)
+        mean, covariance = _mean_and_covariance(band, self.functions, response)
+        slopes = _slopes(band, self.functions, smooth, response, mean)
         sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
         correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
         correlation += RIDGE * np.eye(len(sigma))
@@ -171,30 +184,29 @@ def _blocks(n: int) -> list[slice]:
     return [slice(first, first + BLOCK) for first in range(0, n, BLOCK)]
 
 
-def _slopes(band: Band, functions: ConditionalFunctions, parameters: Parameters) -> Values:
-    """Derivatives of the functions' means with the parameters, (functions, parameters)."""
-
-    def mean() -> Values:
-        (total,), n = sim.sums(parameters.response, lambda r: (functions.sum(r),), draws=1)
-        return np.asarray(total / n)
-
-    sim, vector, columns = band.sim.first(FOR_WEIGHTS), parameters.vector(), []
-    for i, step in enumerate(parameters.steps):
-        means = []
-        for sign in (1, -1):
-            moved = vector.copy()
-            moved[i] += sign * step
-            parameters.set(moved)
-            means.append(mean())
-        columns.append((means[0] - means[1]) / (2 * step))
-    parameters.set(vector)
+def _slopes(
+    band: Band,
+    functions: ConditionalFunctions,
+    smooth: SmoothParameters,
+    response: ElectronicsResponse,
+    mean: Values,
+) -> Values:
+    """Derivatives of the functions' means with the coordinates, (functions, coordinates)."""
+    sim, place, columns = band.sim.first(FOR_WEIGHTS), smooth.get(), []
+    for i, step in enumerate(smooth.steps):
+        moved = place.copy()
+        moved[i] += step
+        smooth.set(moved)
+        (total,), n = sim.sums(response, lambda r: (functions.sum(r),), draws=1)
+        columns.append((total / n - mean) / step)
+    smooth.set(place)
     return np.stack(columns, axis=1)
 
 
-def _covariance(
+def _mean_and_covariance(
     band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
-) -> Values:
-    """Covariance of the functions over the pulses of both sides."""
+) -> tuple[Values, Values]:
+    """Means of the functions over simulated pulses, and their covariance over both sides."""
 
     def of(readings: Readings) -> tuple[Values, ...]:
         values = functions(readings)
@@ -204,4 +216,4 @@ def _covariance(
     mean = total / n
     simulated = squares / n - np.outer(mean, mean)
     measured = functions(band.moments.data[slice(0, FOR_WEIGHTS)])
-    return np.asarray(0.5 * (simulated + np.cov(measured.T)))
+    return mean, np.asarray(0.5 * (simulated + np.cov(measured.T)))

@@ -9,7 +9,7 @@ import numpy as np
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response import record_length
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
 from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands
 from cpunet.training.moments import Moments
@@ -79,11 +79,16 @@ class PulseSets:
 
     def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
         _, training = self.recipe.matching
-        measured = self.data.waveforms[band.data[data]]
+        measured = _taken(self.data.waveforms, band.data[data])
         moments = Moments.of_data(measured, training, self.recipe.preparation)
         rows = band.sim[sim]
-        pulses, energy_kev = self.sim.waveforms[rows], self.sim.energy_kev[rows]
+        pulses, energy_kev = _taken(self.sim.waveforms, rows), self.sim.energy_kev[rows]
         length, draws = record_length(pulses.shape[1]), training.noise_sets
         drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng, self.remains)
         translated = Translated(pulses, drawn, moments, band.weights[sim])
         return Band(band.name, translated, rows)
+
+
+def _taken(waveforms: FloatArray, rows: Rows) -> FloatArray:
+    """Rows in their order; all of them without a copy, which may be gigabytes."""
+    return waveforms if len(rows) == len(waveforms) else waveforms[rows]
