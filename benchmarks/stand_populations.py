@@ -1,0 +1,84 @@
+"""Are the events of both sides of a stand alike? By their hits alone, before any pulse.
+
+    python benchmarks/stand_populations.py --seeds 21-23
+    python benchmarks/stand_populations.py --seeds 100-123
+
+The sides of a stand are drawn independently, so that they differ by chance. What a calibration
+finds differs with them. Prints, for each seed and for all together, how far the means of the
+full-energy peak's events differ, in standard errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.electronics.presets import read_electronics
+from cpunet.jobs.simulation.hit_sources import Window
+from cpunet.jobs.simulation.stand_plan import Side, StandPlan
+from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.geometry_readers import read_detector
+
+FEP = Window("FEP", 2609.511, 2619.511)
+NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")
+SITE_MM, LOST_KEV = 1.0, 0.5
+Values = npt.NDArray[np.float64]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", default="100-123", help="first-last")
+    parser.add_argument("--events", type=int, default=3000)
+    arguments = parser.parse_args()
+    first, last = map(int, arguments.seeds.split("-"))
+    print("seed", *NAMES, sep=" | ")
+    sides: list[list[Values]] = [[], []]
+    for seed in range(first, last + 1):
+        plan = StandPlan.of(
+            read_electronics("legend200"),
+            read_detector("icpc"),
+            (FEP,),
+            (arguments.events,),
+            kind="shifted",
+            seed=seed,
+        )
+        here = [events_of(side) for side in (plan.sim, plan.data)]
+        for all_of_side, events in zip(sides, here, strict=True):
+            all_of_side.append(events)
+        print(seed, *deviations(*here), sep=" | ", flush=True)
+    print("all", *deviations(*map(np.concatenate, sides)), sep=" | ")
+
+
+def events_of(side: Side) -> Values:
+    """Numbers of each event with its whole energy in active germanium, shape (events, 6)."""
+    blocks = []
+    for hits in side.source.open(side.detector).blocks:
+        active = side.detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
+        lost = np.add.reduceat(hits.edep_kev * ~active, hits.offsets[:-1])
+        sites = cluster_hits(hits[lost < LOST_KEV], SITE_MM)
+        begin, energy = sites.offsets[:-1], sites.edep_kev
+        radius = np.hypot(sites.x_mm, sites.y_mm)
+        total = np.add.reduceat(energy, begin)
+        means = [
+            np.add.reduceat(energy * values, begin) / total
+            for values in (radius, sites.z_mm, radius**2, sites.z_mm**2)
+        ]
+        spreads = [
+            np.sqrt(np.maximum(square - mean**2, 0))
+            for mean, square in zip(means[:2], means[2:], strict=True)
+        ]
+        largest = np.maximum.reduceat(energy, begin) / total
+        blocks.append(np.stack([*means[:2], *spreads, np.diff(sites.offsets), largest], 1))
+    return np.concatenate(blocks)
+
+
+def deviations(sim: Values, data: Values) -> list[str]:
+    """Differences of the means in standard errors."""
+    error = np.sqrt(sim.var(axis=0) / len(sim) + data.var(axis=0) / len(data))
+    return [f"{z:+.1f}" for z in (sim.mean(axis=0) - data.mean(axis=0)) / error]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""The comparison that chain and physics minimise together, where the answer is known.
+
+Pulses are two numbers here, and the functions are these numbers, so that means, covariances
+and derivatives follow from the definition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
+from cpunet.calibration.nearby import Nearby
+from cpunet.calibration.nuisances import Physics, named
+from cpunet.networks.response import ElectronicsResponse
+from cpunet.recipes import load_recipe
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.moments import Readings
+
+RECIPE = load_recipe("fast")
+PHYSICS = Physics(
+    read_detector("ppc"), SimulationSettings(), (named("temperature"), named("impurity"))
+)
+N, SLOPES = 400, {0: np.array([0.02, -0.01]), 1: np.array([1.0, 3.0])}
+
+
+@dataclass
+class Pairs:
+    """Simulated pulses that no readout changes: two numbers each."""
+
+    sim: np.ndarray
+    weights: np.ndarray
+
+    def __len__(self):
+        return len(self.sim)
+
+    def first(self, n):
+        return Pairs(self.sim[:n], self.weights[:n])
+
+    def sums(self, response, of, *, cut=True, draws=None):
+        readings = Readings(self.sim, np.zeros(len(self)), self.weights)
+        return of(readings), float(self.weights.sum())
+
+
+class Plain(JointProblem):
+    """The problem with pulses that need no preparation."""
+
+    def prepared(self, coordinates, most=None):
+        return SimpleNamespace(waveforms=self.nearby.at(coordinates, most))
+
+
+class Numbers:
+    """The functions: the numbers themselves."""
+
+    names = ("first", "second")
+
+    def __call__(self, readings, clip=None):
+        return readings.linear
+
+
+def problem(sim, data, *, free=(0, 1), held=False, known=None, centre=(0.0, 0.0)):
+    response = ElectronicsResponse(RECIPE.matching[0], 16.0)
+    at = np.array(centre)
+    parameters = JointParameters(response, PHYSICS, at, free, {})
+    slopes = {i: np.tile(slope, (len(sim), 1)) for i, slope in SLOPES.items()}
+    simulator = SimpleNamespace(physics=PHYSICS)
+    nearby = Nearby(simulator, at, sim, slopes, at)
+    ones = np.ones(len(sim))
+    band = SimpleNamespace(
+        name="FEP",
+        sim=Pairs(sim, ones),
+        rows=np.arange(len(sim)),
+        moments=SimpleNamespace(data=Readings(data, np.zeros(len(data)), np.ones(len(data)))),
+        pairs=1 / (1 / len(data) + 1 / len(sim)),
+    )
+    more = {} if known is None else {"known": known}
+    return Plain(parameters, [band], [Numbers()], nearby, ones, RECIPE, **more, held=held)
+
+
+@pytest.fixture(scope="module")
+def sides():
+    rng = np.random.default_rng(3)
+    mixed = np.array([[1.0, 0.6], [0.0, 0.8]])
+    return 2 * rng.normal(size=(N, 2)) @ mixed, 0.3 + rng.normal(size=(N, 2)) @ mixed
+
+
+def whitened(deviation, covariance):
+    """Chi-square of deviations by its definition, with the shrunk correlations."""
+    sigma = np.sqrt(covariance.diagonal())
+    correlation = (1 - RIDGE) * covariance / np.outer(sigma, sigma) + RIDGE * np.eye(2)
+    pull = deviation / sigma
+    return pull @ np.linalg.solve(correlation, pull)
+
+
+def test_chi_square_is_that_of_the_definition(sides):
+    sim, data = sides
+    both = problem(sim, data)
+    covariance = 0.5 * (np.cov(sim.T, bias=True) + np.cov(data.T)) / (N / 2)
+    deviation = sim.mean(axis=0) - data.mean(axis=0)
+    vector = both.parameters.vector()
+    assert both.chi_square(vector) == pytest.approx(whitened(deviation, covariance))
+    assert both.pulls(vector) == pytest.approx(deviation / np.sqrt(covariance.diagonal()))
+    assert both.moments == 2
+    assert both.names == ("first", "second")
+
+
+def test_far_from_the_data_only_their_covariance_counts(sides):
+    sim, data = sides
+    held = problem(sim, data, held=True)
+    deviation = sim.mean(axis=0) - data.mean(axis=0)
+    expected = whitened(deviation, np.cov(data.T) / (N / 2))
+    vector = held.parameters.vector()
+    assert held.chi_square(vector) == pytest.approx(expected)
+    near = problem(sim, data)
+    near.weigh_like(held)
+    assert near.chi_square(vector) == pytest.approx(expected)
+
+
+def test_priors_and_further_knowledge_follow_the_deviations(sides):
+    known = problem(*sides, known=lambda coordinates: 7 * coordinates[:1])
+    parameters = known.parameters
+    vector = parameters.vector()
+    vector[parameters.n_chain :] = 1.5, 0.02
+    found = known.residuals(vector)
+    prior = found[known.moments : known.moments + len(vector)]
+    assert prior[parameters.n_chain :] == pytest.approx([1.5 / 3.0, 0.02 / 0.1])
+    assert not prior[: parameters.n_chain].any()
+    assert found[-1] == pytest.approx(10.5)
+    assert parameters.coordinates.tolist() == [1.5, 0.02]
+
+
+def test_steps_from_far_away_are_held_within_reach(sides):
+    held = problem(*sides, held=True, centre=(1.0, 0.0))
+    vector = held.parameters.vector()
+    vector[-2:] = 1.0 + PHYSICS.nuisances[0].reach, -0.5 * PHYSICS.nuisances[1].reach
+    assert held.residuals(vector)[-2:] == pytest.approx([HOLD, -0.5 * HOLD])
+
+
+def test_derivatives_are_those_of_the_pulses(sides):
+    both = problem(*sides)
+    vector = both.parameters.vector()
+    jacobian = both.jacobian(vector, both.residuals(vector))
+    n, sigma = both.parameters.n_chain, both._sigma[0]
+    for column, slope in SLOPES.items():
+        expected = both._whiten[0] @ (slope / sigma)
+        assert jacobian[:2, n + column] == pytest.approx(expected, rel=1e-6)
+    assert not jacobian[:2, :n].any()  # these pulses know no readout
+    priors = jacobian[2:].diagonal()
+    assert priors == pytest.approx(1 / both.parameters.widths)
+    assert np.array_equal(both.parameters.vector(), vector)
+
+
+def test_what_is_not_free_stays(sides):
+    one = problem(*sides, free=[1], centre=(1.0, 0.0))
+    parameters = one.parameters
+    assert parameters.names[-1] == "impurity_factor"
+    vector = parameters.vector()
+    vector[-1] = 1e3  # far beyond its bound
+    one.pulls(vector)
+    assert parameters.coordinates[0] == 1.0
+    assert parameters.coordinates[1] == pytest.approx(np.log(PHYSICS.nuisances[1].highest))
