@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside as aside_of_kind
 from cpunet.files import written_aside
-from cpunet.outputs import MARKER, FolderKind
+from cpunet.outputs import MARKER, FolderKind, mark
 
 KIND = FolderKind("thing", "cpunet make", known_by="old", own="old|new")
 
@@ -143,6 +143,36 @@ def test_an_existing_folder_is_refused_and_with_force_replaced(tmp_path):
         (aside / "new").touch()
         assert listing(target) == ["old"]
     assert listing(target) == ["new"]
+    assert listing(tmp_path) == ["run"]
+
+
+@pytest.mark.parametrize("at_the_move", [True, False])
+@pytest.mark.parametrize("own", [True, False])
+def test_of_a_folder_that_appears_meanwhile_others_files_stay(
+    tmp_path, monkeypatch, own, at_the_move
+):
+    target, replace, done = tmp_path / "run", Path.replace, list[bool]()
+
+    def appear():
+        if not done:
+            done.append(True)
+            target.mkdir()
+            (target / "old").touch()
+            mark(target, KIND)  # what is there now is the program's
+            if not own:
+                (target / "thesis.tex").touch()
+
+    def after_another(path, to):
+        if to == target:
+            appear()
+        return replace(path, to)
+
+    monkeypatch.setattr("pathlib.Path.replace", after_another)
+    with folder_written_aside(target) as aside:
+        (aside / "new").touch()
+        if not at_the_move:
+            appear()
+    assert listing(target) == (["new"] if own else ["new", "thesis.tex"])
     assert listing(tmp_path) == ["run"]
 
 

@@ -105,7 +105,7 @@ def folder_written_aside(
         aside.chmod(0o777 & ~_umask())
         mark(aside, kind)
         kept = keep_others(place, aside, kind) if place.exists() else []
-        _take_the_place(aside, place)
+        _take_the_place(aside, place, kind)
         told_kept(target, kept, note)
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
@@ -113,11 +113,21 @@ def folder_written_aside(
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _take_the_place(aside: Path, target: Path) -> None:
-    """Rename `aside` to `target`; an old folder is removed only afterwards."""
+def _take_the_place(aside: Path, target: Path, kind: FolderKind) -> None:
+    """Rename `aside` to `target`; an old folder is removed only afterwards.
+
+    Another process may have put its own there in the meantime: it is replaced, too.
+    """
     if not target.exists():
-        aside.replace(target)
-        return
+        try:
+            aside.replace(target)
+        except OSError:
+            if not target.exists():
+                raise
+            require_replaceable(target, kind)
+            keep_others(target, aside, kind)
+        else:
+            return
     old = aside.with_name(f"{aside.name}-old")
     target.replace(old)
     try:

@@ -45,7 +45,22 @@ COMMANDS = {
     ),
     "import pulses": ("import pulses pulses.pickle --out", "out.lh5"),
     "train": ("train --sim sim.lh5 --data data.lh5 TINY --out", "out"),
+    "library lithium": ("library lithium --out", "out.lh5"),
 }
+# Those that take several seconds each, or write in the same way as one of the above.
+SLOW_COMMANDS = {
+    "info": ("info data.lh5 --without-remains", "out.lh5"),
+    "library translate": ("library translate LEARNED psl.lh5 --out", "out.lh5"),
+    "library merge": ("library merge psl.lh5 --out", "out.lh5"),
+    "validate": ("validate RUN --sim sim.lh5 --data data.lh5 --no-rivals --out", "out"),
+    "check": ("check --sim sim.lh5 --data data.lh5 --out", "out.png"),
+    "explore": ("explore LEARNED --detector detector.yaml --points 4 --out", "out.html"),
+    "export parameters": ("export LEARNED --to legend-pars --out", "out"),
+}
+ALL_COMMANDS = [
+    *COMMANDS,
+    *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_COMMANDS),
+]
 SCORES = '{"peaks": {"FEP": {"parameters": {"drift_time": {"iou": {"ren": 80.0}}}}}}'
 
 
@@ -74,10 +89,18 @@ def home(run: Path, stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 def words_of(name: str, tiny: list[str]) -> list[str]:
-    words, out = COMMANDS[name]
+    words, out = (COMMANDS | SLOW_COMMANDS)[name]
     found = [*words.split(), out]
     at = found.index("TINY") if "TINY" in found else None
     return found if at is None else [*found[:at], *tiny, *found[at + 1 :]]
+
+
+def ready_words(command, name: str, tiny: list[str]) -> list[str]:
+    """Words of a command, whose inputs are made if they are not there yet."""
+    words = words_of(name, tiny)
+    if "psl.lh5" in words:
+        assert command(*COMMANDS["library make"][0].split(), "psl.lh5").code == 0
+    return words
 
 
 def listing(folder: Path) -> dict[str, bytes]:
@@ -136,11 +159,11 @@ SLOW = "ESTALE as it is moved into place"
     "fault",
     [pytest.param(f, marks=[pytest.mark.slow] if f == SLOW else []) for f in FAULTS],
 )
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ALL_COMMANDS)
 def test_a_fault_leaves_one_line_and_nothing_else(
     command, home, tiny, monkeypatch, name, fault
 ):
-    words = words_of(name, tiny)
+    words = ready_words(command, name, tiny)
     is_folder = not Path(words[-1]).suffix
     what, instead = (FOLDER_FAULTS if is_folder else {}).get(fault, FAULTS[fault])
     if name in ("train", "figure") and fault == "read-only":
@@ -153,11 +176,12 @@ def test_a_fault_leaves_one_line_and_nothing_else(
     require_failed(outcome, before, home, status)
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "train"])
+@pytest.mark.parametrize("name", [name for name in ALL_COMMANDS if name != "train"])
 def test_a_full_disk_leaves_one_line_and_nothing_else(command, home, tiny, name):
+    words = ready_words(command, name, tiny)
     before = listing(home)
     with full_disk():
-        outcome = command(*words_of(name, tiny))
+        outcome = command(*words)
     require_failed(outcome, before, home, 2)
     assert "File too large" in outcome.err.splitlines()[-1]
 
@@ -185,11 +209,23 @@ def killed_at_the_move(held: ModuleType, words: list[str], told: Path) -> int:
     return int(job.exitcode)
 
 
-@pytest.mark.parametrize("name", ["simulate", "translate", "compare", "library make"])
+KILLED_COMMANDS = ["simulate", "translate", "compare", "library make"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *KILLED_COMMANDS,
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in sorted((COMMANDS | SLOW_COMMANDS).keys() - {*KILLED_COMMANDS, "train"})
+        ),
+    ],
+)
 def test_what_was_killed_has_left_no_output_and_can_be_done_again(
     command, home, tiny, held, tmp_path_factory, name
 ):
-    words = words_of(name, tiny)
+    words = ready_words(command, name, tiny)
     before = set(listing(home))
     if "detector.yaml" in words:  # its fields are moved into the cache, too
         assert command("fields", "detector.yaml").code == 0
@@ -201,6 +237,28 @@ def test_what_was_killed_has_left_no_output_and_can_be_done_again(
     assert Path(words[-1]).exists()
     if name == "translate":  # which cleans up after the dead
         assert set(listing(home)) - before == {words[-1]}
+
+
+@pytest.mark.parametrize("name", ["simulate", "stand", "compare", "library lithium"])
+def test_of_two_writers_the_last_is_whole(command, home, tiny, monkeypatch, name):
+    """Another process ends with the same output while this one is about to."""
+    words = words_of(name, tiny)
+    with monkeypatch.context() as patched:
+        replace, second = Path.replace, list[int]()
+
+        def after_another(path: Path, target: Path) -> Path:
+            if not second and Path(target).name == words[-1]:
+                second.append(0)
+                second.append(command(*words, "--force").code)
+            return replace(path, target)
+
+        patched.setattr("pathlib.Path.replace", after_another)
+        first = command(*words, "--force")
+    assert second == [0, 0]
+    assert first.code == 0, first.err
+    assert command(*words).code == 2  # it is there, and
+    assert command(*words, "--force").code == 0  # is known as this program's own
+    assert not [name for name in listing(home) if ".partial" in name]
 
 
 @pytest.mark.parametrize("name", ["simulate", "translate", "train"])

@@ -103,6 +103,8 @@ def test_it_is_replaced_with_force_only(command, made: Path):
         (("--preset", "ornl", "--kind", "shifted", "--shift", "bias=1"), "no such key bias"),
         (("--preset", "ornl", "--set", "hole_trapping_per_us=-1"), "hole_trapping_per_us"),
         (("--preset", "ornl", "--set", "dt_ns=16"), "leave dt_ns out"),
+        (("--preset", "ornl", "--rate-khz", "1e300"), "1e+300 is not from 0 to 1000"),
+        (("--preset", "ornl", "--pile-up-khz", "nan"), "nan is not from 0 to 1000"),
     ],
 )
 def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], said: str):

@@ -22,6 +22,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.ensemble_folder import read_study
 from cpunet.training.run_folder import write_run
 from cpunet.translation.backends import Backend
 from cpunet.translation.ensemble import EnsembleREN
@@ -289,3 +290,23 @@ def test_what_is_no_ensemble_is_told_in_a_line(several, tmp_path):
     other = REN.load(response(tmp_path / "seed_001", 45, "preparation.samples_after=410"))
     with pytest.raises(CpunetError, match=r"member 1 .* another preparation"):
         EnsembleREN([first, other])
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ({"seeds": {}}, "begun_with: Field required"),
+        ({"begun_with": 3}, "begun_with: Input should be a valid dict"),
+        ({"begun_with": {}, "seeds": [1]}, "seeds: Input should be a valid dict"),
+        ({"begun_with": {}, "seeds": {"x": {"state": "trained"}}}, "String should match"),
+        ({"begun_with": {}, "seeds": {"0": {}}}, "seeds.0.state: Field required"),
+        ({"begun_with": {"peak": []}}, "resumed with another peak"),
+        ([], "no mapping"),
+    ],
+)
+def test_a_damaged_record_is_one_line(tmp_path, content, told):
+    path = tmp_path / "ensemble.json"
+    assert read_study(path, {"peak": "FEP"}) is None
+    path.write_text(json.dumps(content))
+    with pytest.raises(CpunetError, match=told):
+        read_study(path, {"peak": "FEP"})

@@ -63,12 +63,18 @@ SettingsFile = Annotated[
 RateKhz = Annotated[
     float | None,
     typer.Option(
-        "--rate-khz", min=0, help="Pulses per ms before a record; their tails are under it."
+        "--rate-khz",
+        help="Pulses per ms before a record; their tails are under it.",
+        callback=options.within(0, 1000),
     ),
 ]
 PileUpKhz = Annotated[
     float | None,
-    typer.Option("--pile-up-khz", min=0, help="Pulses per ms within a record besides its own."),
+    typer.Option(
+        "--pile-up-khz",
+        help="Pulses per ms within a record besides its own.",
+        callback=options.within(0, 1000),
+    ),
 ]
 HumOption = Annotated[
     str | None, typer.Option("--hum", help="Wave of the mains: HZ=KEV, such as 50=2.")

@@ -16,6 +16,8 @@ REFERENCE_KEV = 2614.5
 """Energy (keV) of the full-energy peak, at which energy-dependent values are quoted."""
 
 _Share = Annotated[float, Field(gt=0, le=1)]
+MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
+_Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
 class _Figures(Config):
@@ -119,13 +121,13 @@ class Noise(_Figures):
 class EarlierPulses(_Figures):
     """Pulses before the record, a Poisson process. Their tails lie under its traces."""
 
-    rate_kHz: NonNegative
+    rate_kHz: _Rate
 
 
 class PileUp(_Figures):
     """Second pulses within the record, a Poisson process."""
 
-    rate_kHz: NonNegative
+    rate_kHz: _Rate
 
 
 class Hum(_Figures):

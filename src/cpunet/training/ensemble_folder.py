@@ -16,9 +16,10 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.file_locks import locked
@@ -35,6 +36,7 @@ from cpunet.outputs import (
     told_kept,
 )
 from cpunet.regular_files import read_text
+from cpunet.training.checkpoints import require_same
 from cpunet.training.run_folder import INFO, RUN
 from cpunet.training.unfinished import UNFINISHED
 from cpunet.yaml_files import MAX_BYTES, plain_json
@@ -160,6 +162,43 @@ def read_json(path: Path) -> dict[str, Any] | None:
         raise CpunetError(f"{path}: cannot be read ({reason}); remove it") from error
     if not isinstance(content, dict):
         raise CpunetError(f"{path}: damaged (no mapping); remove it")
+    return content
+
+
+class _Seed(BaseModel):
+    """What became of a seed."""
+
+    state: Literal["trained", "failed"]
+    reason: str | None = None
+
+
+class _Study(BaseModel):
+    """What is gone on with, of an ensemble or a search."""
+
+    begun_with: dict[str, Any]
+    seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,9}$")], _Seed] = {}
+
+
+def read_study(path: Path, begun_with: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Read what a study was begun with, which must be the same; None if it was not begun.
+
+    Raises
+    ------
+    CpunetError
+        If the file was damaged, or the study begun with other settings or pulses.
+    """
+    content = read_json(path)
+    if content is None:
+        return None
+    try:
+        _Study.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        raise CpunetError(
+            f"{path}: damaged ({key}: {first['msg']}); begin again with --force"
+        ) from error
+    require_same(content["begun_with"], begun_with)
     return content
 
 

@@ -94,10 +94,10 @@ class Responses:
         Raises
         ------
         CpunetError
-            If the file is damaged.
+            If the file is damaged, or none of its traces is finite.
         """
         n, samples = self._shape
-        waiting = np.empty((0, samples), np.float32)
+        waiting, finite = np.empty((0, samples), np.float32), not len(self._index)
         with self._readable(), npz_files.member(self.path, _NAME) as stream:
             npz_files.read_header(stream)
             for first in range(0, n, size):
@@ -106,10 +106,13 @@ class Responses:
                 traces = np.frombuffer(raw, self._dtype).reshape(rows, samples)
                 begin, end = np.searchsorted(self._index, [first, first + rows])
                 chosen = traces[self._index[begin:end] - first].astype(np.float32)
+                finite = finite or bool(np.isfinite(chosen).all(axis=1).any())
                 waiting = np.concatenate([waiting, chosen])
                 if len(waiting) >= size:
                     yield waiting[:size]
                     waiting = waiting[size:]
+        if not finite:
+            raise CpunetError(f"{self.path}: no response is finite; give noise-free traces")
         if len(waiting):
             yield waiting
 

@@ -21,12 +21,12 @@ from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.recipes.schema import Recipe
-from cpunet.training.checkpoints import require_same
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
     ENSEMBLE_KIND,
     member_folder,
     read_json,
+    read_study,
     require_usable,
     working_folder,
     write_json,
@@ -128,8 +128,8 @@ class _Ensemble:
 
     def __init__(self, folder: Path, begun_with: dict[str, Any]) -> None:
         self.folder, self.path = folder, folder / ENSEMBLE
-        content = read_json(self.path) or {"begun_with": begun_with, "seeds": {}}
-        require_same(content["begun_with"], begun_with)
+        content = read_study(self.path, begun_with) or {"begun_with": begun_with}
+        content.setdefault("seeds", {})
         self.content = content
         for seed, entry in [*content["seeds"].items()]:
             if entry["state"] == FAILED:  # failed seeds are retried

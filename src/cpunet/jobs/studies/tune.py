@@ -41,9 +41,8 @@ from cpunet.jobs.studies.tuning_study import (
 from cpunet.outputs import FolderKind
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.checkpoints import require_same
 from cpunet.training.ensemble_folder import (
-    read_json,
+    read_study,
     require_usable,
     working_folder,
     write_json,
@@ -126,9 +125,7 @@ def tune_recipe(
     with working_folder(
         out, TUNE_KIND, resume=resume, force=force, alone=False, note=monitor.note
     ) as folder:
-        known = read_json(folder / TUNE)
-        if known is not None:
-            require_same(known["begun_with"], begun_with)
+        known = read_study(folder / TUNE, begun_with)
         write_json(folder / TUNE, known or {"begun_with": begun_with})
         study = open_study(folder, recipe)
         queue_first(study, recipe, space)

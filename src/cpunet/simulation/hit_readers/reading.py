@@ -127,7 +127,10 @@ def holds_hits(path: Path | str) -> bool:
         with opened(file) as content:
             return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
     if start.startswith(_ZIP_MAGIC):
-        return {"x_mm", "offsets"} <= set(npz_files.keys(file))
+        try:
+            return {"x_mm", "offsets"} <= set(npz_files.keys(file))
+        except npz_files.DAMAGED:
+            return False  # which the reader of pulses tells
     return start == _CSV_MAGIC
 
 
