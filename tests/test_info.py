@@ -246,6 +246,14 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_crystal_without_the_taper_is_not_turned_over(reference_data: Path):
+    """Upside down more hits would be inside, but the bore would be at the wrong end."""
+    path = reference_data / "geant4" / "g4_h20mm.npz"
+    told = describe(path, detector=read_detector("icpc"))["detectors"][""]["crystal"]
+    assert told["outside_percent"] == pytest.approx(10.5, abs=0.3)
+    assert "fits" not in told
+
+
 def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
     """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
     crystal = read_detector("icpc")
