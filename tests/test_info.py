@@ -275,3 +275,16 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
         main()
     assert f"{told['fits']['options']}\n" in capsys.readouterr().out
     assert re.fullmatch(r"--origin [\d.,-]+ --flip-z", told["fits"]["options"])
+
+
+def test_a_page_replaces_nothing_unasked(tmp_path):
+    path, page = tmp_path / "pulses.npy", tmp_path / "page.html"
+    np.save(path, np.tile(np.arange(300.0), (3, 1)))
+    with pytest.raises(CpunetError, match="pulses.npy"):
+        describe(path, dt_ns=16, out=path, force=True)
+    describe(path, dt_ns=16, out=page)
+    first = page.read_text("utf-8")
+    assert "What is in pulses.npy" in first
+    assert "Cs-137" in first
+    with pytest.raises(CpunetError, match="exists already"):
+        describe(path, dt_ns=16, out=page)
