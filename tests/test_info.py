@@ -280,7 +280,7 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
 def test_a_page_replaces_nothing_unasked(tmp_path):
     path, page = tmp_path / "pulses.npy", tmp_path / "page.html"
     np.save(path, np.tile(np.arange(300.0), (3, 1)))
-    with pytest.raises(CpunetError, match="pulses.npy"):
+    with pytest.raises(CpunetError, match=r"pulses\.npy"):
         describe(path, dt_ns=16, out=path, force=True)
     describe(path, dt_ns=16, out=page)
     first = page.read_text("utf-8")
