@@ -260,6 +260,14 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_crystal_without_the_taper_is_not_turned_over(reference_data: Path):
+    """Upside down more hits would be inside, but the bore would be at the wrong end."""
+    path = reference_data / "geant4" / "g4_h20mm.npz"
+    told = describe(path, detector=read_detector("icpc"))["detectors"][""]["crystal"]
+    assert told["outside_percent"] == pytest.approx(10.5, abs=0.3)
+    assert "fits" not in told
+
+
 def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
     """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
     crystal = read_detector("icpc")
@@ -281,3 +289,16 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
         main()
     assert f"{told['fits']['options']}\n" in capsys.readouterr().out
     assert re.fullmatch(r"--origin [\d.,-]+ --flip-z", told["fits"]["options"])
+
+
+def test_a_page_replaces_nothing_unasked(tmp_path):
+    path, page = tmp_path / "pulses.npy", tmp_path / "page.html"
+    np.save(path, np.tile(np.arange(300.0), (3, 1)))
+    with pytest.raises(CpunetError, match=r"pulses\.npy"):
+        describe(path, dt_ns=16, out=path, force=True)
+    describe(path, dt_ns=16, out=page)
+    first = page.read_text("utf-8")
+    assert "What is in pulses.npy" in first
+    assert "Cs-137" in first
+    with pytest.raises(CpunetError, match="exists already"):
+        describe(path, dt_ns=16, out=page)

@@ -217,9 +217,12 @@ def test_figures_draw_what_is_in_the_tables():
     drawn = figure.axes[0].lines[0].get_ydata()
     assert drawn.tolist() == [row["median"] for row in table["methods"]["data"]]
 
+    amplitude["raw"] = amplitude["raw"] + 100
     both = two_dimensional(amplitude, time, bootstraps=10)
     figure = two_dimensional_figure(both, "SEP")
     render(figure)
+    said = [[text.get_text() for text in axes.texts] for axes in figure.axes[:3]]
+    assert said == [[], ["no event in the\nrange of the data"], []]
     mesh = figure.axes[0].collections[0].get_array()
     assert mesh.sum() == pytest.approx(100 * np.sum(both["counts"]["data"]) / 900)
 

@@ -142,6 +142,11 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
         )
         axes.grid(visible=False)
         outside = 100 - share.sum()
+        if not share.any():
+            axes.text(
+                0.5, 0.5, "no event in the\nrange of the data", transform=axes.transAxes,
+                ha="center", va="center",
+            )  # fmt: skip
         axes.set_title(f"{label(method)}{_score(table, method)}\n{outside:.1f} % outside")
     for axes in grid.flat[len(shares) :]:
         axes.set_axis_off()

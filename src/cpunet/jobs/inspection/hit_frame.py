@@ -11,14 +11,19 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import Transform
 from cpunet.simulation.hits import Hits
 
-MOST = 200_000  # hits that are looked at
+MOST = 50_000  # hits that are looked at
 FITS = 0.999  # share inside above which the frame is right but for rounding at the surface
 BETTER = 0.02  # share by which another frame must be better than that of the file
+CELL_R_MM, CELL_Z_MM = 4.0, 8.0  # cells in which hits are counted
+EXPECTED, VOID = 20.0, 0.05  # hits of a cell that can be void; share below which it is
 AS_GIVEN = Transform()
 
 
 def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
     """Tell how many hits lie in a crystal, and which frame would have more of them inside.
+
+    A frame in which a part of the crystal has no hits, such as germanium where the hits leave
+    out a bore, does not fit, however many hits are inside.
 
     Parameters
     ----------
@@ -61,11 +66,11 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
     if as_given > FITS:
         return told
     # of equally good frames, the first: that of the file, not flipped
-    share, frame = max(
-        ((inside(frame), frame) for frame in _frames(position, detector)),
-        key=lambda one: one[0],
-    )
-    if share < as_given + BETTER:
+    shares = {frame: inside(frame) for frame in _frames(position, detector)}
+    better = [frame for frame in shares if shares[frame] >= as_given + BETTER]
+    better.sort(key=lambda frame: -shares[frame])
+    frame = next((f for f in better if not _has_void(f.apply(position), detector)), None)
+    if frame is None:
         return told
     origin = [float(value) for value in frame.origin_mm]
     words = [f"--origin {','.join(f'{value:g}' for value in origin)}"] if any(origin) else []
@@ -73,7 +78,7 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
         "fits": {
             "origin_mm": origin,
             "flip_z": frame.flip_z,
-            "inside_percent": 100 * share,
+            "inside_percent": 100 * shares[frame],
             "options": " ".join([*words, *(["--flip-z"] if frame.flip_z else [])]),
         }
     }
@@ -89,3 +94,18 @@ def _frames(position: np.ndarray[Any, Any], detector: Detector) -> Iterator[Tran
         for z in (0.0, length, near, far - length, (near + far - length) / 2):
             for x, y in centres:
                 yield Transform((round(x, 1) + 0.0, round(y, 1) + 0.0, round(z, 1) + 0.0), flip)
+
+
+def _has_void(position: np.ndarray[Any, Any], detector: Detector) -> bool:
+    """Whether a part of the crystal has no hits where others of the same height have many."""
+    x, y, z = position.T
+    r_edges = np.arange(0, detector.crystal_radius + CELL_R_MM, CELL_R_MM)
+    z_edges = np.arange(0, detector.crystal_length + CELL_Z_MM, CELL_Z_MM)
+    counts = np.histogram2d(np.hypot(x, y), z, (r_edges, z_edges))[0]
+    corners = detector.inside(*np.meshgrid(r_edges, z_edges, indexing="ij"))
+    whole = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
+    volume = np.diff(r_edges**2)[:, np.newaxis] * whole
+    layers = volume.sum(axis=0)
+    density = (counts * whole).sum(axis=0) / np.where(layers, layers, 1.0)
+    expected = volume * density
+    return bool((whole & (expected > EXPECTED) & (counts < VOID * expected)).any())

@@ -10,7 +10,7 @@ from cpunet.analysis.html_pages import figure_html, rendered
 from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.files import written_aside
 from cpunet.jobs.inspection.info_words import in_words
-from cpunet.pulses.spectrum import SOURCES
+from cpunet.pulses.spectrum import CAESIUM, LINE_KEV, SOURCES
 
 Spectra = dict[str, Spectrum]  # by channel; "" for a file of one
 
@@ -41,7 +41,7 @@ def write_info_page(out: Path, told: Mapping[str, Any], spectra: Spectra) -> Non
         title=f"What is in {Path(told['path']).name}",
         path=told["path"],
         sections=[_section(name, one, spectra.get(name)) for name, one in of_each.items()],
-        sources=SOURCES,
+        sources=SOURCES | {CAESIUM: (LINE_KEV,)},
     )
     with written_aside(out) as aside:
         aside.write_text(html, encoding="utf-8")

@@ -129,7 +129,7 @@ def _frame(crystal: Mapping[str, Any]) -> str:
         return f"{fits['inside_percent']:.2f} % would be inside with {fits['options']}"
     if crystal["outside_percent"] < 1:
         return "that of the crystal"
-    return "no other fits better; another detector, or its dimensions"
+    return "no other fits; these hits are of another detector, or of other dimensions"
 
 
 def _run(told: Mapping[str, Any]) -> Lines:
