@@ -153,7 +153,7 @@ def test_too_little_memory(command, words, tmp_path, monkeypatch, error, line):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr("cpunet.jobs.training.train.train", fail)
+    monkeypatch.setattr("cpunet.jobs.training.cyclegan_trainer.train", fail)
     outcome = command(*words)
     assert outcome.code == 2
     assert outcome.err.splitlines()[-1] == line
