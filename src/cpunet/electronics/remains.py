@@ -286,7 +286,7 @@ def _require_empty(fit: RateFit) -> None:
     if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
         raise CpunetError(
             "nearly all traces lie on remains of earlier pulses, so that the level of an empty "
-            "baseline is not seen and nothing is told of them; measure at a lower rate"
+            "baseline is not seen and they cannot be measured; measure at a lower rate"
         )
 
 
@@ -330,7 +330,7 @@ def _tail_decay_us(slopes: FloatArray) -> float:
     slope = float(np.median(slopes))
     if not slope < 0:
         raise CpunetError(
-            "the tails of the traces do not decay, so nothing of earlier pulses can be told; "
+            "the tails of the traces do not decay, so nothing is known of earlier pulses; "
             "are these measured traces?"
         )
     return -1e3 / slope

@@ -117,7 +117,7 @@ def describe(
     except CpunetError as error:
         if without_remains is not None:
             raise CpunetError(f"{path}: {error}") from error
-        return told | {"remains": f"cannot be told: {error}"}
+        return told | {"remains": f"not known: {error}"}
     if without_remains is not None:
         refuse_inputs(without_remains, path, energy)
         _write_without(source, remains, without_remains, force=force)
