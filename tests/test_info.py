@@ -89,7 +89,7 @@ def test_remains_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
     told = describe(path, recipe=RECIPE)
-    assert told["remains"].startswith("cannot be told: only 0 of 40 traces can be prepared")
+    assert told["remains"].startswith("not known: only 0 of 40 traces can be prepared")
     with pytest.raises(CpunetError, match="only 0 of 40 traces"):
         describe(path, recipe=RECIPE, without_remains=tmp_path / "flat.lh5")
     write_pulses(tmp_path / "sim.lh5", Pulses.of(np.tile(np.arange(400), (9, 1)), dt_ns=16))

@@ -200,7 +200,7 @@ def test_metrics_have_their_schema(report, trained):
         assert 18 <= scores["n_data"] <= 24
         assert set(scores["parameters"]) == PARAMETERS
         for comparison in scores["parameters"].values():
-            # too few pulses to fit the rivals to, but the truth needs no fit
+            # too few pulses to fit baseline methods to, but the truth needs no fit
             methods = {"raw", "ren", "truth_no_noise"}
             assert methods <= set(comparison["wasserstein"]) == set(comparison["ks"])
             assert {*comparison["wasserstein"], "ceiling"} == set(comparison["iou"])

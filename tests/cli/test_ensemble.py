@@ -45,7 +45,7 @@ def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
     assert "Traceback" not in told
     if how == signal.SIGINT:
         assert job.exitcode == 130
-        assert "go on with --resume" in told.splitlines()[-1]
+        assert "continue with --resume" in told.splitlines()[-1]
     assert all((one / "checkpoint.safetensors").exists() for one in unfinished)
     if how == signal.SIGKILL:
         return
@@ -69,5 +69,5 @@ def test_a_table_and_a_figure(stand, tiny, command, tmp_path, no_pool):
     assert str(folder / "seeds.png") in done.out
     again = command("ensemble", *words)
     assert again.code == 2
-    assert "exists already; go on with --resume" in again.err
+    assert "exists already; continue with --resume" in again.err
     assert os.listdir(tmp_path) == ["ens"]  # noqa: PTH208

@@ -61,7 +61,7 @@ def test_a_signal_stops_between_two_iterations(
     assert stopped.out == ""
     told = stopped.err.splitlines()
     assert "stopping after this iteration; once more to stop at once" in told
-    assert told[-1] == "error: stopped after 3 of 4 iterations; go on with --resume"
+    assert told[-1] == "error: stopped after 3 of 4 iterations; continue with --resume"
     assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
     assert command(*words, "--resume").code == 0
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -102,7 +102,7 @@ def test_what_can_be_done_with_an_unfinished_training(
         return outcome.err.splitlines()[-1]
 
     assert refused() == (
-        f"error: {folder}: an unfinished training; go on with --resume, or begin again with "
+        f"error: {folder}: an unfinished training; continue with --resume, or begin again with "
         "--force"
     )
     assert refused("--resume", "--set", "training.batch_size=5") == (
@@ -153,7 +153,7 @@ def test_too_little_memory(command, words, tmp_path, monkeypatch, error, line):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr("cpunet.jobs.training.train.train", fail)
+    monkeypatch.setattr("cpunet.jobs.training.cyclegan_trainer.train", fail)
     outcome = command(*words)
     assert outcome.code == 2
     assert outcome.err.splitlines()[-1] == line

@@ -34,7 +34,7 @@ TINY = (
 )
 RECIPE = load_recipe("small", TINY)
 EVENTS = {"FEP": 240, "SEP": 60, "DEP": 60}
-RIVALS = ("rc", "gauss_exp", "superpulse")
+BASELINE_METHODS = ("rc", "gauss_exp", "superpulse")
 
 
 OPTIONS = {
@@ -72,16 +72,16 @@ def test_every_rival_and_the_truth_stand_beside_the_ren(
 ) -> None:
     _, metrics = whole
     assert metrics["rivals"]["missing"] == {}
-    assert set(metrics["rivals"]["fits"]) == set(RIVALS)
+    assert set(metrics["rivals"]["fits"]) == set(BASELINE_METHODS)
     for peak in EVENTS:
         scores = metrics["peaks"][peak]
         iou = scores["parameters"]["current_amplitude"]["iou"]
-        for method in (*RIVALS, "truth"):
+        for method in (*BASELINE_METHODS, "truth"):
             assert {method, f"{method}_no_noise"} <= set(iou)
-        assert set(scores["paired"]) == {"raw", *RIVALS, "ren"}
+        assert set(scores["paired"]) == {"raw", *BASELINE_METHODS, "ren"}
         # a response fitted to the data comes nearer to the truth than none
         edges = {method: paired["edge_rmse"] for method, paired in scores["paired"].items()}
-        assert max(edges[rival] for rival in RIVALS) < edges["raw"] / 3
+        assert max(edges[rival] for rival in BASELINE_METHODS) < edges["raw"] / 3
 
 
 def test_finished_parts_are_kept_and_a_whole_one_is_refused(

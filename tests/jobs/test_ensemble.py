@@ -160,7 +160,7 @@ def test_going_on_keeps_what_is_finished_and_records_what_fails(files, made, tmp
 
 
 def test_no_folder_is_overwritten_by_mistake(files, made, tmp_path):
-    with pytest.raises(CpunetError, match="exists already; go on with --resume"):
+    with pytest.raises(CpunetError, match="exists already; continue with --resume"):
         train_ensemble(*files, made.folder, RECIPE, device="cpu")
     mine = tmp_path / "mine"
     mine.mkdir()

@@ -198,7 +198,7 @@ def test_a_stop_is_kept(tiny, sets):
         lambda state: states.append(state["iteration"]), stop=lambda: next(asked)
     )
     with pytest.raises(
-        StoppedError, match=r"^stopped after 3 of 4 iterations; go on with --res"
+        StoppedError, match=r"^stopped after 3 of 4 iterations; continue with --res"
     ):
         train(*sets, tiny(), seed=0, hooks=hooks)
     assert states == [3]

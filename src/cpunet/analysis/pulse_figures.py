@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import DATA_FILL, colours, label, styled
-from cpunet.electronics.rivals.superpulses import fitted_tail_slope, without_decay
+from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 

@@ -150,7 +150,7 @@ def calibrate(
     events
         Simulated events, at most, that are drifted again and again.
     seed
-        Of everything random.
+        Seed of all random numbers.
     force
         Replace what this program wrote there.
     progress

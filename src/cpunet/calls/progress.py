@@ -135,7 +135,7 @@ class NotebookMonitor(Monitor):
 
 
 class NotesKept(Monitor):
-    """Passes on all that it is told, and keeps the notes."""
+    """Pass everything on, and keep the notes."""
 
     def __init__(self, passed_to: Monitor) -> None:
         self._passed_to = passed_to

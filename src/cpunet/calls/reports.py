@@ -46,7 +46,7 @@ class Report:
     folder
         Of the report; None if none was written.
     notes
-        What was told meanwhile.
+        Notes of the job.
     drawn
         What the figures are drawn of, by name.
     """

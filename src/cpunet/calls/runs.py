@@ -211,13 +211,13 @@ def train(
     peak
         Energies to train on: a line, or ranges in keV, such as ``"FEP,1000-1580"``.
     seed
-        Of everything random.
+        Seed of all random numbers.
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     init
         A run of another detector or period to start from.
     resume
-        Go on with an unfinished training of a network.
+        Resume an unfinished training of a network.
     force
         Replace what this program wrote there.
     progress

@@ -54,7 +54,7 @@ class Translation:
     path
         The file they were written to; None if they are in memory only.
     notes
-        What was told meanwhile.
+        Notes of the job.
     kept
         The pulses and the codes of their rejections if they are in memory.
     """
@@ -200,7 +200,7 @@ def translate(
     pile_up_khz
         Rate in kHz of second pulses within a trace.
     realisations
-        Draw the noise so many times for each pulse.
+        Number of noise draws for each pulse.
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     resume

@@ -34,7 +34,7 @@ Validate = Annotated[
     bool, typer.Option("--validate/--no-validate", help="Score each seed, or not.")
 ]
 Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on in OUT; give all other options as before.")
+    bool, typer.Option("--resume", help="Resume in OUT; give all other options as before.")
 ]
 
 
@@ -88,7 +88,7 @@ def ensemble(
             monitor=monitor(),
         )
     except SystemExit:
-        err.print("finished seeds are kept; go on with --resume", markup=False)
+        err.print("finished seeds are kept; continue with --resume", markup=False)
         raise
     if told["table"]:
         tell_table(_table(told))

@@ -76,7 +76,7 @@ LowRank = Annotated[
     int | None,
     typer.Option(
         "--low-rank",
-        help="With simflow: so many components in place of whole templates.",
+        help="With simflow: number of components in place of whole templates.",
         min=1,
         max=1000,
     ),

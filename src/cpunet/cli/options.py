@@ -46,7 +46,7 @@ class Impurities(StrEnum):
 Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
 Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="RUN")]
-Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of everything random.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of all random numbers.")]
 Threads = Annotated[
     int | None,
     typer.Option(min=1, max=MAX_THREADS, help="CPU threads; all cores by default."),
@@ -99,7 +99,7 @@ Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]
 Rivals = Annotated[
-    bool, typer.Option("--rivals/--no-rivals", help="Fit the rival methods too, or not.")
+    bool, typer.Option("--rivals/--no-rivals", help="Fit the baseline methods too, or not.")
 ]
 Crystal = Annotated[
     Path | None,

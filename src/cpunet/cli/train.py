@@ -19,7 +19,7 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:  # torch takes seconds to import
-    from cpunet.training.team import Launch
+    from cpunet.training.process_group import Launch
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 RecipeName = Annotated[
@@ -35,9 +35,7 @@ Set = Annotated[
 ]
 Resume = Annotated[
     bool,
-    typer.Option(
-        "--resume", help="Go on with OUT.unfinished; give all other options as before."
-    ),
+    typer.Option("--resume", help="Resume OUT.unfinished; give all other options as before."),
 ]
 Init = Annotated[
     Path | None,
@@ -88,7 +86,7 @@ def train(
     from cpunet.jobs.training.train_channels import train_channels
     from cpunet.recipes import load_recipe
     from cpunet.training.loop import StoppedError
-    from cpunet.training.team import ToldElsewhereError, launch
+    from cpunet.training.process_group import ToldElsewhereError, launch
 
     refuse_inputs(out_folder, recipe)
     if threads is not None:
@@ -145,14 +143,14 @@ def _in_words(info: dict[str, Any]) -> str:
 
 
 def _follows(launched: Launch | None) -> bool:
-    return launched is not None and not launched.team.leads
+    return launched is not None and not launched.group.leads
 
 
 class _StopRequest:
     """Ctrl-C and batch systems stop a training between two iterations, with its state stored.
 
     A second signal, or one before anyone asks whether to stop, acts as it did before.  In a
-    team a second one says nothing new, since batch system and torchrun may both pass on the
+    group a second one says nothing new, since batch system and torchrun may both pass on the
     first, and torchrun itself ends what goes on for too long.
     """
 
@@ -170,7 +168,7 @@ class _StopRequest:
 
     @property
     def status(self) -> int:
-        """Of the process that stopped; in a team, the signal may have come to another one."""
+        """Of the process that stopped; in a group, the signal may have come to another one."""
         return 128 + (self.signal or signal.SIGTERM)
 
     def __enter__(self) -> Self:

@@ -56,7 +56,7 @@ Realisations = Annotated[
     typer.Option(
         min=1,
         max=options.MAX_REALISATIONS,
-        help="Draw the noise so many times: rows repeated, and counted.",
+        help="Number of noise draws for each pulse: rows are repeated and numbered.",
     ),
 ]
 Table = Annotated[

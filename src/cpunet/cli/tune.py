@@ -71,7 +71,7 @@ def tune(
             monitor=monitor(),
         )
     except SystemExit:
-        err.print("finished trials are kept; go on with --resume", markup=False)
+        err.print("finished trials are kept; continue with --resume", markup=False)
         raise
     tell_table(_table(told))
     best, first = told["best"], told["first"]

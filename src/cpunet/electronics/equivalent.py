@@ -1,7 +1,7 @@
 """A readout chain in two numbers, Gaussian ⊗ exponential, as production simulations have it.
 
 They are fitted as there: to the averaged current about its maximum, weighted with its square.
-What two numbers cannot follow is told with them.
+The part that two numbers cannot describe is reported with them.
 """
 
 from __future__ import annotations

@@ -252,5 +252,5 @@ def _require_empty(fit: RateFit) -> None:
     if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
         raise CpunetError(
             "nearly all traces lie on remains of earlier pulses, so that the level of an empty "
-            "baseline is not seen and nothing is told of them; measure at a lower rate"
+            "baseline is not seen and they cannot be measured; measure at a lower rate"
         )

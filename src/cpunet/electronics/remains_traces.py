@@ -98,7 +98,7 @@ def _tail_decay_us(slopes: FloatArray) -> float:
     slope = float(np.median(slopes))
     if not slope < 0:
         raise CpunetError(
-            "the tails of the traces do not decay, so nothing of earlier pulses can be told; "
+            "the tails of the traces do not decay, so nothing is known of earlier pulses; "
             "are these measured traces?"
         )
     return -1e3 / slope

@@ -185,12 +185,12 @@ def _spline(frequency: Tensor) -> Tensor:
 
 
 def record_length(samples: int) -> int:
-    """Samples of the record that a window of so many becomes."""
+    """Length of the record of a window of this length, in samples."""
     return PADDING_BEFORE + samples + PADDING_AFTER
 
 
 def padded_length(length: int) -> int:
-    """Samples of the transform of a record of so many."""
+    """Length of the Fourier transform of a record of this length, in samples."""
     return fast_length(math.ceil(_MIN_FACTOR * length))
 
 

@@ -33,7 +33,7 @@ _ABSENT = "none"
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A state, and what is to be known of the training that it belongs to."""
+    """A state, and what identifies its training."""
 
     state: State
     facts: dict[str, Any]
@@ -119,7 +119,7 @@ def _read(path: Path) -> Checkpoint | None:
 
 
 def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on with other settings or pulses.
+    """Refuse to resume with other settings or pulses.
 
     Parameters
     ----------

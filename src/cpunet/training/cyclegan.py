@@ -29,8 +29,8 @@ from cpunet.training.fast_step import (
 from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
 from cpunet.training.outside import Outside, tolerance
+from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.surroundings import NONE, Surroundings
-from cpunet.training.team import ALONE, Team
 
 LOSS_NAMES = (
     "identity_data",
@@ -91,8 +91,8 @@ class Step:
         What is trained, and how.
     fast
         Whether to take the passes of `cpunet.training.fast_step`; as it pays if None.
-    team
-        Who trains, each on its own batches; see also `cpunet.training.team_norm`.
+    group
+        Who trains, each on its own batches; see also `cpunet.training.group_norm`.
     outside
         What is added to translations before they are judged; nothing if None.
     chain
@@ -105,7 +105,7 @@ class Step:
         config: TrainingConfig,
         *,
         fast: bool | None = None,
-        team: Team = ALONE,
+        group: ProcessGroup = ALONE,
         outside: Outside | None = None,
         chain: ChainStep | None = None,
     ) -> None:
@@ -114,7 +114,7 @@ class Step:
         self.accuracy: dict[str, Tensor] = {}  # of the judges, if this iteration updates them
         self._right = torch.empty(0, dtype=torch.bool)
         self.config = config
-        self.team = team
+        self.group = group
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
         self.noise = config.instance_noise
@@ -122,8 +122,8 @@ class Step:
             generator_pass(network, config.precision, compiled=config.compiled)
             for network in (model.ren, model.iren)
         )
-        # fast passes have batch norms of their own, which know no team
-        plain = config.compiled or config.precision != "float32" or team.size > 1
+        # fast passes have batch norms of their own, which know no group
+        plain = config.compiled or config.precision != "float32" or group.size > 1
         pays = fast_passes_pay(model.ren, device.type) and not plain
         self.fast = pays if fast is None else fast
 
@@ -153,7 +153,7 @@ class Step:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where a step of the same settings was."""
+        """Restore the state of a step of the same settings."""
         optimisers = (self.generators, *self.discriminators)
         for optimiser, own in zip(optimisers, state["optimisers"], strict=True):
             # a file knows names only, the optimisers count their parameters
@@ -173,7 +173,7 @@ class Step:
         """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
 
         With noise outside, `rows` say which pulses the simulated ones are.  Discriminator
-        losses are there only in iterations that update them.  In a team, losses are the means
+        losses are there only in iterations that update them.  In a group, losses are the means
         of all processes'.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
@@ -182,10 +182,10 @@ class Step:
         if iteration % self.config.discriminator_interval == 0:
             names = ("discriminator_data", "discriminator_sim")
             losses |= self._update_discriminators(dict(zip(names, judged, strict=True)))
-            self.accuracy = self.team.mean(self.accuracy)
+            self.accuracy = self.group.mean(self.accuracy)
         for schedule in self.schedules:
             schedule.step()
-        return self.team.mean({name: loss.detach() for name, loss in losses.items()})
+        return self.group.mean({name: loss.detach() for name, loss in losses.items()})
 
     def generator_losses(
         self, sim: Tensor, data: Tensor, rows: Tensor | None = None
@@ -257,7 +257,7 @@ class Step:
         losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
-        self.team.average_gradients(model.generator_parameters())
+        self.group.average_gradients(model.generator_parameters())
         clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
         self.generators.step()
         for network in discriminators:
@@ -296,7 +296,7 @@ class Step:
             )
             optimiser.zero_grad(set_to_none=True)
             (loss + penalty).backward()  # type: ignore[no-untyped-call]
-            self.team.average_gradients(network.parameters())
+            self.group.average_gradients(network.parameters())
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss

@@ -5,7 +5,7 @@
 ``seed_000``, ``seed_001``, …
     Run folders; with ``metrics.json`` if they were scored.
 ``seed_002.unfinished``
-    A training to go on with, see `cpunet.training.unfinished`.
+    A training that can be resumed, see `cpunet.training.unfinished`.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def finished_members(ensemble: Path) -> list[Path]:
 def require_usable(
     out: Path, kind: FolderKind, *inputs: Given, resume: bool, force: bool
 ) -> None:
-    """Raise a `CpunetError` if `out` is there and may be neither gone on with nor replaced."""
+    """Raise a `CpunetError` if `out` exists and can be neither resumed nor replaced."""
     out = Path(out)
     refuse_inputs(out, *inputs)
     if out.exists() and not (resume or force):
         raise CpunetError(
-            f"{out}: exists already; go on with --resume, or choose another name or --force"
+            f"{out}: exists already; continue with --resume, or choose another name or --force"
         )
     left = {path.name for path in out.iterdir()} if out.is_dir() else set()
     if left != {_LOCK}:  # of a process that was stopped before it had begun
@@ -114,7 +114,7 @@ def working_folder(
     alone
         Keep other processes out.
     note
-        Told of what is kept of an old folder.
+        Receiver of notes on what is kept of an old folder.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def working_folder(
     except OSError as error:
         raise CpunetError(
             f"{out}: cannot be written ({error.strerror or error}); what is finished is kept, "
-            "go on with --resume"
+            "continue with --resume"
         ) from error
 
 

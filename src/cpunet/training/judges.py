@@ -31,7 +31,7 @@ def judges_noted(records: Sequence[Record]) -> list[str]:
         if mean > WON:
             lines.append(
                 f"the judge of {side} has won: it is right {100 * mean:.0f} % of the time, so "
-                "translations are still told at sight; train longer or lower "
+                "translations are still easily distinguished; train longer or lower "
                 "training.rate_discriminators"
             )
         elif mean < LOST:

@@ -23,7 +23,7 @@ UPDATES = 2  # steps with derivatives that were only updated
 
 
 class Unknowns(Protocol):
-    """What is to be found, as a vector, and how far each may go in a step."""
+    """Free parameters as a vector, and the largest step of each."""
 
     widths: Values
 
@@ -78,7 +78,7 @@ def levenberg_marquardt(
     steps
         The most there may be.
     listener
-        Told step and chi-square.
+        Called with step and chi-square.
     coarse
         Whether it begins far from the data.
 

@@ -18,13 +18,13 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
+from cpunet.training.group_norm import share_norms
 from cpunet.training.pairs import learn_pairs
+from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
 from cpunet.training.surroundings import NONE, Surroundings
-from cpunet.training.team import ALONE, Team
-from cpunet.training.team_norm import share_norms
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
@@ -47,9 +47,9 @@ class CheckpointHooks:
         before a stop, always after the listener has had all records before it.  The
         tensors go on changing once it returns.
     start
-        A state to go on from; the same in all processes of a team.
+        A state to go on from; the same in all processes of a group.
     stop
-        Asked after each iteration whether to stop there; a team stops if any process should.
+        Asked after each iteration whether to stop there; a group stops if any process should.
     """
 
     save: Callable[[State], None]
@@ -71,12 +71,12 @@ def train(
     surroundings: Surroundings = NONE,
     listener: Listener | None = None,
     hooks: CheckpointHooks = NOTHING_KEPT,
-    team: Team = ALONE,
+    group: ProcessGroup = ALONE,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
     The same seed on the same machine gives the same weights, whether the training was
-    interrupted and went on or not.  The processes of a team train on the same sets, end with
+    interrupted and went on or not.  The processes of a group train on the same sets, end with
     the same weights, and those are what one process gives, up to rounding and the noise drawn.
 
     Parameters
@@ -99,13 +99,13 @@ def train(
         and ``"accuracy"`` of the judges where they were updated.
     hooks
         Where the state goes and comes from, and whether to stop.
-    team
+    group
         Who trains; `listener` and ``hooks.save`` are called where it leads.
 
     Raises
     ------
     CpunetError
-        If a set is empty, a team cannot share the batches, or a loss becomes NaN or infinite.
+        If a set is empty, a group cannot share the batches, or a loss becomes NaN or infinite.
     StoppedError
         If `hooks` asked to stop.
     """
@@ -120,22 +120,22 @@ def train(
             behind = ChainStep(*surroundings.chain, model.ren, model.iren, recipe)
         samplers = [
             EpochSampler(
-                torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, team
+                torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, group
             )
             for side, pulses in zip(_sampler_seeds(seed), (sim, data), strict=True)
         ]
         if hooks.start is None:
             _begin(model, samplers, recipe, surroundings, behind, init)
-        team.follow(model.state_dict().values())
-        share_norms(model, team)
-        step = Step(model, config, team=team, outside=surroundings.outside, chain=behind)
+        group.follow(model.state_dict().values())
+        share_norms(model, group)
+        step = Step(model, config, group=group, outside=surroundings.outside, chain=behind)
         training = _Training(step, samplers, device)
-        if team.size > 1:
-            _reseed(seed, team.rank, 0)
+        if group.size > 1:
+            _reseed(seed, group.rank, 0)
         if hooks.start is not None:
             training.load_state_dict(hooks.start, seed)
         try:
-            _iterate(training, listener if team.leads else None, hooks)
+            _iterate(training, listener if group.leads else None, hooks)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
@@ -174,7 +174,7 @@ class _Training:
 
     def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
         self.step, self.samplers = step, samplers
-        self.model, self.config, self.team = step.model, step.config, step.team
+        self.model, self.config, self.group = step.model, step.config, step.group
         self.device = torch.device(device)
         model, config = self.model, self.config
         average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
@@ -203,10 +203,10 @@ class _Training:
         own = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             own["cuda"] = torch.cuda.get_rng_state(self.device)
-        of_all = {where: self.team.gathered(state) for where, state in own.items()}
+        of_all = {where: self.group.gathered(state) for where, state in own.items()}
         random = [
             {where: states[rank] for where, states in of_all.items()}
-            for rank in range(self.team.size)
+            for rank in range(self.group.size)
         ]
         return {
             "iteration": self.iteration,
@@ -218,7 +218,7 @@ class _Training:
         }
 
     def load_state_dict(self, state: State, seed: int) -> None:
-        """Go on where a training of the same pulses, settings and seed was."""
+        """Restore the state of a training of the same pulses, settings and seed."""
         self.iteration = state["iteration"]
         self.model.load_state_dict(state["model"])
         for averaged, own in zip(self.averages, state["averages"], strict=True):
@@ -227,8 +227,8 @@ class _Training:
         for sampler, own in zip(self.samplers, state["decks"], strict=True):
             sampler.load_state_dict(own)
         random = state["random"]
-        rank = self.team.rank
-        if rank >= len(random):  # of a larger team than before
+        rank = self.group.rank
+        if rank >= len(random):  # of a larger group than before
             _reseed(seed, rank, self.iteration)
             return
         torch.set_rng_state(random[rank]["cpu"])
@@ -243,7 +243,7 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
         pending.append(training.advance())
         done = training.iteration
         last = done == config.iterations
-        stop = training.team.any(hooks.stop()) and not last
+        stop = training.group.any(hooks.stop()) and not last
         keep = last or stop or done % config.checkpoint_interval == 0
         # values are fetched in bunches: each fetch makes a GPU wait
         if keep or len(pending) == config.log_interval:
@@ -255,11 +255,12 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
         if keep:
             _require_finite_weights(training)
             state = training.state_dict()
-            if training.team.leads:
+            if training.group.leads:
                 hooks.save(state)
         if stop:
             raise StoppedError(
-                f"stopped after {done} of {config.iterations} iterations; go on with --resume"
+                f"stopped after {done} of {config.iterations} iterations; "
+                "continue with --resume"
             )
 
 
@@ -300,7 +301,7 @@ def _sampler_seeds(seed: int) -> Iterator[int]:
 
 
 def _reseed(seed: int, rank: int, iteration: int) -> None:
-    """Let each process of a team draw noise of its own."""
+    """Let each process of a group draw noise of its own."""
     (mixed,) = np.random.SeedSequence([seed, rank, iteration]).generate_state(1, np.uint64)
     torch.manual_seed(int(mixed))
 

@@ -151,7 +151,7 @@ def fit_response(
     remains
         Of earlier pulses, that the data have and the translations are to be given.
     listener
-        Told step and chi-square.
+        Called with step and chi-square.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def _with_wrong_physics(
 
 
 def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
-    """What is told of a response that has been found."""
+    """Describe the fit of a response."""
     parameters = problem.parameters
     vector = parameters.vector()
     pulls, deviations = problem.pulls(vector), problem.deviations(vector)
@@ -263,6 +263,6 @@ def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
 
 
 def _counted(listener: Listener) -> Listener:
-    """A listener told the steps of all fits as one count."""
+    """Make a listener that counts the steps of all fits."""
     steps = itertools.count(1)
     return lambda _, chi_square: listener(next(steps), chi_square)

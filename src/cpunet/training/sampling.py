@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpunet.training.team import ALONE, Team
+from cpunet.training.process_group import ALONE, ProcessGroup
 
 
 class EpochSampler:
@@ -23,7 +23,7 @@ class EpochSampler:
         Pulses per batch; smaller sets are drawn with replacement.
     seed
         Seed of the order.
-    team
+    group
         Process group: all draw the same batches, and each process takes its share.
 
     Raises
@@ -32,11 +32,13 @@ class EpochSampler:
         If a batch cannot be shared equally.
     """
 
-    def __init__(self, pulses: Tensor, batch_size: int, seed: int, team: Team = ALONE) -> None:
+    def __init__(
+        self, pulses: Tensor, batch_size: int, seed: int, group: ProcessGroup = ALONE
+    ) -> None:
         self.pulses = pulses
         self.batch_size = batch_size
-        share = team.share_of(batch_size)
-        self._own = slice(team.rank * share, (team.rank + 1) * share)
+        share = group.share_of(batch_size)
+        self._own = slice(group.rank * share, (group.rank + 1) * share)
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
         self.last_rows = torch.empty(0, dtype=torch.long)

@@ -31,7 +31,7 @@ def refresh_batch_statistics(
     network
         A generator; its mode (training or evaluation) is left as it was.
     sampler
-        Pulses of the side that it translates; in a team, that of the batch norms.
+        Pulses of the side that it translates; in a group, that of the batch norms.
     batches
         How many batches to average over.
     run

@@ -107,7 +107,7 @@ def unfinished_folder(
             mark(folder, UNFINISHED, listed=False)
             if has_checkpoint(folder) and not (resume or force):
                 raise CpunetError(
-                    f"{folder}: an unfinished training; go on with --resume, or begin again "
+                    f"{folder}: an unfinished training; continue with --resume, or begin again "
                     "with --force"
                 )
             finished = False
@@ -121,7 +121,7 @@ def unfinished_folder(
     except OSError as error:
         raise CpunetError(
             f"{folder}: cannot be written ({error.strerror or error}); what is stored is kept, "
-            "go on with --resume"
+            "continue with --resume"
         ) from error
 
 

@@ -67,7 +67,7 @@ class EnsembleREN(REN):
         """
         runs = finished_members(Path(ensemble))
         if len(runs) < 2:
-            raise CpunetError(f"{ensemble}: one finished seed only; go on with --resume")
+            raise CpunetError(f"{ensemble}: one finished seed only; continue with --resume")
         return cls([REN.load(run, device) for run in runs])
 
     @property

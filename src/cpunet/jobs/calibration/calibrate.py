@@ -46,9 +46,9 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.process_group import ProcessGroup
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run_folder import RUN, write_run
-from cpunet.training.team import Team
 
 QUIET = Monitor()
 CALIBRATION, PAGE, SIM = "calibration.json", "calibration.html", "sim.lh5"
@@ -155,8 +155,8 @@ class Calibration:
                 InputFile(folder / SIM), self.recipe, sides.selection, monitor
             )
             job = TrainingJob(
-                self.recipe, self.peak, self.seed, "cpu", Team(), None, again, sides.data,
-                self.data, folder, monitor,
+                self.recipe, self.peak, self.seed, "cpu", ProcessGroup(), None, again,
+                sides.data, self.data, folder, monitor,
             )  # fmt: skip
             trainer = ResponseTrainer(self.recipe)
             model, info, recipe = trainer.train(job, known=calibrated.response)

@@ -178,7 +178,7 @@ def _of_pulses(
     except CpunetError as error:
         if without_remains is not None:
             raise CpunetError(f"{path}: {error}") from error
-        return told | {"remains": f"cannot be told: {error}"}, counts.spectrum()
+        return told | {"remains": f"not known: {error}"}, counts.spectrum()
     if without_remains is not None:
         _write_without(source, remains, without_remains, force=force)
     return told | {"remains": remains.describe()}, counts.spectrum()

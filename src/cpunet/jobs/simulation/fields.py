@@ -45,7 +45,7 @@ def describe_fields(
     force
         Replace an existing picture.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------

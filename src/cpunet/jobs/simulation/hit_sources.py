@@ -130,7 +130,7 @@ class HitFile:
         return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
 
     def provenance(self) -> dict[str, Any]:
-        """What the output tells of its hits."""
+        """Description of the hits, for the output."""
         return {
             "file": str(self.path),
             "table": self.table,
@@ -220,7 +220,7 @@ class GammaSource:
         return OpenHits(total, self._blocks(detector, -(-total // _ROUND_EVENTS)))
 
     def provenance(self) -> dict[str, Any]:
-        """What the output tells of its hits."""
+        """Description of the hits, for the output."""
         return {
             "monte_carlo": "Tl-208, 2614.511 keV",
             "windows_kev": _by_name(self.windows),

@@ -62,7 +62,7 @@ def write_library(
     force
         Replace an existing file.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------

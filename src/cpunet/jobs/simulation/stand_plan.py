@@ -90,7 +90,7 @@ class StandPlan:
     sim, data
         The two sides.
     seed
-        Of everything random.
+        Seed of all random numbers.
     readout_seed
         Of the noise and what else the readout adds, drawn from `seed`.
     """
@@ -150,7 +150,7 @@ class StandPlan:
         return cls(electronics, kind, shift, sim, data, seed, readout_seed)
 
     def provenance(self) -> dict[str, Any]:
-        """What ``stand.json`` tells of how the stand was made."""
+        """Provenance for ``stand.json``."""
         sides = {
             name: {
                 "detector": side.detector.model_dump(mode="json"),

@@ -109,7 +109,7 @@ def check(
     peak
         Energies, as of a training.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Raises
     ------

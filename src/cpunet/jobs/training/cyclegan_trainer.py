@@ -15,13 +15,13 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
 from cpunet.recipes.schema import Recipe
+from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.held_out import Kept
 from cpunet.training.judges import judges_noted
 from cpunet.training.loop import CheckpointHooks, Listener, Record, train
 from cpunet.training.network_gate import NetworkGate
+from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import read_losses, weights_sha256
-from cpunet.training.team import Team
-from cpunet.training.team_state import require_same_everywhere, share_state
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
 # settings of logs and checkpoints, which change no weight
@@ -38,14 +38,14 @@ class CycleGanTrainer:
         self.config = recipe.cyclegan.training
         self.steps = self.config.iterations
 
-    def require_shareable(self, team: Team) -> None:
+    def require_shareable(self, group: ProcessGroup) -> None:
         """Refuse processes that cannot share the batches, or would all match a chain first."""
         if self.recipe.chain is not None:
             raise CpunetError(
                 f"recipe {self.recipe.name}: takes minutes in one process, its chain being "
                 "matched first; start it without torchrun"
             )
-        team.share_of(self.config.batch_size)
+        group.share_of(self.config.batch_size)
 
     def less_memory(self, processes: int) -> str:
         """Return what to change if the memory does not suffice."""
@@ -74,14 +74,14 @@ class CycleGanTrainer:
     ) -> Trained | None:
         """Train or resume; return None in a process that does not lead."""
         fingerprint = _fingerprint(job)
-        require_same_everywhere(job.team, fingerprint)
-        if not job.team.leads:
-            state = share_state(job.team, None)
+        require_same_everywhere(job.group, fingerprint)
+        if not job.group.leads:
+            state = share_state(job.group, None)
             hooks = CheckpointHooks(lambda _state: None, state, stop)
             self._trained(job, self._start(job), hooks, None)
             return None
         run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
-        state = share_state(job.team, run.begin(resume=resume))
+        state = share_state(job.group, run.begin(resume=resume))
         start = self._start(job)
         left = self.steps - (state["iteration"] if state else 0)
         with (
@@ -136,7 +136,7 @@ class CycleGanTrainer:
             surroundings=surroundings,
             listener=listener,
             hooks=hooks,
-            team=job.team,
+            group=job.group,
         )
         if gate is None or surroundings.chain is None:
             return model, None
@@ -164,7 +164,7 @@ def _environment(job: TrainingJob) -> dict[str, Any]:
     """What the last bits depend on."""
     return {
         "device": job.device,
-        "processes": job.team.size,
+        "processes": job.group.size,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }

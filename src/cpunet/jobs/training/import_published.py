@@ -61,7 +61,7 @@ def import_weights(
     force
         Replace an existing run folder.
     monitor
-        Told of what is kept of it.
+        Receiver of notes on what is kept.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def import_pulses(
     force
         Replace an existing file.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------

@@ -87,11 +87,11 @@ def match(
     recipe
         With a response to be matched.
     seed
-        Of everything random.
+        Seed of all random numbers.
     listen
-        Told step and chi-square.
+        Called with step and chi-square.
     monitor
-        Told of what is to be noted.
+        Receiver of notes.
     known
         A response to start from.
 

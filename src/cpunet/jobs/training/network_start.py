@@ -61,7 +61,7 @@ def network_start(
     init
         A run to start from: of the same networks, or matched, which then makes pairs.
     monitor
-        Told of the fit.
+        Receiver of notes on the fit.
 
     Raises
     ------

@@ -15,8 +15,8 @@ from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
 from cpunet.networks.response import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
+from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import RUN, append_losses
-from cpunet.training.team import Team
 
 
 class ResponseTrainer:
@@ -28,9 +28,9 @@ class ResponseTrainer:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
 
-    def require_shareable(self, team: Team) -> None:
+    def require_shareable(self, group: ProcessGroup) -> None:
         """Refuse several processes: a fit has one."""
-        del team
+        del group
         raise CpunetError(
             f"recipe {self.recipe.name}: takes a minute in one process; "
             "start it without torchrun"

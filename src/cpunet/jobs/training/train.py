@@ -22,7 +22,7 @@ from cpunet.jobs.common.inputs import (
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.train_team import team_for
+from cpunet.jobs.training.launched_group import group_for
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.pulses.peaks import parse_selection
@@ -64,14 +64,14 @@ def train_run(
     peak
         Energies to train on: a peak of the recipe or a range in keV.
     seed
-        Of everything random.
+        Seed of all random numbers.
     device
         ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
     init
         Folder of a run to start from, as of another detector or period: of the same kind, or
         a matched one, which makes pairs for networks to learn first.
     resume
-        Go on with the unfinished training, if there is one; all else must be as it was.
+        Resume an unfinished training, if there is one; all else must be unchanged.
     force
         Replace an existing folder and, without `resume`, an unfinished training.
     tensorboard
@@ -79,7 +79,7 @@ def train_run(
     stop
         Asked after each iteration of a CycleGAN whether to store its state and stop.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------
@@ -96,12 +96,12 @@ def train_run(
     """
     keep_freed_memory()
     trainer = trainer_for(recipe)
-    with team_for(trainer, device) as (team, device):
+    with group_for(trainer, device) as (group, device):
         selection = parse_selection(peak, recipe.peaks)
-        told = monitor if team.leads else QUIET
+        told = monitor if group.leads else QUIET
         read = (*sim.files, *data.files, init)
         place: AbstractContextManager[Path] = nullcontext(out)
-        if team.leads:  # the others do not write
+        if group.leads:  # the others do not write
             place = trainer.workplace(out, read, resume=resume, force=force, note=told.note)
         with place as folder:
             sim_set = load_simulated(sim, recipe, selection, told)
@@ -115,8 +115,8 @@ def train_run(
             if init is not None:
                 _require_sampling(init, data_set)
             sides = sim_set, data_set, data
-            job = TrainingJob(recipe, peak, seed, device, team, init, *sides, folder, told)
-            with enough_memory(trainer.less_memory(team.size)):
+            job = TrainingJob(recipe, peak, seed, device, group, init, *sides, folder, told)
+            with enough_memory(trainer.less_memory(group.size)):
                 done = trainer.train(job, resume=resume, tensorboard=tensorboard, stop=stop)
             if done is None:
                 return {}

@@ -12,7 +12,7 @@ from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import Trained, TrainingJob
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.team import Team
+from cpunet.training.process_group import ProcessGroup
 
 
 class Trainer(Protocol):
@@ -29,7 +29,7 @@ class Trainer(Protocol):
     steps: int
     resumable: bool
 
-    def require_shareable(self, team: Team) -> None:
+    def require_shareable(self, group: ProcessGroup) -> None:
         """Raise a `CpunetError` if several processes cannot train the recipe together."""
 
     def less_memory(self, processes: int) -> str:

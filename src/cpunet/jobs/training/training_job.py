@@ -18,8 +18,8 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.matching import Sides
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
+from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import read_losses, versions
-from cpunet.training.team import Team
 from cpunet.training.tensorboard import LossBoard
 
 
@@ -49,7 +49,7 @@ class TrainingJob:
     ----------
     recipe, peak, seed, device, init
         See `cpunet.jobs.training.train.train_run`; the device is resolved.
-    team
+    group
         Processes that train together.
     sim, data, data_file
         Prepared pulses of both sides, and the file of the measured ones.
@@ -63,7 +63,7 @@ class TrainingJob:
     peak: str
     seed: int
     device: str
-    team: Team
+    group: ProcessGroup
     init: Path | None
     sim: InputSet
     data: InputSet
@@ -86,7 +86,7 @@ class TrainingJob:
             "seed": self.seed,
             "init": None if self.init is None else str(self.init),
             "device": self.device,
-            "processes": self.team.size,
+            "processes": self.group.size,
             "threads": torch.get_num_threads(),
             "started": started,
             "seconds": round(seconds, 1),

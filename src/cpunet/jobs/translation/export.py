@@ -79,7 +79,7 @@ def export_run(
     force
         Replace existing files.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Raises
     ------

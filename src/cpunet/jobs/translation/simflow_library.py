@@ -88,7 +88,7 @@ def translate_for_simflow(
     rings
         Of nodes beyond the crystal.
     rank
-        Write so many components and the coefficients of each node in place of templates; see
+        Write this many components and the coefficients of each node in place of templates; see
         `cpunet.jobs.translation.simflow_files.read_library`.
     device, force, monitor
         As for `cpunet.jobs.training.train.train_run`.

@@ -257,7 +257,7 @@ def translate_file(
     append_column
         Copy the file and add the pulses to the table that was read, as a column of this name.
     realisations
-        Draw the noise so many times for each pulse: its row is repeated, and the column
+        Number of noise draws for each pulse: its row is repeated, and the column
         ``realisation`` counts.
     adc
         Raw traces in ADC counts instead of normalised windows.

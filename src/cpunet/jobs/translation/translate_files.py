@@ -70,7 +70,7 @@ def translate_files(
     force
         Replace outputs that are there.
     monitor
-        Told of the progress.
+        Receiver of the progress.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def translate_files(
         done = f"; {len(told)} are in {out}" if told else ""
         raise CpunetError(
             f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{done}; "
-            "go on with --resume"
+            "continue with --resume"
         )
     return _summed(told)
 

@@ -83,7 +83,7 @@ def writer_of(
 def other_columns(
     pulses: PulseSource, options: TranslateOptions, note: Callable[[str], None]
 ) -> RowColumns:
-    """Find the columns to be copied to a new table; `note` is told of those that cannot be."""
+    """Find the columns to be copied to a new table; `note` reports the others."""
     if options.append_column is not None:
         return RowColumns(pulses.path)  # they are there already
     if _in_hdf5(pulses):

@@ -24,6 +24,7 @@ from cpunet.jobs.common.inputs import (
 )
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
+from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
 from cpunet.jobs.validation.energy_ranges import (
     Range,
     ae_against_energy,
@@ -33,7 +34,6 @@ from cpunet.jobs.validation.energy_ranges import (
 from cpunet.jobs.validation.peak_details import PeakDetails, peak_details
 from cpunet.jobs.validation.peak_sets import PeakSets, peak_sets
 from cpunet.jobs.validation.pulse_tests import survivals
-from cpunet.jobs.validation.rivals import fit_rivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
 from cpunet.machine_memory import require_memory
@@ -108,7 +108,7 @@ def evaluate(
     more = () if ae_range_kev is None else (ae_range_kev,)
     sim_set, data_set = _load_both(ren, sim, data, names, more, most, monitor)
     responses = None if truth is None else Responses(truth, sim_set)
-    others = fit_rivals(
+    others = fit_baseline_methods(
         sim_set,
         data_set,
         data,
@@ -158,7 +158,7 @@ def evaluate(
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
         "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
         "rivals": {
-            "fits": {name: rival.describe() for name, rival in others.methods.items()},
+            "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
         },
         "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.analysis.paired import pair_squares
+from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.finishing import blocks, finish, finish_both
-from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
-from cpunet.jobs.validation.rivals import FittedRivals
+from cpunet.jobs.validation.baseline_methods import FittedBaselineMethods
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
@@ -67,7 +67,7 @@ class Translations:
     """
 
     ren: REN
-    rivals: FittedRivals
+    rivals: FittedBaselineMethods
     simulated: Pulses
     noisy: dict[str, FloatArray] = field(default_factory=dict)
     whole: dict[str, Flags] = field(default_factory=dict)
@@ -78,15 +78,15 @@ class Translations:
         """Noise-free windows of some pulses by method, with the truth if it is known."""
         pulses, config = self.simulated[rows], self.ren.recipe.preparation
         found = {"raw": pulses.waveforms}
-        for name, rival in self.rivals.methods.items():
-            found[name] = translate_like_data(rival, pulses, config).waveforms
+        for name, method in self.rivals.methods.items():
+            found[name] = translate_like_data(method, pulses, config).waveforms
         found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
         return found if self.truth is None else found | {"truth": self.truth[rows]}
 
 
 def translate_all(
     ren: REN,
-    rivals: FittedRivals,
+    rivals: FittedBaselineMethods,
     sim: InputSet,
     responses: Responses | None,
     seed: int,
@@ -155,7 +155,7 @@ def translate_all(
 def _finished(
     records: FloatArray,
     pulses: Pulses,
-    rivals: FittedRivals,
+    rivals: FittedBaselineMethods,
     recipe: Recipe,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray | None]:

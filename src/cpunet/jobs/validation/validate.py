@@ -140,7 +140,7 @@ def _of_remains(info: Mapping[str, Any]) -> list[str]:
     return [
         f"Traces of the training lie on remains of earlier pulses, {told['rate_khz']:.2f} ± "
         f"{told['rate_error_khz']:.2f} kHz decaying with {told['decay_us']:.1f} µs: percent of "
-        f"the traces, measured (by the law), {shares}. Translations, rivals and the truth have "
+        f"the traces, measured (by the law), {shares}. All translations and the truth have "
         "remains drawn by this law, as likely as they pass the quality cuts."
     ]
 

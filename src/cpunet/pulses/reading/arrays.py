@@ -20,8 +20,8 @@ _WAVEFORMS = ("waveform", "waveforms", "values")
 class ArraySource(PulseSource):
     """An array of shape ``(events, samples)``, read row by row.
 
-    The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array that
-    the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
+    The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array
+    that the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
     ``dt``), energies and event numbers, are columns. Pickled objects are never loaded.
     """
 

@@ -139,7 +139,7 @@ class _Seen:
         self.complete = True
 
     def until(self, stop: float) -> list[dict[str, float]]:
-        """Numbers of so many pulses from the first on."""
+        """Numbers of this many pulses, from the first on."""
         if len(self.numbers) < stop and not self.complete:
             for met, _ in enumerate(self.pulses(), start=1):
                 if met >= stop:

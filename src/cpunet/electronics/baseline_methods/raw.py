@@ -8,8 +8,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from cpunet.electronics.rivals.base import check_sets, check_windows
-from cpunet.electronics.rivals.response import PADDING_AFTER, PADDING_BEFORE
+from cpunet.electronics.baseline_methods.base import check_sets, check_windows
+from cpunet.electronics.baseline_methods.response import PADDING_AFTER, PADDING_BEFORE
 from cpunet.pulses.container import FloatArray
 
 
@@ -22,12 +22,12 @@ class Raw:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit nothing, see `base.Rival.fit`."""
+        """Fit nothing, see `BaselineMethod.fit`."""
         check_sets(sim, data, dt_ns, align)
         return cls(dt_ns)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Pad the windows to records, see `base.Rival.translate`."""
+        """Pad the windows to records, see `BaselineMethod.translate`."""
         check_windows(waveforms, "simulated")
         before = np.zeros((len(waveforms), PADDING_BEFORE), np.float32)
         after = np.repeat(waveforms[:, -1:], PADDING_AFTER, axis=1)

@@ -15,15 +15,15 @@ from typing import ClassVar, Self
 import numpy as np
 import scipy.fft
 
-from cpunet.electronics.rivals.base import Values, check_sets, check_windows
-from cpunet.electronics.rivals.response import (
+from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
+from cpunet.electronics.baseline_methods.response import (
     PADDING_BEFORE,
     Spectrum,
     currents,
     record_length,
     respond,
 )
-from cpunet.electronics.rivals.superpulses import (
+from cpunet.electronics.baseline_methods.superpulses import (
     Superpulses,
     crossing,
     fitted_tail_slope,
@@ -66,7 +66,7 @@ class Superpulse:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Divide the mean spectra, see `base.Rival.fit`."""
+        """Divide the mean spectra, see `BaselineMethod.fit`."""
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
@@ -89,7 +89,7 @@ class Superpulse:
         return replace(found, tail_slope_per_ms=slope - excess)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the kernel and the decay, see `base.Rival.translate`."""
+        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
         check_windows(waveforms, "simulated")
         transfer = _transfer(self.kernel, record_length(waveforms.shape[1]))
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)

@@ -1,7 +1,7 @@
 """Processes that train together, each on its share of every batch.
 
 They are started by torchrun, which tells each its rank and where to meet.  The one of rank 0
-leads: it alone reads checkpoints and writes.  A process that is alone is a team of one, for
+leads: it alone reads checkpoints and writes.  A process that is alone is a group of one, for
 which nothing here does anything.
 """
 
@@ -23,15 +23,15 @@ from cpunet.errors import CpunetError
 PATIENCE = timedelta(minutes=10)  # with a process that does not answer
 _BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 _FAILURES = "cpunet/failures"
-_LOST = "another process of this training ended or cannot be reached; go on with --resume"
+_LOST = "another process of this training ended or cannot be reached; continue with --resume"
 
 
 class ToldElsewhereError(CpunetError):
-    """The team ends; another process tells why."""
+    """The process group ends; another process reports why."""
 
 
 @dataclass(frozen=True)
-class Team:
+class ProcessGroup:
     """The processes of a training, as one of them sees them.
 
     All must call the same methods in the same order.  Each raises a `CpunetError` if another
@@ -42,7 +42,7 @@ class Team:
     rank
         Of this process, from 0.
     size
-        How many there are.
+        Number of processes.
     """
 
     rank: int = 0
@@ -50,7 +50,7 @@ class Team:
 
     @property
     def leads(self) -> bool:
-        """Whether this process reads checkpoints, writes and tells."""
+        """Whether this process reads checkpoints, writes and reports."""
         return self.rank == 0
 
     def share_of(self, batch_size: int) -> int:
@@ -135,27 +135,27 @@ class Team:
         return all_of_them
 
 
-ALONE = Team()
+ALONE = ProcessGroup()
 
 
 @dataclass(frozen=True)
 class Launch:
-    """What torchrun tells a process.
+    """Process group and local rank, as set by torchrun.
 
     Parameters
     ----------
-    team
+    group
         Rank and size.
     local_rank
         The number of this process on its computer.
     """
 
-    team: Team
+    group: ProcessGroup
     local_rank: int
 
 
 def launch() -> Launch | None:
-    """Return what torchrun told this process; None if it started none, or but one.
+    """Return the launch by torchrun; None if it started no process, or only one.
 
     Raises
     ------
@@ -175,14 +175,14 @@ def launch() -> Launch | None:
         rank, size, local = (int(known[n]) for n in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     except ValueError as error:
         raise CpunetError(f"RANK, WORLD_SIZE and LOCAL_RANK: {error}") from error
-    return Launch(Team(rank, size), local)
+    return Launch(ProcessGroup(rank, size), local)
 
 
 @contextmanager
-def meeting(launched: Launch) -> Iterator[Callable[[str], Team]]:
-    """Meet the other processes; give what makes them a team that trains on a device.
+def meeting(launched: Launch) -> Iterator[Callable[[str], ProcessGroup]]:
+    """Meet the other processes; give what makes them a group that trains on a device.
 
-    The team lasts as the meeting.  Of several errors inside, the first alone is told.
+    The group lasts as the meeting.  Of several errors inside, the first alone is told.
 
     Raises
     ------
@@ -210,16 +210,16 @@ def meeting(launched: Launch) -> Iterator[Callable[[str], Team]]:
             distributed.destroy_process_group()
 
 
-def _join(launched: Launch, store: Any, device: str) -> Team:
+def _join(launched: Launch, store: Any, device: str) -> ProcessGroup:
     with _answered():
         distributed.init_process_group(
             _BACKENDS[torch.device(device).type],
             store=store,
-            rank=launched.team.rank,
-            world_size=launched.team.size,
+            rank=launched.group.rank,
+            world_size=launched.group.size,
             timeout=PATIENCE,
         )
-    return launched.team
+    return launched.group
 
 
 def _is_first(store: Any) -> bool:

@@ -14,15 +14,15 @@ import numpy as np
 import scipy.fft
 import scipy.optimize
 
-from cpunet.electronics.rivals.base import Values, check_sets, check_windows
-from cpunet.electronics.rivals.response import (
+from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
+from cpunet.electronics.baseline_methods.response import (
     Spectrum,
     currents,
     frequencies_mhz,
     record_length,
     respond,
 )
-from cpunet.electronics.rivals.superpulses import (
+from cpunet.electronics.baseline_methods.superpulses import (
     Groups,
     crossing,
     fitted_tail_slope,
@@ -63,7 +63,7 @@ class GaussExp:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit superpulses in slices of rise time, see `base.Rival.fit`."""
+        """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)
@@ -95,7 +95,7 @@ class GaussExp:
         return cls(dt_ns, sigma, tau, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the kernel and the decay, see `base.Rival.translate`."""
+        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
         check_windows(waveforms, "simulated")
         length = record_length(waveforms.shape[1])
         transfer = _transfer(length, self.dt_ns, self.sigma_ns, self.tau_ns)

@@ -10,15 +10,15 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.training.trainers import Trainer
-from cpunet.training.team import ALONE, Launch, Team, launch, meeting
+from cpunet.training.process_group import ALONE, Launch, ProcessGroup, launch, meeting
 
 
 @contextmanager
-def team_for(trainer: Trainer, device: str) -> Iterator[tuple[Team, str]]:
-    """Join the processes of torchrun, if it started any; give the team and the device.
+def group_for(trainer: Trainer, device: str) -> Iterator[tuple[ProcessGroup, str]]:
+    """Join the processes of torchrun, if it started any; give the group and the device.
 
-    An error inside ends all processes and is told by one of them, see
-    `cpunet.training.team.meeting`.
+    An error inside ends all processes and is reported by one of them, see
+    `cpunet.training.process_group.meeting`.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def team_for(trainer: Trainer, device: str) -> Iterator[tuple[Team, str]]:
         yield ALONE, resolve_device(device)
         return
     with meeting(launched) as join:
-        trainer.require_shareable(launched.team)
+        trainer.require_shareable(launched.group)
         own = _own_device(resolve_device(device), launched)
         with nullcontext() if own == "cpu" else torch.cuda.device(own):
             yield join(own), own

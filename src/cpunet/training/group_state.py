@@ -1,4 +1,4 @@
-"""What the leading process of a team tells the others before they begin."""
+"""State and settings that the leading process shares with the others before they begin."""
 
 from __future__ import annotations
 
@@ -18,39 +18,39 @@ from cpunet.training.checkpoints import (
     write_checkpoint,
 )
 from cpunet.training.loop import State
-from cpunet.training.team import Team
+from cpunet.training.process_group import ProcessGroup
 
 
-def share_state(team: Team, state: State | None) -> State | None:
+def share_state(group: ProcessGroup, state: State | None) -> State | None:
     """Give all processes the leader's state to go on from, or None; no file is shared.
 
     Parameters
     ----------
-    team
+    group
         Who trains.
     state
         The leader's; of no account in other processes.
     """
-    if team.size == 1:
+    if group.size == 1:
         return state
-    with TemporaryDirectory(prefix="cpunet-team-") as name:
+    with TemporaryDirectory(prefix="cpunet-group-") as name:
         folder, content = Path(name), b""
-        if team.leads and state is not None:
+        if group.leads and state is not None:
             write_checkpoint(folder, Checkpoint(state, {}))
             content = (folder / CHECKPOINT).read_bytes()
-        content = team.told(content)
-        if team.leads or not content:
-            return state if team.leads else None
+        content = group.told(content)
+        if group.leads or not content:
+            return state if group.leads else None
         (folder / CHECKPOINT).write_bytes(content)
         received = next(read_checkpoints(folder))
     if received is None:
         raise CpunetError(
-            "the checkpoint did not reach this process whole; go on with --resume"
+            "the checkpoint did not reach this process whole; continue with --resume"
         )
     return received.state
 
 
-def require_same_everywhere(team: Team, fingerprint: dict[str, Any]) -> None:
+def require_same_everywhere(group: ProcessGroup, fingerprint: dict[str, Any]) -> None:
     """Refuse to train together on other pulses or with other settings.
 
     Raises
@@ -59,7 +59,7 @@ def require_same_everywhere(team: Team, fingerprint: dict[str, Any]) -> None:
         Naming a process whose fingerprint differs from the leader's.
     """
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).digest()
-    digests = team.gathered(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
+    digests = group.gathered(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
     for rank, other in enumerate(digests):
         if not torch.equal(other, digests[0]):
             raise CpunetError(

@@ -1,4 +1,4 @@
-"""Batch norms over the pulses of all processes of a team.
+"""Batch norms over the pulses of all processes of a group.
 
 torch's own run on GPUs only and have no second derivative, which a gradient penalty needs.
 """
@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from cpunet.training.team import Team
+from cpunet.training.process_group import ProcessGroup
 
 
-class TeamNorm(nn.BatchNorm1d):
-    """In the place of a batch norm of the same weights: takes its statistics over the team.
+class GroupBatchNorm(nn.BatchNorm1d):
+    """In the place of a batch norm of the same weights: takes its statistics over the group.
 
     All processes give it the same number of pulses.
 
@@ -23,17 +23,17 @@ class TeamNorm(nn.BatchNorm1d):
     ----------
     norm
         The batch norm, with weights and running statistics; its tensors are taken over.
-    team
+    group
         Who trains.
     """
 
-    def __init__(self, norm: nn.BatchNorm1d, team: Team) -> None:
+    def __init__(self, norm: nn.BatchNorm1d, group: ProcessGroup) -> None:
         super().__init__(norm.num_features, norm.eps, norm.momentum)
         self.weight, self.bias = norm.weight, norm.bias
         self.running_mean, self.running_var = norm.running_mean, norm.running_var
         self.num_batches_tracked = norm.num_batches_tracked
         self.train(norm.training)
-        self.team = team
+        self.group = group
         # what is said between processes is no kernel; asked for here, as it imports for seconds
         self._of_all = torch.compiler.disable(_of_all)  # type: ignore[no-untyped-call]
 
@@ -44,8 +44,8 @@ class TeamNorm(nn.BatchNorm1d):
         values = x.float() if x.dtype in (torch.bfloat16, torch.float16) else x
         axes = [axis for axis in range(x.ndim) if axis != 1]
         variance, mean = torch.var_mean(values, dim=axes, correction=0)
-        means, variances = self._of_all(torch.stack([mean, variance]), self.team).unbind(1)
-        # the team's variance: that within the processes, and that between them
+        means, variances = self._of_all(torch.stack([mean, variance]), self.group).unbind(1)
+        # the group's variance: that within the processes, and that between them
         mean, variance = (
             means.mean(dim=0),
             variances.mean(dim=0) + means.var(dim=0, correction=0),
@@ -62,7 +62,7 @@ class TeamNorm(nn.BatchNorm1d):
         assert self.running_mean is not None
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
-        count *= self.team.size
+        count *= self.group.size
         with torch.no_grad():
             self.num_batches_tracked.add_(1)
             part = self.momentum
@@ -73,32 +73,32 @@ class TeamNorm(nn.BatchNorm1d):
             self.running_var.lerp_(unbiased.to(self.running_var.dtype), part)
 
 
-def share_norms(network: nn.Module, team: Team) -> None:
-    """Let all batch norms of a network take their statistics over the team."""
-    if team.size == 1:
+def share_norms(network: nn.Module, group: ProcessGroup) -> None:
+    """Let all batch norms of a network take their statistics over the group."""
+    if group.size == 1:
         return
     for module in [*network.modules()]:
         for name, child in module.named_children():
             if type(child) is nn.BatchNorm1d:
-                setattr(module, name, TeamNorm(child, team))
+                setattr(module, name, GroupBatchNorm(child, group))
 
 
-def _of_all(own: Tensor, team: Team) -> Tensor:
+def _of_all(own: Tensor, group: ProcessGroup) -> Tensor:
     """Stack the statistics of all processes, each of the same shape; gradients flow."""
-    rows = (team.rank, team.size - 1 - team.rank)
-    return _TeamSum.apply(pad(own[None], (0, 0) * own.ndim + rows), team)  # type: ignore[no-any-return, no-untyped-call]
+    rows = (group.rank, group.size - 1 - group.rank)
+    return _GroupSum.apply(pad(own[None], (0, 0) * own.ndim + rows), group)  # type: ignore[no-any-return, no-untyped-call]
 
 
-class _TeamSum(torch.autograd.Function):
-    """Sum over the team; so is its derivative, and the derivative of that."""
+class _GroupSum(torch.autograd.Function):
+    """Sum over the group; so is its derivative, and the derivative of that."""
 
     @staticmethod
-    def forward(ctx: Any, own: Tensor, team: Team) -> Tensor:
-        ctx.team = team
+    def forward(ctx: Any, own: Tensor, group: ProcessGroup) -> Tensor:
+        ctx.group = group
         total = own.clone()
-        team.add(total)
+        group.add(total)
         return total
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return _TeamSum.apply(gradient.contiguous(), ctx.team), None  # type: ignore[no-untyped-call]
+        return _GroupSum.apply(gradient.contiguous(), ctx.group), None  # type: ignore[no-untyped-call]

@@ -21,7 +21,7 @@ import pytest
 from cpunet.cli.main import main
 from cpunet.training.unfinished import UnfinishedRun
 
-PROCESS = "one of a team"  # the name of this module in a process of a team
+PROCESS = "one of a group"  # the name of this module in a process of a group
 SETTINGS = [
     "training.checkpoint_interval=1",
     "training.log_interval=1",
@@ -33,7 +33,7 @@ SETTINGS = [
 def start(
     held: ModuleType, folder: Path, rank: int, environment: dict[str, str], words: list[str]
 ) -> Any:
-    """Start the command as a process of a team."""
+    """Start the command as a process of a group."""
     own = {"RANK": str(rank), "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1"}
     given = {"ENVIRONMENT": environment | own, "WORDS": words, "FOLDER": str(folder)}
     return held.forked(__file__, given, PROCESS)
@@ -83,7 +83,7 @@ def words(stand, tiny, tmp_path) -> list[object]:
 
 
 @pytest.mark.slow
-def test_a_team_trains_and_goes_on(words, pair, tmp_path, command):
+def test_a_group_trains_and_goes_on(words, pair, tmp_path, command):
     told, run = tmp_path / "told", tmp_path / "out" / "run"
     done = pair(told, *words)
     assert (done.codes, done.errors) == ([0, 0], [])
@@ -102,7 +102,7 @@ def test_a_team_trains_and_goes_on(words, pair, tmp_path, command):
 
     stopped = pair(told, *words, environment={"SIGNAL_AFTER": "1"})
     assert stopped.codes == 2 * [128 + signal.SIGTERM]
-    assert stopped.errors == ["error: stopped after 2 of 3 iterations; go on with --resume"]
+    assert stopped.errors == ["error: stopped after 2 of 3 iterations; continue with --resume"]
     assert [path.name for path in run.parent.iterdir()] == ["run.unfinished"]
     shutil.copytree(run.parent / "run.unfinished", run.parent / "alone.unfinished")
     resumed = pair(told, *words, "--resume")
@@ -146,7 +146,7 @@ def test_an_error_is_one_line(words, pair, tmp_path, more, line):
         ("small", "takes minutes in one process, its chain being matched first;"),
     ],
 )
-def test_a_matching_recipe_needs_no_team(stand, pair, tmp_path, recipe, told):
+def test_a_matching_recipe_needs_no_group(stand, pair, tmp_path, recipe, told):
     words = ["train", *stand.inputs, "--recipe", recipe, "--out", tmp_path / "run"]
     refused = pair(tmp_path / "told", *words)
     assert refused.codes == [2, 2]

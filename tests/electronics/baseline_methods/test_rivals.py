@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.analysis.paired import paired_scores
+from cpunet.electronics.baseline_methods.gauss_exp import GaussExp
+from cpunet.electronics.baseline_methods.raw import Raw
+from cpunet.electronics.baseline_methods.rc import RC
+from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
+from cpunet.electronics.baseline_methods.superpulse import LEAD, Superpulse
+from cpunet.electronics.baseline_methods.superpulses import crossing
+from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.rivals.gauss_exp import GaussExp
-from cpunet.electronics.rivals.raw import Raw
-from cpunet.electronics.rivals.rc import RC
-from cpunet.electronics.rivals.registry import RIVALS
-from cpunet.electronics.rivals.superpulse import LEAD, Superpulse
-from cpunet.electronics.rivals.superpulses import crossing
-from cpunet.electronics.rivals.translating import translate_like_data
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -145,7 +145,7 @@ def test_free_kernel_comes_closest_to_the_truth() -> None:
     truth = finish(decayed(sampled(convolved(sim_fine, kernel)), DT_NS), CONFIG, dt_ns=DT_NS)
     pulses = Pulses.of(sim, dt_ns=DT_NS)
     edge = {}
-    for name, method in RIVALS.items():
+    for name, method in BASELINE_METHODS.items():
         rival = method.fit(sim, data, DT_NS, ALIGN)
         windows = translate_like_data(rival, pulses, CONFIG).waveforms
         assert windows.shape == sim.shape
@@ -197,7 +197,7 @@ def test_a_response_is_linear_and_causal(sim) -> None:
 def test_bad_input_is_named(sim) -> None:
     few, broken = sim[:7], sim.copy()
     broken[3, 5] = np.nan
-    for method in RIVALS.values():
+    for method in BASELINE_METHODS.values():
         with pytest.raises(CpunetError, match=r"7 simulated pulses; give \d+ or more"):
             method.fit(few, sim, DT_NS, ALIGN)
         with pytest.raises(

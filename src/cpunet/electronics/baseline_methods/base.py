@@ -16,7 +16,7 @@ Values = npt.NDArray[np.float64]
 MIN_N = 50  # minimum number of pulses of either dataset for a fit
 
 
-class Rival(Protocol):
+class BaselineMethod(Protocol):
     """A baseline method: a causal linear response fitted to unpaired pulses."""
 
     name: ClassVar[str]

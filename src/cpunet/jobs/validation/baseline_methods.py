@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from cpunet.electronics.baseline_methods.base import BaselineMethod
+from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
-from cpunet.electronics.rivals.base import Rival
-from cpunet.electronics.rivals.registry import RIVALS
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class FittedRivals:
+class FittedBaselineMethods:
     """The fitted baseline methods, and the noise that is added to them and to the truth.
 
     Parameters
@@ -36,12 +36,12 @@ class FittedRivals:
         Reasons why methods or the noise are missing, by name.
     """
 
-    methods: dict[str, Rival] = field(default_factory=dict)
+    methods: dict[str, BaselineMethod] = field(default_factory=dict)
     noise: BaselineNoise | TraceNoise | None = None
     missing: dict[str, str] = field(default_factory=dict)
 
 
-def fit_rivals(
+def fit_baseline_methods(
     sim: InputSet,
     data: InputSet,
     data_file: InputFile,
@@ -51,7 +51,7 @@ def fit_rivals(
     remains: DrawnRemains | None = None,
     fitted: bool,
     monitor: Monitor,
-) -> FittedRivals:
+) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
 
     Parameters
@@ -73,12 +73,12 @@ def fit_rivals(
 
     Returns
     -------
-    FittedRivals
+    FittedBaselineMethods
         Methods that cannot be fitted are listed as missing, with the reason.
     """
-    config, result = recipe.preparation, FittedRivals()
+    config, result = recipe.preparation, FittedBaselineMethods()
     # all but the untranslated simulation, which is scored anyway
-    kinds = {name: kind for name, kind in RIVALS.items() if fitted and name != "raw"}
+    kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
     there = remains is not None and remains.law.rate_khz > 0
     found = measured_remains(data_file, config)[0] if there else None
     noise = _or_reason(
@@ -90,15 +90,15 @@ def fit_rivals(
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
-    with monitor.stage("Fitting rivals", len(kinds)) as advance:
+    with monitor.stage("Fitting baseline methods", len(kinds)) as advance:
         for name, kind in kinds.items():
 
-            def fit(kind: type[Rival] = kind) -> Rival:
+            def fit(kind: type[BaselineMethod] = kind) -> BaselineMethod:
                 return kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
 
-            rival = _or_reason(result.missing, name, fit)
-            if rival is not None:
-                result.methods[name] = rival
+            method = _or_reason(result.missing, name, fit)
+            if method is not None:
+                result.methods[name] = method
             advance(1)
     for name, reason in result.missing.items():
         monitor.note(f"{name} is left out: {reason}")

@@ -23,14 +23,20 @@ from torch import Tensor, nn
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import LOSS_NAMES, CycleGan, Step
+from cpunet.training.group_norm import GroupBatchNorm, share_norms
+from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.loop import CheckpointHooks, StoppedError, train
+from cpunet.training.process_group import (
+    ALONE,
+    ProcessGroup,
+    ToldElsewhereError,
+    launch,
+    meeting,
+)
 from cpunet.training.sampling import EpochSampler
-from cpunet.training.team import ALONE, Team, ToldElsewhereError, launch, meeting
-from cpunet.training.team_norm import TeamNorm, share_norms
-from cpunet.training.team_state import require_same_everywhere, share_state
 
 SIZE = 2
-PROCESS = "one of a team"  # the name of this module in a process of a team
+PROCESS = "one of a group"  # the name of this module in a process of a group
 STEPS = 3
 PENALTIES = (0.0, 0.3)
 SHORT = ("training.iterations=2", "training.log_interval=1", "training.statistics_batches=1")
@@ -41,14 +47,14 @@ NOISY = ("training.iterations=3", "training.instance_noise=0.1", "generator.drop
 Found = dict[str, Any]
 
 
-# --- what is computed, by one process or by each of a team ---------------------------------
+# --- what is computed, by one process or by each of a group ---------------------------------
 
 
-def own_half(batch: Tensor, team: Team) -> Tensor:
-    return batch.chunk(team.size)[team.rank]
+def own_half(batch: Tensor, group: ProcessGroup) -> Tensor:
+    return batch.chunk(group.size)[group.rank]
 
 
-def norm_found(team: Team, shape: tuple[int, ...], momentum: float | None) -> Found:
+def norm_found(group: ProcessGroup, shape: tuple[int, ...], momentum: float | None) -> Found:
     """Output, first and second derivatives and running statistics of a batch norm."""
     random = torch.Generator().manual_seed(4)
     x, weight = (torch.randn(shape, generator=random, dtype=torch.float64) for _ in range(2))
@@ -57,14 +63,14 @@ def norm_found(team: Team, shape: tuple[int, ...], momentum: float | None) -> Fo
         norm.weight.copy_(torch.tensor([0.5, 1.5, -2.0]))
         norm.bias.copy_(torch.tensor([0.1, 0.2, 0.3]))
     network = nn.Sequential(norm)
-    share_norms(network, team)
-    own, own_weight = own_half(20 + 3 * x, team).requires_grad_(), own_half(weight, team)
+    share_norms(network, group)
+    own, own_weight = own_half(20 + 3 * x, group).requires_grad_(), own_half(weight, group)
     for _ in range(2):
         y = network(own)
     (slope,) = torch.autograd.grad((own_weight * y.sin()).sum(), own, create_graph=True)
     (curved,) = torch.autograd.grad(slope.square().sum(), own, retain_graph=True)
     slope.square().mean().backward()
-    team.average_gradients(network.parameters())
+    group.average_gradients(network.parameters())
     return {
         "of pulses": {"y": y.detach(), "slope": slope.detach(), "curved": curved},
         "same": {"weight": norm.weight.grad, "bias": norm.bias.grad} | network.state_dict(),
@@ -79,18 +85,18 @@ def quiet(model: CycleGan) -> None:
         nn.init.constant_(network.latent_log_variance.bias, -200.0)
 
 
-def steps_found(team: Team, overrides: list[str], sets) -> Found:
+def steps_found(group: ProcessGroup, overrides: list[str], sets) -> Found:
     """Losses and gradients of the first step, and the weights after a few."""
     recipe = load_recipe("paper", overrides)
     torch.manual_seed(2)
     model = CycleGan(recipe).train()
     quiet(model)
-    share_norms(model, team)
-    step = Step(model, recipe.cyclegan.training, fast=False, team=team)
+    share_norms(model, group)
+    step = Step(model, recipe.cyclegan.training, fast=False, group=group)
     found: Found = {}
     for number in range(STEPS):
         batches = [
-            own_half(torch.from_numpy(np.roll(s, number, 0)[:8])[:, None].double(), team)
+            own_half(torch.from_numpy(np.roll(s, number, 0)[:8])[:, None].double(), group)
             for s in sets
         ]
         losses = step(number, *batches)
@@ -100,39 +106,39 @@ def steps_found(team: Team, overrides: list[str], sets) -> Found:
     return found | {"weights": copy.deepcopy(model.state_dict())}
 
 
-def training_found(team: Team, overrides: list[str], sets) -> Found:
+def training_found(group: ProcessGroup, overrides: list[str], sets) -> Found:
     """A training from its start to its end, in float64: records and weights."""
     recipe = load_recipe("paper", overrides)
     records: list[Any] = []
 
     doubled = [pulses.astype(np.float64) for pulses in sets]
-    model = train(*doubled, recipe, seed=3, init=quiet, listener=records.extend, team=team)
+    model = train(*doubled, recipe, seed=3, init=quiet, listener=records.extend, group=group)
     losses = [[r["losses"][n] for n in LOSS_NAMES[:6]] for r in records]
     return {"weights": model.state_dict(), "losses": torch.tensor(losses, dtype=torch.float64)}
 
 
-def resumed_found(team: Team, overrides: list[str], sets) -> Found:
+def resumed_found(group: ProcessGroup, overrides: list[str], sets) -> Found:
     """Weights of a noisy training in one go, and of one that process 1 has stopped."""
     recipe = load_recipe("paper", overrides)
-    whole = train(*sets, recipe, seed=5, team=team).state_dict()
+    whole = train(*sets, recipe, seed=5, group=group).state_dict()
     states: list[Any] = []
     asked: list[int] = []
 
     def stop() -> bool:
         asked.append(0)
-        return team.rank == team.size - 1 and len(asked) == 1
+        return group.rank == group.size - 1 and len(asked) == 1
 
     hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)), stop=stop)
     with pytest.raises(StoppedError, match=r"^stopped after 1 of 3 iterations"):
-        train(*sets, recipe, seed=5, hooks=hooks, team=team)
+        train(*sets, recipe, seed=5, hooks=hooks, group=group)
     kept = len(states)
-    start = share_state(team, states[-1] if states else None)
+    start = share_state(group, states[-1] if states else None)
     hooks = CheckpointHooks(lambda _state: None, start)
-    again = train(*sets, recipe, seed=5, hooks=hooks, team=team).state_dict()
+    again = train(*sets, recipe, seed=5, hooks=hooks, group=group).state_dict()
     return {"whole": whole, "again": again, "kept": kept, "random": start["random"]}
 
 
-# --- a process of a team --------------------------------------------------------------------
+# --- a process of a group --------------------------------------------------------------------
 
 
 def message(act: Callable[[], Any]) -> str:
@@ -142,30 +148,30 @@ def message(act: Callable[[], Any]) -> str:
 
 
 def work(folder: Path, job: dict[str, Any]) -> None:
-    """All that a process of the team does."""
+    """All that a process of the group does."""
     torch.set_num_threads(1)
     sets = [np.load(folder / f"{side}.npy") for side in ("sim", "data")]
     found: Found = {}
     launched = launch()
     assert launched is not None
-    rank = launched.team.rank
+    rank = launched.group.rank
     try:
         with meeting(launched) as join:
-            team = join("cpu")
-            found["any"] = [team.any(False), team.any(team.rank == 1), team.any(True)]
-            found["told"] = [len(team.told(b"")), team.told(b"of 0" * (1 - team.rank))]
+            group = join("cpu")
+            found["any"] = [group.any(False), group.any(group.rank == 1), group.any(True)]
+            found["told"] = [len(group.told(b"")), group.told(b"of 0" * (1 - group.rank))]
             for name, arguments in job["norms"].items():
-                found[name] = norm_found(team, *arguments)
+                found[name] = norm_found(group, *arguments)
             for name, overrides in job["steps"].items():
-                found[name] = steps_found(team, overrides, sets)
-            found["training"] = training_found(team, job["training"], sets)
-            found["resumed"] = resumed_found(team, job["resumed"], sets)
+                found[name] = steps_found(group, overrides, sets)
+            found["training"] = training_found(group, job["training"], sets)
+            found["resumed"] = resumed_found(group, job["resumed"], sets)
             found["others"] = message(
-                lambda: require_same_everywhere(team, {"seed": team.rank})
+                lambda: require_same_everywhere(group, {"seed": group.rank})
             )
-            require_same_everywhere(team, {"seed": 1})
+            require_same_everywhere(group, {"seed": 1})
             sets[1][5] = np.nan  # of a pulse that one process is dealt
-            training_found(team, job["training"], sets)
+            training_found(group, job["training"], sets)
     except CpunetError as error:
         found["diverged"] = [type(error).__name__, str(error)]
     torch.save(found, folder / f"found-{rank}.pt")
@@ -174,11 +180,11 @@ def work(folder: Path, job: dict[str, Any]) -> None:
     lost: list[Any] = []
     try:
         with meeting(launched) as join:
-            team = join("cpu")
-            team.any(False)
+            group = join("cpu")
+            group.any(False)
             if rank == 1:
                 os._exit(9)
-            team.any(False)
+            group.any(False)
     except CpunetError as error:
         lost = [type(error).__name__, str(error)]
     (folder / f"lost-{rank}.json").write_text(json.dumps(lost))
@@ -192,9 +198,9 @@ def work_on_gpus(folder: Path, job: dict[str, Any]) -> None:
     device = f"cuda:{launched.local_rank}"
     recipe = load_recipe("paper", job["recipe"])
     with torch.cuda.device(device), meeting(launched) as join:
-        team = join(device)
-        model = train(*sets, recipe, seed=3, device=device, team=team)
-    torch.save(model.cpu().state_dict(), folder / f"found-{launched.team.rank}.pt")
+        group = join(device)
+        model = train(*sets, recipe, seed=3, device=device, group=group)
+    torch.save(model.cpu().state_dict(), folder / f"found-{launched.group.rank}.pt")
 
 
 # --- the tests ------------------------------------------------------------------------------
@@ -256,7 +262,7 @@ def run_pair(
 @pytest.fixture(scope="module")
 def folder(job, sides, held, tmp_path_factory) -> Path:
     """What the two processes found."""
-    folder = tmp_path_factory.mktemp("team")
+    folder = tmp_path_factory.mktemp("group")
     assert run_pair(held, folder, sides, job, work) == [0, 9]
     return folder
 
@@ -271,7 +277,7 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("name", ["pulses", "vectors"])
-def test_a_norm_of_a_team_is_that_of_all_its_pulses(job, found, name):
+def test_a_norm_of_a_group_is_that_of_all_its_pulses(job, found, name):
     alone = norm_found(ALONE, *job["norms"][name])
     for part, expected in alone["of pulses"].items():
         whole = torch.cat([one[name]["of pulses"][part] for one in found])
@@ -282,13 +288,13 @@ def test_a_norm_of_a_team_is_that_of_all_its_pulses(job, found, name):
             torch.testing.assert_close(one[name]["same"][part], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_norm_of_a_team_has_the_same_names_and_evaluates_the_same():
+def test_a_norm_of_a_group_has_the_same_names_and_evaluates_the_same():
     plain = nn.Sequential(nn.Conv1d(1, 3, 3), nn.BatchNorm1d(3))
     plain(torch.randn(5, 1, 9))
     shared = copy.deepcopy(plain)
-    share_norms(shared, Team(0, 2))
-    assert isinstance(shared[1], TeamNorm)
-    assert isinstance(copy.deepcopy(shared)[1], TeamNorm)  # as for running averages
+    share_norms(shared, ProcessGroup(0, 2))
+    assert isinstance(shared[1], GroupBatchNorm)
+    assert isinstance(copy.deepcopy(shared)[1], GroupBatchNorm)  # as for running averages
     assert [n for n, _ in shared.named_parameters()] == [n for n, _ in plain.named_parameters()]
     x = torch.randn(4, 1, 9)
     assert torch.equal(shared.eval()(x), plain.eval()(x))
@@ -332,7 +338,7 @@ def test_a_training_is_that_of_one_process(job, found, sides):
         torch.testing.assert_close(first["weights"][key], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_a_resumed_team_ends_with_the_same_bits(found):
+def test_a_resumed_group_ends_with_the_same_bits(found):
     first, second = (one["resumed"] for one in found)
     assert (first["kept"], second["kept"]) == (1, 0)
     for one in (first, second):
@@ -343,7 +349,7 @@ def test_a_resumed_team_ends_with_the_same_bits(found):
     assert not torch.equal(*noises)
 
 
-def test_a_state_goes_on_in_a_team_of_another_size(found, job, sides):
+def test_a_state_goes_on_in_a_group_of_another_size(found, job, sides):
     recipe = load_recipe("paper", job["resumed"])
     states: list[Any] = []
     hooks = CheckpointHooks(
@@ -383,14 +389,15 @@ def test_a_process_that_dies_ends_the_other(folder):
     kind, text = json.loads((folder / "lost-0.json").read_text())
     assert kind == CpunetError.__name__
     assert text == (
-        "another process of this training ended or cannot be reached; go on with --resume"
+        "another process of this training ended or cannot be reached; continue with --resume"
     )
 
 
 def test_the_shares_of_a_deck_are_the_batch():
     pulses = torch.arange(20.0)[:, None, None]
     whole, *shares = (
-        EpochSampler(pulses, 6, 1, team) for team in (ALONE, *(Team(r, 3) for r in range(3)))
+        EpochSampler(pulses, 6, 1, group)
+        for group in (ALONE, *(ProcessGroup(r, 3) for r in range(3)))
     )
     for _ in range(5):
         batch = whole.next_batch()
@@ -398,7 +405,7 @@ def test_the_shares_of_a_deck_are_the_batch():
     with pytest.raises(
         CpunetError, match=r"batch_size=6 cannot be shared equally by 4 proc.*multiple of 4"
     ):
-        EpochSampler(pulses, 6, 1, Team(0, 4))
+        EpochSampler(pulses, 6, 1, ProcessGroup(0, 4))
 
 
 @pytest.mark.parametrize("missing", ["MASTER_ADDR", "MASTER_PORT", "LOCAL_RANK"])
@@ -408,7 +415,7 @@ def test_half_a_launch(monkeypatch, missing):
         monkeypatch.setenv(name, value)
     launched = launch()
     assert launched is not None
-    assert (launched.team, launched.local_rank) == (Team(1, 3), 0)
+    assert (launched.group, launched.local_rank) == (ProcessGroup(1, 3), 0)
     monkeypatch.delenv(missing)
     with pytest.raises(CpunetError, match=f"but not {missing}; start with torchrun"):
         launch()

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from cpunet.electronics.baseline_methods.base import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.finishing import blocks, finish
-from cpunet.electronics.rivals.base import Rival
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 
 def translate_like_data(
-    rival: Rival,
+    method: BaselineMethod,
     pulses: Pulses,
     config: PreparationConfig,
     *,
@@ -25,7 +25,7 @@ def translate_like_data(
 
     Parameters
     ----------
-    rival
+    method
         A fitted baseline method.
     pulses
         Prepared simulated pulses.
@@ -44,17 +44,17 @@ def translate_like_data(
     CpunetError
         If the sampling period differs from that of the fit, or for the reasons of `finish`.
     """
-    if not np.isclose(pulses.dt_ns, rival.dt_ns):
+    if not np.isclose(pulses.dt_ns, method.dt_ns):
         raise CpunetError(
-            f"the pulses are sampled every {pulses.dt_ns:g} ns, {rival.name} was fitted to "
-            f"{rival.dt_ns:g} ns; resample the pulses"
+            f"the pulses are sampled every {pulses.dt_ns:g} ns, {method.name} was fitted to "
+            f"{method.dt_ns:g} ns; resample the pulses"
         )
     rng = np.random.default_rng(seed)
     windows = np.empty((len(pulses), config.length), np.float32)
     for rows in blocks(len(pulses)):
         part = pulses[rows]
         windows[rows] = finish(
-            rival.translate(part.waveforms),
+            method.translate(part.waveforms),
             config,
             dt_ns=pulses.dt_ns,
             noise=noise,

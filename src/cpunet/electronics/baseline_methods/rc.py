@@ -15,15 +15,15 @@ import numpy as np
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.finishing import blocks
-from cpunet.electronics.rivals.base import Values, check_sets, check_windows
-from cpunet.electronics.rivals.response import (
+from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
+from cpunet.electronics.baseline_methods.response import (
     PADDING_BEFORE,
     currents,
     integrated,
     record_length,
 )
-from cpunet.electronics.rivals.superpulses import fitted_tail_slope, without_decay
+from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
+from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
@@ -56,12 +56,12 @@ class RC:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Match the mode of the current amplitudes and the tails, see `base.Rival.fit`.
+        """Match the mode of the current amplitudes and the tails, see `BaselineMethod.fit`.
 
         Raises
         ------
         CpunetError
-            For the reasons of `base.Rival.fit`, or if the data are slower than the maximum
+            For the reasons of `BaselineMethod.fit`, or if the data are slower than the maximum
             tau.
         """
         check_sets(sim, data, dt_ns, align)
@@ -87,7 +87,7 @@ class RC:
         return cls(dt_ns, tau * dt_ns, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the integration and the decay, see `base.Rival.translate`."""
+        """Apply the integration and the decay, see `BaselineMethod.translate`."""
         check_windows(waveforms, "simulated")
         records = np.empty((len(waveforms), record_length(waveforms.shape[1])), np.float32)
         for rows in blocks(len(waveforms)):

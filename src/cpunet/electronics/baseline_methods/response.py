@@ -12,8 +12,8 @@ import numpy.typing as npt
 import scipy.fft
 import scipy.signal
 
+from cpunet.electronics.baseline_methods.base import Values
 from cpunet.electronics.finishing import blocks
-from cpunet.electronics.rivals.base import Values
 from cpunet.pulses.container import FloatArray
 
 Spectrum = npt.NDArray[np.complex128]
