@@ -49,6 +49,8 @@ def one_seed(
             monitor=Monitor(),
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
+    if "network" in info:
+        found["network kept"] = float(info["network"]["kept"])
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():
@@ -69,7 +71,7 @@ def summary(runs: list[dict[str, Any]]) -> str:
             continue
         values = np.array([run.get(name, np.nan) for run in runs], float)
         middle = np.median(values)
-        score = not name.endswith(("seconds", "cpu", "AUC", "RMSE"))
+        score = not name.endswith(("seconds", "cpu", "kept", "AUC", "RMSE"))
         failed = str(int((~(values >= FAILED * middle)).sum())) if score else ""
         lines.append(
             f"{name:<36}{middle:>10.4g}{values.min():>10.4g}{values.max():>10.4g}{failed:>8}"

@@ -26,6 +26,7 @@ from cpunet.training.pairs import learn_pairs
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
+from cpunet.training.team import Team
 from cpunet.translation.translator import IREN, REN
 
 DT_NS, KEV, N = 16.0, 2614.5, 240
@@ -170,6 +171,21 @@ def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
         torch.equal(value, before[name]) for name, value in model.ren.state_dict().items()
     )
     assert bool(model.iren.outlet.weight.any())
+
+
+def test_a_team_learns_pairs_from_the_gradients_of_all(sim, surroundings):
+    asked = []
+
+    class Pair(Team):
+        def average_gradients(self, parameters) -> None:
+            asked.append([p.grad is not None for p in parameters])
+
+    torch.manual_seed(0)
+    model = CycleGan(RECIPE, surroundings).train()
+    sampler = EpochSampler(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
+    learn_pairs(model, sampler, RECIPE, surroundings, chain_step(model, surroundings), Pair())
+    assert len(asked) == RECIPE.training.pairs.iterations
+    assert all(map(all, asked))
 
 
 def test_nothing_is_added_where_the_pulse_does_not_move(surroundings):

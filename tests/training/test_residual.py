@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
@@ -16,10 +17,10 @@ from cpunet.networks.hybrid import EdgeResidual
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes import load_recipe, recipe_from
+from cpunet.recipes import load_recipe
 from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.residual import Kept, fit_residual
-from cpunet.training.run_folder import write_run
+from cpunet.training.run_folder import read_recipe, write_run
 from cpunet.translation.translator import REN
 
 DT_NS, KEV, N = 16.0, 2614.5, 500
@@ -144,12 +145,15 @@ def test_same_physics_are_as_far_apart_as_chance(chain):
     assert other > 3 * same
 
 
-def test_recipes_of_former_versions_are_read():
+def test_recipes_of_former_versions_are_read(tmp_path):
     settings = RECIPE.model_dump(mode="json")
     residual = settings["generator"]["residual"]
     del residual["roughness_weight"], residual["weight_decay"]
-    residual |= {"projections": 64, "size_weight": 1000.0, "slope_weight": 30.0}
-    assert recipe_from(settings, "run").residual.width == RECIPE.residual.width
-    residual["projection"] = 3
-    with pytest.raises(CpunetError, match=r"generator\.residual\.projection"):
-        recipe_from(settings, "run")
+    former = {"projections": 64, "size_weight": 1e3, "slope_weight": 30.0}
+    residual |= former | {"amplitude_weight": 1.0}
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(settings))
+    assert read_recipe(tmp_path).residual.width == RECIPE.residual.width
+    del residual["projections"]
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(CpunetError, match=r"residual\."):
+        read_recipe(tmp_path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -42,9 +42,6 @@ class ResponseConfig(Config):
     ringing_ns: Positive
 
 
-FORMER_RESIDUAL = ("projections", "amplitude_weight", "size_weight", "slope_weight")
-
-
 class ResidualConfig(Config):
     """A small network beside a matched response, see `cpunet.training.residual`.
 
@@ -60,19 +57,11 @@ class ResidualConfig(Config):
     iterations: Count
     batch_size: Annotated[int, Field(ge=16, le=100_000)]
     rate: Positive
-    weight_decay: NonNegative = 0.0
+    weight_decay: NonNegative
     average_decay: Fraction
-    roughness_weight: NonNegative = 0.0
+    roughness_weight: NonNegative
     held_out: Annotated[float, Field(gt=0, lt=1)]
     least_fall: Fraction
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_former(cls, settings: Any) -> Any:
-        """Runs of former versions have settings of a loss that is no more."""
-        if not isinstance(settings, dict):
-            return settings
-        return {key: value for key, value in settings.items() if key not in FORMER_RESIDUAL}
 
 
 class HybridConfig(ResponseConfig):

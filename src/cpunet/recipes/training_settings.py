@@ -81,7 +81,7 @@ class TrainingConfig(Config):
     noise: Literal["none", "baselines"]
     pairs: PairsConfig
     losses: LossConfig
-    held_out: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    held_out: Annotated[float, Field(ge=0, le=0.5)]
 
 
 class MatchingConfig(Config):

@@ -124,10 +124,10 @@ def train(
             )
             for side, pulses in zip(_sampler_seeds(seed), (sim, data), strict=True)
         ]
-        if hooks.start is None:
-            _begin(model, samplers, recipe, surroundings, behind, init)
-        group.follow(model.state_dict().values())
         share_norms(model, group)
+        if hooks.start is None:
+            _begin(model, samplers, recipe, surroundings, behind, init, group)
+        group.follow(model.state_dict().values())
         step = Step(model, config, group=group, outside=surroundings.outside, chain=behind)
         training = _Training(step, samplers, device)
         if group.size > 1:
@@ -155,6 +155,7 @@ def _begin(
     surroundings: Surroundings,
     behind: ChainStep | None,
     init: Callable[[CycleGan], None] | None,
+    team: Team,
 ) -> None:
     """Give the generators the start there is: weights, the closed form, pairs."""
     if init is not None:
@@ -162,7 +163,7 @@ def _begin(
     elif behind is None:
         sim, data = (sampler.pulses for sampler in samplers)
         match_skips(model, sim, data, recipe.preparation.samples_before)
-    learn_pairs(model, samplers[0], recipe, surroundings, behind)
+    learn_pairs(model, samplers[0], recipe, surroundings, behind, team)
 
 
 class _DivergenceError(Exception):

@@ -117,6 +117,12 @@ def _completed(settings: Any) -> Any:
         own = settings.get(part) if isinstance(settings, dict) else None
         if isinstance(own, dict) and known_by in own:
             settings = settings | {part: added | own}
+    if isinstance(settings, dict) and isinstance(own := settings.get("generator"), dict):
+        residual = own.get("residual")
+        if isinstance(residual, dict) and residual.keys() >= _FORMER_RESIDUAL:
+            kept = {k: v for k, v in residual.items() if k not in _FORMER_RESIDUAL}
+            later = {"weight_decay": 0.0, "roughness_weight": 0.0}
+            settings = settings | {"generator": own | {"residual": later | kept}}
     return settings
 
 
@@ -125,9 +131,11 @@ _LATER: dict[str, tuple[str, dict[str, Any]]] = {
     "generator": ("fast_decays_us", {"free_decays": False}),
     "training": (
         "discriminator_interval",
-        {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}},
+        {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}, "held_out": 0.0},
     ),
 }
+# of a loss by which networks beside a chain were trained
+_FORMER_RESIDUAL = {"projections", "amplitude_weight", "size_weight", "slope_weight"}
 
 
 def read_losses(run: Path) -> list[Record]:
