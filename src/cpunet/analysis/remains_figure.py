@@ -114,13 +114,14 @@ def sizes_figure(
     axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
     law = RemainsLaw(float(told["rate_khz"]), float(told["decay_us"]), tuple(energies_kev))
     axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
-    axes.axvline(2 * float(told["error_kev"]), color="0.6", lw=0.8, ls=":")
+    twice = 2 * float(told["error_kev"])
+    axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")
     axes.set_ylim(max(30 / n, 0.01), 100)
     axes.set_xlabel("remainder at the first sample (keV)")
     axes.set_ylabel("traces above (%)")
     axes.set_title(
         f"{told['rate_khz']:.2f} ± {told['rate_error_khz']:.2f} kHz, "
-        f"decay {told['decay_us']:.1f} µs; dotted: twice the error of a size"
+        f"decay {told['decay_us']:.1f} µs"
     )
     axes.legend()
     return figure
