@@ -23,10 +23,10 @@ from cpunet.training.loop import CheckpointHooks, train
 from cpunet.training.network_gate import NetworkGate
 from cpunet.training.outside import Outside
 from cpunet.training.pairs import learn_pairs
+from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
-from cpunet.training.team import Team
 from cpunet.translation.translator import IREN, REN
 
 DT_NS, KEV, N = 16.0, 2614.5, 240
@@ -173,10 +173,10 @@ def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
     assert bool(model.iren.outlet.weight.any())
 
 
-def test_a_team_learns_pairs_from_the_gradients_of_all(sim, surroundings):
+def test_a_group_learns_pairs_from_the_gradients_of_all(sim, surroundings):
     asked = []
 
-    class Pair(Team):
+    class Pair(ProcessGroup):
         def average_gradients(self, parameters) -> None:
             asked.append([p.grad is not None for p in parameters])
 

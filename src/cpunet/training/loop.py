@@ -155,7 +155,7 @@ def _begin(
     surroundings: Surroundings,
     behind: ChainStep | None,
     init: Callable[[CycleGan], None] | None,
-    team: Team,
+    group: ProcessGroup,
 ) -> None:
     """Give the generators the start there is: weights, the closed form, pairs."""
     if init is not None:
@@ -163,7 +163,7 @@ def _begin(
     elif behind is None:
         sim, data = (sampler.pulses for sampler in samplers)
         match_skips(model, sim, data, recipe.preparation.samples_before)
-    learn_pairs(model, samplers[0], recipe, surroundings, behind, team)
+    learn_pairs(model, samplers[0], recipe, surroundings, behind, group)
 
 
 class _DivergenceError(Exception):

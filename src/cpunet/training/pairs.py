@@ -19,9 +19,9 @@ from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.losses import weighted_l1, window_weights
 from cpunet.training.outside import Outside, as_measured, of_height
+from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import Surroundings
-from cpunet.training.team import ALONE, Team
 
 
 def learn_pairs(
@@ -30,7 +30,7 @@ def learn_pairs(
     recipe: Recipe,
     surroundings: Surroundings,
     behind: ChainStep | None,
-    team: Team = ALONE,
+    group: ProcessGroup = ALONE,
 ) -> None:
     """Train the generators on pairs, if there is anything that makes some.
 
@@ -46,7 +46,7 @@ def learn_pairs(
         Noise, and a teacher if there is one.
     behind
         The passes behind a chain, if there is one.
-    team
+    group
         Who learns, each from its share of the pairs.
 
     Raises
@@ -69,14 +69,14 @@ def learn_pairs(
         else:
             assert teacher is not None
             loss = _of_teacher(model, sim, sampler.last_rows, *teacher, weights)
-        if team.any(not bool(torch.isfinite(loss))):
+        if group.any(not bool(torch.isfinite(loss))):
             raise CpunetError(
                 f"pairs: a loss is {float(loss)} in iteration {iteration}; lower "
                 "training.pairs.rate"
             )
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        team.average_gradients(learning)
+        group.average_gradients(learning)
         torch.nn.utils.clip_grad_norm_(learning, config.max_grad_norm)
         optimiser.step()
         schedule.step()
