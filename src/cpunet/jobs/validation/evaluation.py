@@ -186,7 +186,9 @@ def _load_both(
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe, more_kev)
     length = ren.recipe.preparation.samples_before + ren.recipe.preparation.samples_after
-    pulses = min(most, max(file.open().n_pulses for file in (sim, data)))
+    # a file that does not tell its number may hold all that are wanted
+    numbers = [file.open().n_pulses for file in (sim, data)]
+    pulses = max(most if n is None else min(most, n) for n in numbers)
     require_memory(
         pulses * length * _WINDOWS * np.dtype(np.float32).itemsize,
         f"{data.path}: comparing {pulses} pulses",
