@@ -310,7 +310,7 @@ def test_a_training_that_died_is_finished(sets, recipe, out, whole):
 
 def test_without_resume_nothing_is_lost(sets, recipe, out):
     before = content(beside(out))
-    with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; go on"):
+    with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; continue"):
         work(sets, recipe, out, [])
     assert content(beside(out)) == before
 

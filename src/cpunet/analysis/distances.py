@@ -97,10 +97,12 @@ def kolmogorov_smirnov(a: Values, b: Values) -> float:
     from scipy.stats import ks_2samp
 
     a, b = _finite(a), _finite(b)
-    # an exact probability takes long, and only the distance is wanted
-    return (
-        float(ks_2samp(a, b, method="asymp").statistic) if a.size and b.size else float("nan")
-    )
+    if not (a.size and b.size):
+        return float("nan")
+    # only the distance is wanted: of many values an exact probability takes long, and of one
+    # value each the asymptotic one divides by zero
+    method = "exact" if a.size + b.size == 2 else "asymp"
+    return float(ks_2samp(a, b, method=method).statistic)
 
 
 def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, require_stored, text_attribute
+from cpunet.machine_memory import require_memory
 from cpunet.pulses.reading.columns import TIME_UNITS
 from cpunet.pulses.reading.source import MAX_SAMPLES
 
@@ -88,3 +89,36 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
     if not 1e-3 <= value <= 1e9:
         raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
     return value
+
+
+def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
+    """Copy a dataset by its values: on damaged ones the HDF5 library's own copy crashes."""
+    require_memory(item.nbytes, f"{item.file.filename}: '{name}'", "give a smaller library")
+    try:
+        values = item[()]
+    except OSError as error:
+        said = " ".join(str(error).split())
+        raise CpunetError(
+            f"{item.file.filename}: '{name}' cannot be read ({said}); write it again"
+        ) from error
+    stored = item.id.get_create_plist()  # with its filters, whichever plugins they are of
+    if stored.get_external_count() or item.is_virtual:
+        copy = made.create_dataset(name, data=values)
+    else:
+        space, kind = item.id.get_space(), item.id.get_type()
+        h5py.h5d.create(made.id, name.encode(), kind, space, dcpl=stored)
+        copy = made[name]
+        copy[()] = values
+    for key, value in item.attrs.items():
+        copy.attrs[key] = value
+
+
+def copy_group(given: h5py.Group, made: h5py.Group) -> None:
+    """Copy a group with all below it by its values; see `copy_values`."""
+    for key, value in given.attrs.items():
+        made.attrs[key] = value
+    for name, item in given.items():
+        if isinstance(item, h5py.Group):
+            copy_group(item, made.create_group(name))
+        else:
+            copy_values(item, made, name)

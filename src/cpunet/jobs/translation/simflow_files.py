@@ -16,6 +16,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.hdf5_files import is_column, opened, require_all_stored
+from cpunet.jobs.translation.library_file import copy_group
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.translation.low_rank import Loss
@@ -283,7 +284,7 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
                     axis = _time_axis(file[name])
                     _require_new(name, path, axis, first)
                     first[name] = (path, axis)
-                    file.copy(file[name], made.h5, name)
+                    copy_group(file[name], made.h5.create_group(name))
     return sorted(first)
 
 

@@ -19,12 +19,12 @@ from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.translation.library_file import (
     WAVEFORM,
+    copy_values,
     libraries,
     n_templates,
     require_whole,
     sampling_period_ns,
 )
-from cpunet.machine_memory import require_memory
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.lh5_parts import FileInTheMaking
@@ -155,28 +155,6 @@ class _Job:
     advance: Advance
 
 
-def _copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
-    """Copy a dataset by its values: on damaged ones the HDF5 library's own copy crashes."""
-    require_memory(item.nbytes, f"{item.file.filename}: '{name}'", "give a smaller library")
-    try:
-        values = item[()]
-    except OSError as error:
-        said = " ".join(str(error).split())
-        raise CpunetError(
-            f"{item.file.filename}: '{name}' cannot be read ({said}); write it again"
-        ) from error
-    stored = item.id.get_create_plist()  # with its filters, whichever plugins they are of
-    if stored.get_external_count() or item.is_virtual:
-        copy = made.create_dataset(name, data=values)
-    else:
-        space, kind = item.id.get_space(), item.id.get_type()
-        h5py.h5d.create(made.id, name.encode(), kind, space, dcpl=stored)
-        copy = made[name]
-        copy[()] = values
-    for key, value in item.attrs.items():
-        copy.attrs[key] = value
-
-
 def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
     """Copy a group with all below it, translating the templates of libraries."""
     for key, value in given.attrs.items():
@@ -192,7 +170,7 @@ def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
         if isinstance(item, h5py.Group):
             _copy(item, made.create_group(name), job)
         elif name not in replaced:
-            _copy_values(item, made, name)
+            copy_values(item, made, name)
     for angle in sorted(angles):
         item = given[f"waveform_{angle}"]
         arrays = (current_arrays if job.currents else charge_arrays)(item, made, angle)
