@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import hashlib
 import importlib.util
 import os
@@ -61,6 +62,12 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["NUMBA_CACHE_DIR"] = folder
         code_of_others()
+
+
+def pytest_collection_finish() -> None:
+    """Leave what all tests keep, imported modules and tests, to no search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def code_of_others() -> Path:

@@ -32,6 +32,7 @@ print(calling(1), sum(calling.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
     package = tmp_path / "loops"
     package.mkdir()

@@ -54,6 +54,7 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert "ch1: trained already" in again.err
 
 
+@pytest.mark.slow
 def test_info_of_all_tables(command, raw, tmp_path):
     page = tmp_path / "raw.html"
     told = command("info", raw, "--table", "all", "--out", page)

@@ -120,6 +120,7 @@ def poles(run: Path) -> list[float]:
     return [v for name, v in fit["parameters"].items() if name.startswith("pole")]
 
 
+@pytest.mark.slow
 def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> None:
     cold = train_run(files["sim"], files["other"], tmp_path / "cold", FAST, device="cpu")
     warm = train_run(
@@ -157,6 +158,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
     assert not any((tmp_path / name).exists() for name in "abcd")
 
 
+@pytest.mark.slow
 def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> None:
     errors = []
     for name, iterations in (("short", 1), ("long", 120)):

@@ -129,6 +129,7 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         parts.score(Giving(lost, recipe))
 
 
+@pytest.mark.slow
 def test_scores_on_the_way_do_not_change_the_training(files):
     recipe = tiny("training.iterations=6")
     parts, told = held_out(files, recipe), []

@@ -216,6 +216,7 @@ def told(capsys, monkeypatch, *words: object) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monkeypatch):
     raw, sim = tmp_path / "MJD_Train_0.hdf5", tmp_path / "sim.lh5"
     write_majorana(raw)

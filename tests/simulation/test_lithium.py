@@ -80,6 +80,7 @@ def test_numbers_without_a_meaning(numbers: tuple[float, ...], words: str) -> No
         LithiumLayer(*numbers)
 
 
+@pytest.mark.slow
 def test_the_file_serves_reboosts_surface_model(tmp_path: Path) -> None:
     psd = pytest.importorskip("reboost.hpge.psd")
     told = write_lithium_library(LithiumLayer(1.0), tmp_path / "lithium.lh5")

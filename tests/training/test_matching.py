@@ -261,6 +261,7 @@ def test_a_ringing_is_found_where_there_is_one() -> None:
     assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_fast_decay_gets_a_time_of_its_own() -> None:
     """That of the paper's stand: fixed times of 4 and 16 us do not follow 2.9.
 
@@ -282,6 +283,7 @@ def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
     assert "ringing_mhz" not in near.response.describe()
 
 
+@pytest.mark.slow
 def test_a_ringing_is_found_with_few_pulses() -> None:
     """Derivatives far from it promise no more than a fifth of chi-square."""
     ringing = {"frequency_MHz": 5.0, "fraction": 0.285, "damping_ns": 160.0}

@@ -247,6 +247,7 @@ def test_judges_see_the_instance_noise_and_it_fades(tiny, batches):
         assert float(noise) == pytest.approx(0.3 * (10 - iteration) / 10, rel=0.25)
 
 
+@pytest.mark.slow
 def test_steps_bring_the_networks_nearer(tiny, batches):
     recipe = tiny("training.iterations=60", "training.decay_start=60", "training.batch_size=4")
     step = make_step(recipe)

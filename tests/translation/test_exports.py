@@ -103,6 +103,7 @@ def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
     pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")

@@ -214,6 +214,7 @@ def words_of(calls: list[list[str]], command: str, detector: str) -> list[str]:
     return words
 
 
+@pytest.mark.slow
 def test_a_failure_stops_no_other_detector(place):
     place.pretend()
     (place.folder / "broken").touch()

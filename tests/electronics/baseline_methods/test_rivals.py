@@ -138,6 +138,7 @@ def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     np.testing.assert_allclose(steps[0, LEAD + 8 : 60], shifted[LEAD + 8 :], atol=0.01)
 
 
+@pytest.mark.slow
 def test_free_kernel_comes_closest_to_the_truth() -> None:
     sim_fine, other_fine = ideal(1600, seed=1), ideal(1600, seed=2)
     sim, kernel = simulated(sim_fine), two_pole_kernel()
