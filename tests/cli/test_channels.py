@@ -54,6 +54,34 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert "ch1: trained already" in again.err
 
 
+def test_check_looks_at_each_channel(command, stand, raw, tmp_path):
+    files = ["--sim", stand.sim, "--data", raw, "--data-table", "all"]
+    told = command("check", *files, "--out", tmp_path / "check.png")
+    assert told.code == 1  # for the channel without pulses of the line
+    channels = [line for line in told.out.splitlines() if line.endswith(":")]
+    assert channels == ["ch1:", "ch2:", "ch3:"]
+    assert told.out.partition("ch3:")[2].startswith("\nstop ")
+    pictures = sorted(path.name for path in tmp_path.glob("*.png"))
+    assert pictures[:2] == ["check-ch1.png", "check-ch2.png"]
+
+
+def test_calibrate_takes_one_channel(command, stand, raw, tmp_path):
+    words = [
+        "--sim",
+        stand.sim,
+        "--data",
+        raw,
+        "--data-table",
+        "all",
+        "--out",
+        tmp_path / "run",
+    ]
+    told = command("calibrate", *words)
+    assert told.code == 2
+    assert "--data-table CHANNEL and the --sim or --detector of each" in told.err
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 def test_info_of_all_tables(command, raw, tmp_path):
     page = tmp_path / "raw.html"

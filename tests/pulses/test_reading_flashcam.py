@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading import open_pulses
+from cpunet.jobs.inspection.info import describe
+from cpunet.pulses.reading import open_pulses, tables_of
 
 LENGTH = 64
 
@@ -68,6 +69,20 @@ def test_full_and_sparse_events_of_one_channel(tmp_path):
         open_pulses(path)
     with pytest.raises(CpunetError, match=r"no channel 3; there are 0, 1, 2"):
         open_pulses(path, table="3")
+
+
+def test_channels_with_traces_are_listed_and_counted(tmp_path):
+    records = [config(4), event(0, {0: trace(0), 3: trace(1)}, sparse=True)]
+    records.append(event(1, {3: trace(2)}, sparse=True))
+    path = write(tmp_path / "run.fcio", *records)
+    assert tables_of(path) == ["0", "3"]
+    told = describe(path)
+    assert told["kind"] == "tables"
+    assert {name: one["n_pulses"] for name, one in told["tables"].items()} == {"0": 1, "3": 2}
+    one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
+    assert tables_of(one) == ["0"]
+    path.write_bytes(path.read_bytes()[:-30])
+    assert tables_of(path) == ["0", "3"]  # what reads the traces tells that it is cut off
 
 
 @pytest.mark.parametrize(("bits", "dt_ns"), [(16, 16.0), (12, 4.0)])

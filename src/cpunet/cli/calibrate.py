@@ -151,9 +151,15 @@ def calibrate(
     """
     from cpunet.jobs.calibration.calibrate import Calibration
     from cpunet.jobs.calibration.calibration_inputs import Freedom
+    from cpunet.jobs.common.channels import ALL
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes import load_recipe
 
+    if data_table == ALL:
+        raise CpunetError(
+            f"--data-table {ALL}: each channel is a detector with physics of its own; calibrate"
+            " one after another, with --data-table CHANNEL and the --sim or --detector of each"
+        )
     if out_folder is None and not plan:
         raise CpunetError("give --out, the run folder to make, or --plan")
     if out_folder is not None:

@@ -23,8 +23,9 @@ from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
-from cpunet.pulses.reading import open_pulses, tables_of
+from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.energies import amplitude
+from cpunet.pulses.reading.opening import table_sizes
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
 from cpunet.pulses.spectrum import Values, suggested_calibration
@@ -141,7 +142,7 @@ def _of_file(
             except CpunetError as error:
                 channels[name] = str(error).removeprefix(f"{file.path}: ")
         return {"kind": "channels", "path": str(file.path), "channels": channels}, spectra
-    tables = tables_of(file.path) if file.table is None else []
+    tables = table_sizes(file.path) if file.table is None else {}
     if len(tables) > 1 and without_remains is None:
         told = {"tables": _told_of(file.path, tables, file.dt_ns)}
         return {"kind": "tables", "path": str(file.path), **told}, {}
@@ -184,16 +185,20 @@ def _of_pulses(
     return told | {"remains": remains.describe()}, counts.spectrum()
 
 
-def _told_of(path: Path, tables: list[str], dt_ns: float | None) -> dict[str, Any]:
+def _told_of(
+    path: Path, tables: Mapping[str, int | None], dt_ns: float | None
+) -> dict[str, Any]:
     """Description of each table without reading its traces, or why it cannot be read."""
     told: dict[str, Any] = {}
-    for table in tables:
+    for table, counted in tables.items():
         try:
             source = open_pulses(path, table=table, dt_ns=dt_ns)
         except CpunetError as error:
             told[table] = str(error)
         else:
             told[table] = source.describe()
+            if counted is not None:
+                told[table]["n_pulses"] = counted
     return told
 
 

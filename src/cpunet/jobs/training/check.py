@@ -88,6 +88,11 @@ class Checked:
     findings: list[Finding]
     sides: dict[str, InputSet] = field(default_factory=dict)
 
+    @classmethod
+    def refused(cls, side: str, error: CpunetError) -> Checked:
+        """The finding that one side, ``"sim"`` or ``"data"``, cannot be read."""
+        return cls([_refusal(side, str(error))])
+
     @property
     def level(self) -> Level:
         """The worst."""

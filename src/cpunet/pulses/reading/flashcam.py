@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,14 +30,9 @@ class FlashCamSource(PulseSource):
 
     def __init__(self, options: ReadOptions) -> None:
         with _opened(options.path) as stream:
-            config = stream.config
-            if config is None:
-                raise CpunetError(f"{options.path}: holds no configuration; copy it again")
-            n_channels = int(config.adcs)
-            length = int(config.eventsamples)
-            period_ns = np.asarray(float(config.sampling_period_ns))
-        if not 0 < n_channels <= _MAX_CHANNELS:
-            raise CpunetError(f"{options.path}: {n_channels} channels; copy the file again")
+            n_channels = _n_channels(options.path, stream)
+            length = int(stream.config.eventsamples)
+            period_ns = np.asarray(float(stream.config.sampling_period_ns))
         self._channel = _channel(options, n_channels)
         layout = Layout(
             format="FlashCam",
@@ -66,7 +62,7 @@ class FlashCamSource(PulseSource):
         # only after the next record, or the regular end, has been read.
         last: tuple[npt.NDArray[np.uint16], int] | None = None
         any_record = False
-        while self._next(stream):
+        while _next(self.path, stream):
             any_record = True
             if last is not None:
                 yield last
@@ -77,13 +73,6 @@ class FlashCamSource(PulseSource):
             raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
         if last is not None:
             yield last
-
-    def _next(self, stream: FCIO) -> bool:
-        try:
-            return bool(stream.get_record())
-        except Exception as error:  # whatever the library makes of damaged records
-            said = " ".join(str(error).split())
-            raise CpunetError(f"{self.path}: damaged ({said}); copy it again") from error
 
     def _event(self, stream: FCIO) -> tuple[npt.NDArray[np.uint16], int] | None:
         if stream.tag not in (Tags.Event, Tags.SparseEvent):
@@ -102,6 +91,42 @@ class FlashCamSource(PulseSource):
                 "split the file by length"
             )
         return trace, number
+
+
+def channel_sizes(path: Path) -> dict[str, int | None]:
+    """Number of traces of each channel that has any; None, unread, if there is one channel.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or is damaged.
+    """
+    counts: Counter[int] = Counter()
+    with _opened(path) as stream:
+        n_channels = _n_channels(path, stream)
+        if n_channels == 1:
+            return {"0": None}
+        while _next(path, stream):
+            if stream.tag in (Tags.Event, Tags.SparseEvent):
+                counts.update(int(channel) for channel in stream.event.trace_list)
+    return {str(c): counts[c] for c in sorted(counts) if 0 <= c < n_channels}
+
+
+def _n_channels(path: Path, stream: FCIO) -> int:
+    if stream.config is None:
+        raise CpunetError(f"{path}: holds no configuration; copy it again")
+    n_channels = int(stream.config.adcs)
+    if not 0 < n_channels <= _MAX_CHANNELS:
+        raise CpunetError(f"{path}: {n_channels} channels; copy the file again")
+    return n_channels
+
+
+def _next(path: Path, stream: FCIO) -> bool:
+    try:
+        return bool(stream.get_record())
+    except Exception as error:  # whatever the library makes of damaged records
+        said = " ".join(str(error).split())
+        raise CpunetError(f"{path}: damaged ({said}); copy it again") from error
 
 
 def _channel(options: ReadOptions, n_channels: int) -> int:

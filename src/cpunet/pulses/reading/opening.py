@@ -80,22 +80,42 @@ def open_pulses(
 
 
 def tables_of(path: str | Path) -> list[str]:
-    """List the waveform tables of an LH5 or other HDF5 file; empty for other formats.
+    """List the waveform tables of an LH5 or other HDF5 file; empty for formats without tables.
 
-    For the Majorana release, these are the detectors.
+    For the Majorana release these are the detectors, for FlashCam files the channels with
+    traces.
 
     Raises
     ------
     CpunetError
         If the file is missing or cannot be read.
     """
-    if recognise(Path(path)) != "hdf5":
-        return []
+    return list(table_sizes(path))
+
+
+def table_sizes(path: str | Path) -> dict[str, int | None]:
+    """Tables as `tables_of`, with their numbers of pulses where these had to be counted.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing or cannot be read.
+    """
+    path = Path(path)
+    match recognise(path):
+        case "hdf5":
+            return dict.fromkeys(_hdf5_tables(path))
+        case "fcio":
+            from cpunet.pulses.reading.flashcam import channel_sizes
+
+            return channel_sizes(path)
+    return {}
+
+
+def _hdf5_tables(path: Path) -> list[str]:
     from cpunet.pulses.reading.hdf5 import opened
     from cpunet.pulses.reading.hdf5_tables import waveform_tables
     from cpunet.pulses.reading.majorana import detectors, is_majorana
 
-    with opened(Path(path)) as file:
-        if is_majorana(file):
-            return detectors(file)
-        return waveform_tables(file)
+    with opened(path) as file:
+        return detectors(file) if is_majorana(file) else waveform_tables(file)
