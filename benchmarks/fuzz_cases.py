@@ -138,7 +138,7 @@ def option(_folder: Path, rng: np.random.Generator) -> Case:
         (TRAIN, "--peak", ["", "x", "-1", "FEP,x", "5-1", "1e400-", "7000-8000", "FEP,"]),
         (TRAIN, "--device", ["", "x", "cuda:99", "gpu"]),
         (TRAIN, "--init", ["nothing", "sim.lh5", "report"]),
-        (TRAIN, "--sim-table", ["x", "geds", "/x/"]),
+        (TRAIN, "--sim-table", ["x", "geds/raw", "/x/"]),
         (TRAIN, "--kev-per-adc", numbers),
         (TRAIN, "--data-energy", ["x", "sim.lh5:x", "nothing.lh5:x", ":", "geds/raw"]),
         (translate, "--realisations", ["0", "-1", "1000000", "x"]),

@@ -93,6 +93,8 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
 
 def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
     """Copy a dataset by its values: on damaged ones the HDF5 library's own copy crashes."""
+    if not isinstance(item, h5py.Dataset):  # an array whose shape is lost looks like a type
+        raise CpunetError(f"{item.file.filename}: '{name}' is no array; write it again")
     require_memory(item.nbytes, f"{item.file.filename}: '{name}'", "give a smaller library")
     try:
         values = item[()]
