@@ -53,7 +53,7 @@ def test_rows_and_what_they_show():
     shown = [[cell.text for cell in row.cells] for row in table.rows]
     assert shown[0] == ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)"]
     assert shown[2] == ["0.520 ± 0.020", "0.450 ± 0.020"]
-    assert shown[3] == ["0.6", "0.6"]
+    assert shown[3] == ["0.600", "0.600"]
     assert shown[4] == ["+1.00 ± 2.00", "-0.50 ± 2.00"]
     # an AUC of 0.52 is closer to chance than one of 0.45
     assert [set(row.best) for row in table.rows] == [{1}, {1}, {0}, {0, 1}, {1}]
@@ -66,7 +66,7 @@ def test_another_method():
         "3.0 ± 1.0 (88.0)",
         "3.0 ± 1.0 (88.0)",
         "0.990 ± 0.020",
-        "7",
+        "7.00",
     ]
 
 

@@ -78,7 +78,7 @@ def pulls_figure(content: Mapping[str, Any]) -> Figure:
     middles = [0.5 * (a + b - 1) for a, b in zip(starts, ends, strict=True)]
     panel.set_xticks(middles, [_wrapped(name) for name in names], fontsize=8)
     panel.grid(axis="x", visible=False)
-    panel.set_ylabel("deviation in standard deviations")
+    panel.set_ylabel("deviation [standard deviations]\n(symlog scale)")
     panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
 

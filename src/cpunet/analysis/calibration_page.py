@@ -11,6 +11,7 @@ from cpunet.analysis.calibration_figures import (
     pulls_figure,
 )
 from cpunet.analysis.html_pages import figure_html, rendered
+from cpunet.analysis.nested_tables import with_std
 
 _PROFILES = (
     "Chi-square along the valley of each parameter, everything else following; grey: the "
@@ -36,6 +37,7 @@ def calibration_page(content: Mapping[str, Any]) -> str:
     return rendered(
         "calibration.html",
         title=f"Detector and readout of {content['detector']}, calibrated together",
+        with_std=with_std,
         chi=content["chi_square"],
         profiles=figure_html(_PROFILES, profiles_figure(content)) if free else "",
         pulls=figure_html(_PULLS, pulls_figure(content)),

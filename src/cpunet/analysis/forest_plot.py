@@ -50,7 +50,9 @@ def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> s
     for i, (name, cell) in enumerate(zip(names, row.cells, strict=True)):
         y = TOP + LINE * (i + 0.5)
         short = name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}"
-        marks = "".join(_marks(cell, y, at))
+        marks = "".join(_marks(cell, y, at)) or (
+            f'<text x="{NAMES + 4}" y="{y + 4}" style="fill:#777">no score</text>'
+        )
         drawn.append(
             f"<g><title>{escape(f'{name}: {cell.text}')}</title>"
             f'<text x="{NAMES - 8}" y="{y + 4}" text-anchor="end">{escape(short)}</text>'

@@ -173,12 +173,16 @@ def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
-    head = ["Against the true shapes", "RMSE", "RMSE of the edge"]
+    head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
     rows = [
-        [label(method), number(scores.get("rmse")), number(scores.get("edge_rmse"))]
+        [label(method), *(_thousandths(scores.get(key)) for key in ("rmse", "edge_rmse"))]
         for method, scores in paired.items()
     ]
     return html_table(head, rows)
+
+
+def _thousandths(value: float | None) -> str:
+    return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
 
 
 def _texts(value: Any) -> list[str]:

@@ -136,7 +136,7 @@ def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
     cells = [_auc(part(s, "two_sample", method)) for s in scores]
     rows.append(_row(peak, "classifier: AUC", cells, _off))
     cells = [_edge(part(s, "paired", method)) for s in scores]
-    rows.append(_row(peak, "edge RMSE [0.001]", cells, _off))
+    rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
     cells = [_survival(part(metrics, "ae_survival", peak), method) for metrics in runs]
     rows.append(_row(peak, "A/E survival less data [points]", cells, _off))
     return [row for row in rows if any(cell.value is not None for cell in row.cells)]
@@ -168,7 +168,7 @@ def _auc(tested: Metrics) -> Cell:
 
 def _edge(paired: Metrics) -> Cell:
     rmse = number(paired, "edge_rmse")
-    return _cell(None if rmse is None else 1e3 * rmse, None, None, None, ".3g")
+    return _cell(None if rmse is None else 1e3 * rmse, None, None, None, "#.3g")
 
 
 def _survival(survival: Metrics, method: str) -> Cell:
