@@ -119,7 +119,7 @@ def test_page_shows_scores_counts_and_provenance(report):
         '<th scope="col">IoU [%]</th>',
         ">Ceiling</td>",
         "Drift time",
-        "<td>REN translation</td><td>0.25</td><td>–</td>",
+        "<td>REN translation</td><td>250</td><td>–</td>",
         "<td>data: saturated</td><td>3</td>",
         "simulation: no &lt;edge&gt;",
         "1 &lt; 2 &amp; 3.",

@@ -104,10 +104,11 @@ def test_dots_are_where_the_scores_are():
     assert ceilings == pytest.approx([4 * per_point] * 2, abs=0.15)
 
 
-def test_a_missing_score_leaves_its_line_empty():
+def test_a_missing_score_is_said_in_its_line():
     entries = [Entry("V01", "p03", metrics(80.0, 81.0)), Entry("B02", "p03", metrics(70.0))]
     second = figures(summary_page(entries))[1]
     assert len(list(second.iter("circle"))) == 1
+    assert [text.text for text in second.iter("text")].count("no score") == 1
     assert [g.findtext("title") for g in second.iter("g")][1] == "B02 · p03: –"
 
 
