@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from cpunet.cli.main import main
 from cpunet.jobs.validation import validate
-from cpunet.jobs.validation.figures import drawings
+from cpunet.jobs.validation.drawings import drawings
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 

@@ -14,10 +14,10 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.validation.drawings import drawings, figure_names
 from cpunet.jobs.validation.energy_ranges import validation_selection
 from cpunet.jobs.validation.evaluation import Evaluation, evaluate
 from cpunet.jobs.validation.figure_store import read_drawings, write_drawings
-from cpunet.jobs.validation.figures import drawings, figure_names
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters

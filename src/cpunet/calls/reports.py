@@ -21,8 +21,8 @@ from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.drawings import Drawing
 from cpunet.jobs.validation.figure_store import STORE, read_drawings
-from cpunet.jobs.validation.figures import Drawing
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked

@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.analysis.figures import loss_curves
 from cpunet.analysis.response_figure import response_figure
+from cpunet.analysis.run_figures import loss_curves
 from cpunet.calls import html
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.response import chain_of, describe_responses
+from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
 from cpunet.jobs.training.train import train_run
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe

@@ -19,8 +19,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import EdgeResidual
-from cpunet.networks.response import PADDING_AFTER
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import PADDING_AFTER
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.network_settings import ResidualConfig
 from cpunet.recipes.schema import Recipe

@@ -17,8 +17,8 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import HybridGenerator
-from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
 from cpunet.translation.backends import ResponseBackend

@@ -33,10 +33,10 @@ from cpunet.jobs.calibration.calibration_inputs import (
     read_sides,
 )
 from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.common.remains import drawn_like, measured_remains
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import ResponseTrainer

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
-from cpunet.jobs.training.matching import known_response, match
+from cpunet.jobs.training.chain_and_inverse import known_response, match
 from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup

@@ -15,7 +15,7 @@ from torch import nn
 from cpunet.jobs.common.devices import peak_memory_mb
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.training.matching import Sides
+from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup

@@ -12,9 +12,9 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.drawings import LOSSES, Drawing, drawings, figure_names, of_losses
 from cpunet.jobs.validation.evaluation import evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, read_drawings, write_drawings
-from cpunet.jobs.validation.figures import LOSSES, Drawing, drawings, figure_names, of_losses
 from cpunet.outputs import made_here, refuse_existing
 from cpunet.training.run_folder import read_info, read_losses, read_recipe
 

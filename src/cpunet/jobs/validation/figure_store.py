@@ -14,7 +14,7 @@ from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translation_record import run_print, source_print
-from cpunet.jobs.validation.figures import Drawing
+from cpunet.jobs.validation.drawings import Drawing
 
 STORE = "figures.npz"
 _INDEX = "index"

@@ -13,10 +13,10 @@ from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.drawings import Drawing, drawings
 from cpunet.jobs.validation.evaluation import MOST_PULSES, Evaluation, evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
-from cpunet.jobs.validation.figures import Drawing, drawings
-from cpunet.jobs.validation.views import report_views
+from cpunet.jobs.validation.report_charts import report_views
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.training.run_folder import read_info
 

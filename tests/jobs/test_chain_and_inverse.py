@@ -17,7 +17,7 @@ from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.training.matching import Sides
+from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.network_start import network_start
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.translation.translate import translate_file
