@@ -105,8 +105,6 @@ def superpulse_views(
         charge.
     slices
         Names of the slices, by peak or common to all peaks.
-    dt_ns
-        Sampling period in ns.
     n_before
         Sample at which the pulses are aligned.
     """
@@ -147,8 +145,6 @@ def pulse_views(
     pulses
         Noise-free pulses by peak and method, shape ``(n, samples)``; each row is the same
         simulated event for all methods.
-    dt_ns
-        Sampling period in ns.
     measured
         Measured pulses by peak.  The nearest to an event has the smallest root-mean-square
         difference from its truth, or else from its REN translation, among `SEARCHED` pulses.
@@ -157,11 +153,6 @@ def pulse_views(
     n_before, n_after
         Number of samples before the crossing of half the maximum, at which all pulses are
         aligned, and from it on.
-
-    Raises
-    ------
-    CpunetError
-        If the methods of a peak have different numbers of pulses.
     """
     window = (n_before, n_after)
     peaks: View = {}

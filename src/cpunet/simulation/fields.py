@@ -45,8 +45,6 @@ def compute_fields(
 
     Parameters
     ----------
-    detector
-        Geometry, impurities and bias.
     cache, progress
         See `cpunet.simulation.superposition.solve`.
 
@@ -118,11 +116,6 @@ def scaled_to_depletion(
 
     Manufacturers measure impurity densities to about 10 %, while the depletion voltage is
     known to a few volts. `cache` and `progress` are those of `compute_fields`.
-
-    Raises
-    ------
-    CpunetError
-        If the detector has no ``measured_depletion_V``, or no scale leads to it.
     """
     measured = detector.measured_depletion_V
     if not measured:
@@ -151,8 +144,6 @@ def electric_field(
     ----------
     potential
         Potential in V, shape (nr, nz).
-    grid
-        Nodes of the potential.
     mirror
         Whether z = 0 is a mirror plane, as the axis always is.
 

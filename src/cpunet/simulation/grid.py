@@ -52,13 +52,7 @@ class Grid:
 
 
 def make_grid(detector: Detector) -> Grid:
-    """Place nodes over the crystal, up to the first ones on or beyond its surfaces.
-
-    Raises
-    ------
-    CpunetError
-        If ``grid_mm`` gives more nodes than fit into the memory.
-    """
+    """Place nodes over the crystal, up to the first ones on or beyond its surfaces."""
     h = detector.grid_mm
     nr, nz = (
         int(np.ceil(size / h - 1e-6)) + 1

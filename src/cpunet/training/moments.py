@@ -109,13 +109,7 @@ class Moments:
     def of_data(
         cls, windows: FloatArray, config: MatchingConfig, preparation: PreparationConfig
     ) -> Moments:
-        """Draw up the moments from prepared measured pulses, shape (pulses, samples).
-
-        Raises
-        ------
-        CpunetError
-            If there are too few pulses.
-        """
+        """Draw up the moments from prepared measured pulses, shape (pulses, samples)."""
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
         some = whole[np.linspace(0, len(whole) - 1, min(len(whole), DRAWN)).astype(int)]
         level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0

@@ -76,13 +76,7 @@ def write_run(
 
 
 def read_info(run: Path) -> dict[str, Any]:
-    """Provenance of a run.
-
-    Raises
-    ------
-    CpunetError
-        If the folder is no finished run, or of a newer version.
-    """
+    """Provenance of a run."""
     path = Path(run) / INFO
     try:
         info = plain_json(read_text(path, MAX_BYTES))
@@ -164,13 +158,7 @@ def _is_record(record: Any) -> bool:
 
 
 def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") -> nn.Module:
-    """Fill `network` with the weights saved under `name` (``"ren"``, ``"iren"``, …).
-
-    Raises
-    ------
-    CpunetError
-        If the file is missing, damaged or of another architecture.
-    """
+    """Fill `network` with the weights saved under `name` (``"ren"``, ``"iren"``, …)."""
     path = Path(run) / WEIGHTS
     weights = _weights_of(run, device)
     prefix = f"{name}."
@@ -207,13 +195,7 @@ def fill_networks(run: Path, model: nn.Module) -> None:
 
 
 def weights_sha256(run: Path) -> str:
-    """Fingerprint of a run's weights.
-
-    Raises
-    ------
-    CpunetError
-        If there are none.
-    """
+    """Fingerprint of a run's weights."""
     path = Path(run) / WEIGHTS
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -14,13 +14,7 @@ ROOMS = ("generator", "discriminator", "training")
 
 
 def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
-    """The search space of a recipe, every value of which the recipe could have.
-
-    Raises
-    ------
-    CpunetError
-        If there is none, or a key or value in it is not allowed: names the key.
-    """
+    """The search space of a recipe, every value of which the recipe could have."""
     if not recipe.search:
         raise CpunetError(
             f"recipe {recipe.name}: has no search space; add one, as "
@@ -39,13 +33,7 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
 
 
 def value_of(recipe: Recipe, key: str) -> Any:
-    """The value of a setting.
-
-    Raises
-    ------
-    CpunetError
-        If the recipe has none of that name.
-    """
+    """The value of a setting."""
     node: Any = recipe.model_dump(mode="json")
     for part in key.split("."):
         if not isinstance(node, dict) or part not in node:

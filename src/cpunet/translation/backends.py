@@ -130,13 +130,7 @@ class NoisyNetworkBackend(NetworkBackend):
         remains_kev: Energies | None = None,
         second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Run the network, add noise in proportion to 1/energy, and prepare like data.
-
-        Raises
-        ------
-        CpunetError
-            If noise is wanted and an energy is not known.
-        """
+        """Run the network, add noise in proportion to 1/energy, and prepare like data."""
         if noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
         if not noise and (remains_kev is not None or second is not None):
@@ -183,13 +177,7 @@ class ResponseBackend(Backend):
         remains_kev: Energies | None = None,
         second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
-        """Apply the chain, add noise proportional to 1/energy, and prepare like data.
-
-        Raises
-        ------
-        CpunetError
-            If noise is requested and an energy is unknown.
-        """
+        """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         if noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)

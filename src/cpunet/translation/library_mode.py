@@ -161,8 +161,6 @@ def aligned_currents(
     ----------
     charge
         Translated templates, shape (n, samples); rows of NaN remain NaN.
-    dt_ns
-        Sampling period in ns.
 
     Returns
     -------
@@ -202,11 +200,6 @@ def linearity(
         compared.
     seed
         Seed of the choice of templates and of the weights.
-
-    Raises
-    ------
-    CpunetError
-        If none of the sums can be translated.
     """
     rng = np.random.default_rng(seed)
     sites = rng.integers(len(templates), size=(EVENTS, SITES))

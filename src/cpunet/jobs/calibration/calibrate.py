@@ -124,8 +124,6 @@ class Calibration:
         ----------
         out
             Output folder; it appears when it is complete.
-        force, monitor
-            See `cpunet.jobs.training.train.train_run`.
 
         Returns
         -------
@@ -178,8 +176,6 @@ class Calibration:
         ----------
         out
             Folder for ``plan.json`` and ``plan.png``; None for none.
-        force, monitor
-            See `run`.
 
         Returns
         -------

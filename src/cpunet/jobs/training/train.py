@@ -54,32 +54,20 @@ def train_run(
 
     Parameters
     ----------
-    sim, data
-        Simulated and measured pulses.
     out
         The run folder; it appears when the training is done. A CycleGAN works in
         ``OUT.unfinished`` until then, see `cpunet.training.unfinished`.
-    recipe
-        All settings.
     peak
         Energies to train on: a peak of the recipe or a range in keV.
-    seed
-        Seed of all random numbers.
-    device
-        ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
     init
         Folder of a run to start from, as of another detector or period: of the same kind, or
         a matched one, which makes pairs for networks to learn first.
     resume
         Resume an unfinished training, if there is one; all else must be unchanged.
-    force
-        Replace an existing folder and, without `resume`, an unfinished training.
     tensorboard
         Write TensorBoard logs beside the losses (needs the extra ``tensorboard``).
     stop
         Asked after each iteration of a CycleGAN whether to store its state and stop.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------

@@ -36,8 +36,6 @@ def train_channels(
         Files; the table of the data is ``"all"``, that of the simulation may be.
     out
         Folder of the run folders.
-    recipe
-        All settings.
     init
         A run to start from, or the folder of a run for each channel.
     resume

@@ -242,12 +242,8 @@ def translate_file(
 
     Parameters
     ----------
-    run
-        Folder of a training run.
     source
         Simulated pulses, or measured ones for `inverse`.
-    out
-        LH5 file to write.
     inverse
         Apply IREN (data → simulation-like) instead of REN.
     noise, seed
@@ -270,8 +266,6 @@ def translate_file(
         trace's own pulse) of the largest.
     resume
         Leave an output as it is that was made of this source with this run and these options.
-    device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------

@@ -27,13 +27,7 @@ class Stamped(Protocol):
 
 
 def source_print(source: InputFile) -> Record:
-    """Sizes and times of change of the files that are read.
-
-    Raises
-    ------
-    CpunetError
-        If one is not there.
-    """
+    """Sizes and times of change of the files that are read."""
     paths = [source.path]
     elsewhere = (source.energy or "").rpartition(":")[0]
     if elsewhere and Path(elsewhere).is_file():
@@ -82,12 +76,6 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
         A translated file.
     wanted
         ``source``, ``run`` and ``options``.
-
-    Raises
-    ------
-    CpunetError
-        If it says nothing of how it was made, or was made of another source, with another
-        run or with other options.
     """
     found = _read(out)
     for what, value in wanted.items():

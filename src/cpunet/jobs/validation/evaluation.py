@@ -93,13 +93,7 @@ def evaluate(
     ae_range_kev: Range | None = None,
     most: int = MOST_PULSES,
 ) -> Evaluation:
-    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
-
-    Raises
-    ------
-    CpunetError
-        If the input cannot be used, or no peak can be scored.
-    """
+    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`."""
     info = read_info(run)
     ren = REN.load(run, resolve_device(device))
     iren = IREN.load(run, resolve_device(device))

@@ -52,25 +52,15 @@ def draw_figures(
     sim, data
         Simulated and measured pulses, for a run; not needed if results of the run are stored,
         nor for its losses.
-    out
-        Output folder, created if missing.
     suffix
         File format: ``.png``, ``.pdf`` or ``.svg``.
     truth, rivals, seed, device, monitor
         See `cpunet.jobs.validation.validate.validate_run`.
-    force
-        Whether to replace existing files.
 
     Returns
     -------
     list of Path
         Paths of the files written.
-
-    Raises
-    ------
-    CpunetError
-        If a name matches no figure (the message lists them), required pulses are missing,
-        or a file exists.
     """
     if suffix not in FORMATS:
         raise CpunetError(f"format {suffix!r} is not known; use {', '.join(FORMATS)}")
@@ -140,11 +130,6 @@ class _Given:
 
 def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
     """Names of the figures that match the given names in full or in part.
-
-    Raises
-    ------
-    CpunetError
-        If a name matches no figure; the message lists them.
 
     Examples
     --------

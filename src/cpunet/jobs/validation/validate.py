@@ -45,10 +45,6 @@ def validate_run(
 
     Parameters
     ----------
-    run
-        Folder of the training run.
-    sim, data
-        Simulated and measured pulses.
     out
         Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, from
         which `cpunet.jobs.validation.figure_files.draw_figures` redraws the figures.
@@ -62,8 +58,6 @@ def validate_run(
         Further energies to read on both sides for A/E against energy, such as 900 to 2350.
     most
         Largest number of pulses a side that are compared: of more, a random sample.
-    device, force, monitor
-        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
