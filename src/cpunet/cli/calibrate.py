@@ -110,7 +110,9 @@ Events = Annotated[
 ]
 
 
+@options.grouped
 def calibrate(
+    *,
     data: options.Data,
     out_folder: Out = None,
     sim: SimFile = None,
@@ -133,11 +135,7 @@ def calibrate(
     recipe: RecipeName = "fast",
     events: Events = 3000,
     seed: options.Seed = 0,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
+    read_as: options.DataAs,
     force: options.Force = False,
 ) -> None:
     """Calibrate the detector and its electronics together: temperature, impurities, readout.
@@ -151,7 +149,6 @@ def calibrate(
     """
     from cpunet.jobs.calibration.calibrate import Calibration
     from cpunet.jobs.calibration.calibration_inputs import Freedom
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes import load_recipe
 
     if out_folder is None and not plan:
@@ -160,9 +157,9 @@ def calibrate(
         refuse_inputs(out_folder, recipe, detector, settings_file)
     start = _start(
         sim, detector, hits, settings_file, set_values or [], crystal, hits_detector,
-        origin, flip_z, length_unit, energy_unit, cluster_mm, insist,
+        origin, flip_z, length_unit, energy_unit, cluster_mm, read_as.insist,
     )  # fmt: skip
-    measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
+    measured = read_as.data(data)
     job = Calibration(
         start,
         measured,

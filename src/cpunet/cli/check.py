@@ -9,7 +9,6 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out
-from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[
@@ -22,20 +21,14 @@ MARKS = {
 }
 
 
+@options.grouped
 def check(
+    *,
     sim: options.Sim,
     data: options.Data,
     out_file: Out = None,
-    recipe: RecipeName = "fast",
-    peak: Peak = "FEP",
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
-    set_values: Set = None,
+    on: options.TrainOn,
+    read_as: options.ReadAs,
     force: options.Force = False,
 ) -> None:
     """Say whether simulated and measured pulses can be compared, and what to do if not.
@@ -44,17 +37,15 @@ def check(
 
     Example: cpunet check --sim sim.lh5 --data raw.lh5 --out check.png
     """
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.training.check import Level, check, draw
-    from cpunet.recipes import load_recipe
 
     if out_file is not None:
-        refuse_inputs(out_file, sim, data, recipe)
+        refuse_inputs(out_file, sim, data, on.recipe)
     checked = check(
-        InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-        InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
-        load_recipe(recipe, set_values or ()),
-        peak,
+        read_as.sim(sim),
+        read_as.data(data),
+        on.load(),
+        on.peak,
         monitor(),
     )
     for finding in checked.findings:

@@ -21,17 +21,6 @@ library = typer.Typer(
     no_args_is_help=True,
 )
 
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
-]
 Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
 Source = Annotated[Path, typer.Argument(help="LH5 file of a library.", metavar="FILE")]
 Sources = Annotated[
@@ -133,14 +122,14 @@ SettingsFile = Annotated[
 
 @library.command()
 def make(
-    detector: DetectorFile,
+    detector: options.DetectorFile,
     out_file: Out,
     grid_mm: Grid = 1.0,
     angles: Angles = "0,45",
     dt: Dt = None,
     length_ns: Length = None,
     settings: SettingsFile = None,
-    set_values: Set = None,
+    set_values: options.Set = None,
     crystal: options.Crystal = None,
     force: options.Force = False,
 ) -> None:

@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 HITS, GAMMAS = "Hits from a file", "Hits from the built-in gamma Monte Carlo"
 PULSES, OUTPUT = "Pulses", "Output"
 
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
 Set = Annotated[
     list[str] | None,
     typer.Option(
@@ -184,7 +177,7 @@ SelfRepulsion = Annotated[
 
 
 def simulate(
-    detector: DetectorFile,
+    detector: options.DetectorFile,
     out_file: Out,
     hits: HitFileName = None,
     events: Events = None,

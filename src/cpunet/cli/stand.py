@@ -30,13 +30,6 @@ Preset = Annotated[
     str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder to make.")]
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
 Events = Annotated[
     str, typer.Option(help="Events of each peak or range (keV), for sim and data each.")
 ]
@@ -92,7 +85,7 @@ WindowKev = Annotated[
 def stand(
     preset: Preset,
     out_folder: Out,
-    detector: DetectorFile = "icpc",
+    detector: options.DetectorFile = "icpc",
     events: Events = "FEP=4000,SEP=1500,DEP=1500",
     kind: KindOption = Kind.matched,
     shift: ShiftParts = None,
