@@ -21,6 +21,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import evaluate
 from cpunet.recipes import load_recipe
 
@@ -37,7 +38,7 @@ def one_seed(
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         before = time.process_time()
-        info = train_run(*files, run, load_recipe(recipe, overrides), seed=seed)
+        info = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
         cpu = time.process_time() - before
         metrics = evaluate(
             run,

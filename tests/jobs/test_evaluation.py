@@ -14,6 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.drawings import drawings, figure_names
 from cpunet.jobs.validation.energy_ranges import validation_selection
 from cpunet.jobs.validation.evaluation import Evaluation, evaluate
@@ -76,7 +77,7 @@ def files(tmp_path_factory) -> dict[str, InputFile]:
 @pytest.fixture(scope="module")
 def run(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("run") / "run"
-    train_run(files["sim"], files["data"], out, RECIPE, seed=0, device="cpu")
+    train_run(files["sim"], files["data"], out, RECIPE, TrainOptions(seed=0, device="cpu"))
     return out
 
 

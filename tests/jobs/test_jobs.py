@@ -24,6 +24,7 @@ from cpunet.jobs.common.inputs import (
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.common.truth import load_truth
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.pulses.container import Pulses
@@ -176,7 +177,9 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
 
 def test_a_training_tells_what_it_does(files, tmp_path):
     monitor = Listening()
-    info = train_run(*files, tmp_path / "run", RECIPE, seed=7, device="cpu", monitor=monitor)
+    info = train_run(
+        *files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"), monitor=monitor
+    )
     assert monitor.stages == {
         "Preparing sim.lh5": [N, N],
         "Preparing data.lh5": [N, N],
@@ -188,7 +191,9 @@ def test_a_training_tells_what_it_does(files, tmp_path):
 
 
 def test_a_range_of_energies(files, tmp_path):
-    info = train_run(*files, tmp_path / "run", RECIPE, peak="1500-2200", device="cpu")
+    info = train_run(
+        *files, tmp_path / "run", RECIPE, TrainOptions(peak="1500-2200", device="cpu")
+    )
     assert info["peak"] == "1500-2200"
     assert info["sim"]["used"] == 20
 

@@ -66,6 +66,7 @@ def train(
     from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.training.train import train_run
     from cpunet.jobs.training.train_channels import train_channels
+    from cpunet.jobs.training.training_job import TrainOptions
     from cpunet.training.loop import StoppedError
     from cpunet.training.process_group import ToldElsewhereError, launch
 
@@ -91,13 +92,7 @@ def train(
                 read_as.data(data),
                 out_folder,
                 chosen,
-                peak=on.peak,
-                seed=seed,
-                device=device,
-                init=init,
-                resume=resume,
-                force=force,
-                tensorboard=tensorboard,
+                TrainOptions(on.peak, seed, device, init, resume, force, tensorboard),
                 stop=stop,
                 monitor=shown,
             )

@@ -40,7 +40,7 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import ResponseTrainer
-from cpunet.jobs.training.training_job import TrainingJob
+from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
@@ -152,10 +152,10 @@ class Calibration:
             again = load_simulated(
                 InputFile(folder / SIM), self.recipe, sides.selection, monitor
             )
+            how = TrainOptions(self.peak, self.seed, "cpu")
             job = TrainingJob(
-                self.recipe, self.peak, self.seed, "cpu", ProcessGroup(), None, again,
-                sides.data, self.data, folder, monitor,
-            )  # fmt: skip
+                self.recipe, how, ProcessGroup(), again, sides.data, self.data, folder, monitor
+            )
             trainer = ResponseTrainer(self.recipe)
             model, info, recipe = trainer.train(job, known=calibrated.response)
             info["sim"]["file"] = str(out / SIM)

@@ -20,6 +20,7 @@ from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
@@ -201,10 +202,12 @@ class _Member:
                 self.data,
                 run,
                 self.recipe,
-                peak=self.peak,
-                seed=seed,
-                device=self.device,
-                resume=begun and trainer_for(self.recipe).resumable,
+                TrainOptions(
+                    self.peak,
+                    seed,
+                    self.device,
+                    resume=begun and trainer_for(self.recipe).resumable,
+                ),
                 stop=stop,
                 monitor=_Forwarding(link, seed),
             )
