@@ -22,6 +22,7 @@ from cpunet.jobs.training.network_start import network_start
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
@@ -179,7 +180,9 @@ def test_files_are_translated_in_both_directions(
 ) -> None:
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
-    told = translate_file(run.folder, source, out, inverse=inverse, device="cpu")
+    told = translate_file(
+        run.folder, source, out, TranslateOptions(inverse=inverse), device="cpu"
+    )
     assert told == {"read": N, "translated": N, "rejections": {}}
     windows = open_pulses(out).read()
     assert windows.waveforms.shape == (N, 800)
@@ -197,8 +200,8 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
     told = translate_file(run.folder, InputFile(path), tmp_path / "a.lh5", device="cpu")
     assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
-    quiet = {"noise": False, "device": "cpu"}
-    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", **quiet)
+    quiet = TranslateOptions(noise=False)
+    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", quiet, device="cpu")
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 
