@@ -21,7 +21,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -40,11 +40,13 @@ def scores_of(
             run,
             sim,
             data,
-            truth=truth if truth.exists() else None,
-            rivals=rivals,
-            seed=seed,
-            device="auto",
-            monitor=Monitor(),
+            ValidateOptions(
+                truth=truth if truth.exists() else None,
+                baselines=rivals,
+                seed=seed,
+                device="auto",
+            ),
+            Monitor(),
         ).metrics
 
 

@@ -22,7 +22,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -43,11 +43,13 @@ def one_seed(
         metrics = evaluate(
             run,
             *files,
-            truth=truth if truth.exists() and sim == stand else None,
-            rivals=False,
-            seed=seed,
-            device="auto",
-            monitor=Monitor(),
+            ValidateOptions(
+                truth=truth if truth.exists() and sim == stand else None,
+                baselines=False,
+                seed=seed,
+                device="auto",
+            ),
+            Monitor(),
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
     if "network" in info:

@@ -20,7 +20,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
@@ -72,11 +72,10 @@ def main() -> None:
                 run,
                 sim,
                 data,
-                truth=arguments.stand / "truth.npz",
-                rivals=False,
-                seed=0,
-                device="cpu",
-                monitor=Monitor(),
+                ValidateOptions(
+                    truth=arguments.stand / "truth.npz", baselines=False, seed=0, device="cpu"
+                ),
+                Monitor(),
             )
             rows[title] = (info["seconds"], scored.metrics)
     show(rows)

@@ -9,6 +9,7 @@ import pytest
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.recipes import load_recipe
 
@@ -22,7 +23,11 @@ def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_pat
     sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
     train_run(sim, data, tmp_path / "run", load_recipe("small"), TrainOptions(device="cpu"))
     metrics = validate_run(
-        tmp_path / "run", sim, data, tmp_path / "report", truth=folder / "truth.npz"
+        tmp_path / "run",
+        sim,
+        data,
+        tmp_path / "report",
+        ValidateOptions(truth=folder / "truth.npz"),
     )
     worse = []
     for peak in ("SEP", "DEP"):

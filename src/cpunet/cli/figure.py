@@ -39,8 +39,7 @@ def figure(
     data: Data = None,
     out_folder: Out = Path(),
     suffix: Suffix = "png",
-    truth: options.Truth = None,
-    rivals: options.Rivals = True,
+    scored: options.ScoredWith,
     seed: options.Seed = 0,
     read_as: options.ReadAs,
     device: options.Device = "auto",
@@ -52,6 +51,7 @@ def figure(
 
     Example: cpunet figure run "single pulse" --sim sim.lh5 --data raw.lh5 --out figures
     """
+    from cpunet.jobs.validation.evaluation import ValidateOptions
     from cpunet.jobs.validation.figure_files import draw_figures
 
     files = draw_figures(
@@ -61,10 +61,7 @@ def figure(
         None if data is None else read_as.data(data),
         out_folder,
         suffix=f".{suffix.removeprefix('.')}",
-        truth=truth,
-        rivals=rivals,
-        seed=seed,
-        device=device,
+        how=ValidateOptions(scored.truth, scored.fitted, seed, device=device),
         force=force,
         monitor=monitor(),
     )

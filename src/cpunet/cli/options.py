@@ -141,8 +141,12 @@ Insist = Annotated[
 Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]
-Rivals = Annotated[
-    bool, typer.Option("--rivals/--no-rivals", help="Fit the baseline methods too, or not.")
+Baselines = Annotated[
+    bool,
+    typer.Option("--baselines/--no-baselines", help="Fit the baseline methods too, or not."),
+]
+OldBaselines = Annotated[  # the old spelling, until 0.2
+    bool | None, typer.Option("--rivals/--no-rivals", hidden=True)
 ]
 Crystal = Annotated[
     Path | None,
@@ -227,6 +231,20 @@ class ReadAsOrAll(ReadAs):
     """The same, where all channels may be asked for."""
 
     data_table: OneTableOrAll = None
+
+
+@dataclass(frozen=True)
+class ScoredWith:
+    """What a validation compares with."""
+
+    truth: Truth = None
+    baselines: Baselines = True
+    rivals: OldBaselines = None
+
+    @property
+    def fitted(self) -> bool:
+        """Whether baseline methods are fitted, by either spelling."""
+        return self.baselines if self.rivals is None else self.rivals
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,7 @@ def validate(
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
-    truth: options.Truth = None,
-    rivals: options.Rivals = True,
+    scored: options.ScoredWith,
     ae_range: AeRange = None,
     most: Most = 50_000,
     seed: options.Seed = 0,
@@ -55,6 +54,7 @@ def validate(
     Example: cpunet validate runs --sim sim.lh5 --data raw.lh5 --data-table all --out reports
     """
     from cpunet.jobs.common.channels import ALL, Outcome
+    from cpunet.jobs.validation.evaluation import ValidateOptions
     from cpunet.jobs.validation.validate import validate_run
     from cpunet.jobs.validation.validate_channels import INDEX, validate_channels
 
@@ -70,12 +70,7 @@ def validate(
         read_as.sim(sim),
         read_as.data(data),
         out_folder,
-        truth=truth,
-        rivals=rivals,
-        seed=seed,
-        ae_range_kev=span,
-        most=most,
-        device=device,
+        ValidateOptions(scored.truth, scored.fitted, seed, span, most, device),
         force=force,
         monitor=monitor(),
     )

@@ -15,6 +15,7 @@ from cpunet.jobs.simulation.stand import write_stand
 from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.schema import Recipe
@@ -95,9 +96,7 @@ def demonstrate(
         sim,
         data,
         report,
-        truth=stand / "truth.npz",
+        ValidateOptions(stand / "truth.npz", seed=seed, device=device),
         force=report.exists(),
-        seed=seed,
-        device=device,
         monitor=monitor,
     )

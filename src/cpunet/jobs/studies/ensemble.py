@@ -214,18 +214,16 @@ class _Member:
 
     def _score(self, run: Path) -> dict[str, Any]:
         # takes seconds to import in each process: only if needed
-        from cpunet.jobs.validation.evaluation import evaluate
+        from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 
         clock = time.perf_counter()
         metrics = evaluate(
             run,
             self.sim,
             self.data,
-            truth=self.truth,
-            rivals=False,
-            seed=0,  # the same noise and bootstraps for all: they differ only in the training
-            device=self.device,
-            monitor=QUIET,
+            # the same noise and bootstraps for all: they differ only in the training
+            ValidateOptions(self.truth, baselines=False, seed=0, device=self.device),
+            QUIET,
         ).metrics
         write_json(run / METRICS, metrics)
         scores = {
