@@ -9,8 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, out, tell
-from cpunet.cli.simulate import EnergyUnit, FlipZ, HitTable, LengthUnit, Origin
-from cpunet.cli.values import parse_numbers
+from cpunet.cli.simulate import HitFrame
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -118,11 +117,7 @@ def calibrate(
     sim: SimFile = None,
     detector: DetectorFile = None,
     hits: HitFileName = None,
-    hits_detector: HitTable = None,
-    origin: Origin = None,
-    flip_z: FlipZ = False,
-    length_unit: LengthUnit = None,
-    energy_unit: EnergyUnit = None,
+    frame: HitFrame,
     cluster_mm: ClusterMm = 0.05,
     settings_file: SettingsFile = None,
     set_values: Set = None,
@@ -156,8 +151,8 @@ def calibrate(
     if out_folder is not None:
         refuse_inputs(out_folder, recipe, detector, settings_file)
     start = _start(
-        sim, detector, hits, settings_file, set_values or [], crystal, hits_detector,
-        origin, flip_z, length_unit, energy_unit, cluster_mm, read_as.insist,
+        sim, detector, hits, settings_file, set_values or [], crystal, frame,
+        cluster_mm, read_as.insist,
     )  # fmt: skip
     measured = read_as.data(data)
     job = Calibration(
@@ -186,34 +181,22 @@ def _start(
     settings_file: Path | None,
     overrides: list[str],
     crystal: Path | None,
-    hits_detector: str | None,
-    origin: str | None,
-    flip_z: bool,
-    length_unit: str | None,
-    energy_unit: str | None,
+    frame: HitFrame,
     cluster_mm: float,
     insist: bool,
 ) -> Start:
     from cpunet.jobs.calibration.calibration_inputs import Start
     from cpunet.jobs.common.inputs import InputFile
-    from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.simulation.geometry_readers import read_detector
-    from cpunet.simulation.hit_readers import Transform
 
     of_detector, of_settings = split_overrides(overrides)
     if of_detector and detector is None:
         raise CpunetError(f"--set {of_detector[0]}: give the --detector that it is of")
-    source = None
-    if hits is not None:
-        x, y, z = parse_numbers("0,0,0" if origin is None else origin, 3, "--origin")
-        source = HitFile(
-            hits, hits_detector, Transform((x, y, z), flip_z), length_unit, energy_unit
-        )
     given = settings_file is not None or of_settings
     return Start(
         None if sim is None else InputFile(sim, insist=insist),
-        source,
+        None if hits is None else frame.file(hits),
         None if detector is None else read_detector(detector, of_detector, crystal),
         load_settings(settings_file, of_settings) if given else None,
         cluster_mm,

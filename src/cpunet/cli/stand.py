@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -17,6 +18,9 @@ from cpunet.outputs import refuse_inputs
 if TYPE_CHECKING:
     from cpunet.electronics.chain import Hum, Wander
     from cpunet.jobs.simulation.stand import StandSummary
+
+
+Part = TypeVar("Part")
 
 
 class Kind(StrEnum):
@@ -155,26 +159,26 @@ def wanted_hum(hum: str | None) -> Hum | None:
     """The wave of ``"50=2"``: 2 keV at 50 Hz."""
     from cpunet.electronics.chain import Hum
 
-    if hum is None:
-        return None
-    try:
-        frequency, amplitude = map(float, hum.split("="))
-        return Hum(frequency_Hz=frequency, amplitude_kev=amplitude)
-    except ValueError as error:
-        raise CpunetError(f"--hum {hum}: expected HZ=KEV, such as 50=2") from error
+    return _pair(hum, Hum, ("frequency_Hz", "amplitude_kev"), "--hum", "HZ=KEV, such as 50=2")
 
 
 def wanted_wander(wander: str | None) -> Wander | None:
     """The wandering of ``"500=3"``: 3 keV RMS, correlated over 500 us."""
     from cpunet.electronics.chain import Wander
 
-    if wander is None:
+    form = "US=KEV, such as 500=3"
+    return _pair(wander, Wander, ("time_us", "rms_kev"), "--wander", form)
+
+
+def _pair(
+    text: str | None, kind: Callable[..., Part], names: tuple[str, str], option: str, form: str
+) -> Part | None:
+    if text is None:
         return None
     try:
-        time, rms = map(float, wander.split("="))
-        return Wander(time_us=time, rms_kev=rms)
+        return kind(**dict(zip(names, map(float, text.split("=")), strict=True)))
     except ValueError as error:
-        raise CpunetError(f"--wander {wander}: expected US=KEV, such as 500=3") from error
+        raise CpunetError(f"{option} {text}: expected {form}") from error
 
 
 def _lines(summary: StandSummary) -> list[str]:
