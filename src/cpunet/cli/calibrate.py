@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, tell
+from cpunet.cli.messages import monitor, show, tell
 from cpunet.cli.simulate import HitFrame
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -166,12 +166,12 @@ def calibrate(
     )
     if plan:
         for line in plan_lines(job.plan(out_folder, force=force, monitor=monitor())):
-            out.print(line, markup=False, highlight=False, soft_wrap=True)
+            show(line)
         return
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())
     for line in result_lines(content):
-        tell(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_folder}: {line}", plain=True)
 
 
 def _start(

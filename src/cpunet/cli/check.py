@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out
+from cpunet.cli.messages import monitor, out, show
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[
@@ -50,7 +50,7 @@ def check(
     )
     for finding in checked.findings:
         out.print(MARKS[finding.level], end="", soft_wrap=True)
-        out.print(str(finding), markup=False, highlight=False, soft_wrap=True)
+        show(str(finding))
     if out_file is not None and checked.sides:
         draw(checked, out_file, force=force)
         out.print(f"{out_file}: pulses of both sides", markup=False, highlight=False)

@@ -66,4 +66,4 @@ def demo(
         monitor=monitor(),
     )
     print_scores(metrics, leave_out=("FEP",))
-    tell(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report' / 'report.html'}")

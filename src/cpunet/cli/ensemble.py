@@ -84,9 +84,9 @@ def ensemble(
     if told["table"]:
         tell_table(_table(told))
     for line in _summary(told):
-        tell(line, markup=False, highlight=False, soft_wrap=True)
+        tell(line, plain=True)
     if told["table"]:
-        tell(str(out_folder / FIGURE), soft_wrap=True)
+        tell(str(out_folder / FIGURE))
 
 
 def _table(told: dict[str, Any]) -> Table:

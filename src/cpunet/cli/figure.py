@@ -66,4 +66,4 @@ def figure(
         monitor=monitor(),
     )
     for file in files:
-        tell(str(file), soft_wrap=True)
+        tell(str(file))

@@ -78,7 +78,7 @@ def response(
         print_table(response_table(told))
     else:
         tell_table(response_table(told))
-        tell(f"{out_folder / 'response.png'}", soft_wrap=True)
+        tell(f"{out_folder / 'response.png'}")
 
 
 def response_table(told: dict[str, Any]) -> Table:

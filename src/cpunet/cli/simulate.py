@@ -281,7 +281,7 @@ def simulate(
         monitor=monitor(),
     )
     for line in summary_lines(summary):
-        tell(f"{out_file}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_file}: {line}", plain=True)
 
 
 def summary_lines(summary: Summary) -> list[str]:

@@ -107,7 +107,7 @@ def train(
     if isinstance(told, Outcome):
         tell_channels(told, out_folder, _in_words)
     else:
-        tell(f"{out_folder}: {_in_words(told)}", soft_wrap=True)
+        tell(f"{out_folder}: {_in_words(told)}")
     words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]
     report = out_folder.with_name(f"{out_folder.name}-report")
     of_all = ["--data-table", ALL] if every else []

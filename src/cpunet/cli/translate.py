@@ -202,7 +202,7 @@ def translate(
         told = translate_files(run, files, place, form, jobs=jobs, **how)
     else:
         told = translate_file(run, files[0], place, form, **how)
-    tell(f"{place}: {_in_words(told, adc)}", soft_wrap=True)
+    tell(f"{place}: {_in_words(told, adc)}")
 
 
 def _in_words(told: dict[str, Any], adc: Adc | None) -> str:

@@ -70,8 +70,8 @@ def tune(
     tell(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))
     if told["importances"]:
         shares = (f"{key} {share:.2f}" for key, share in told["importances"].items())
-        tell(f"importance: {', '.join(shares)}", highlight=False, soft_wrap=True)
-    tell(str(out_folder / BEST), soft_wrap=True)
+        tell(f"importance: {', '.join(shares)}", plain=True)
+    tell(str(out_folder / BEST))
 
 
 def _table(told: dict[str, Any]) -> Table:

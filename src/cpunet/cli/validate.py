@@ -75,11 +75,11 @@ def validate(
         monitor=monitor(),
     )
     if isinstance(metrics, Outcome):
-        tell(f"{out_folder / INDEX}", soft_wrap=True)
+        tell(f"{out_folder / INDEX}")
         tell_channels(metrics, out_folder, _in_words)
         return
     print_scores(metrics)
-    tell(f"{out_folder / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report.html'}")
 
 
 def _in_words(metrics: dict[str, Any]) -> str:
