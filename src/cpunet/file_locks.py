@@ -19,8 +19,15 @@ def lock(handle: int, busy: str) -> bool:
 
     Parameters
     ----------
+    handle
+        File descriptor.
     busy
         Error message if another process holds the lock.
+
+    Raises
+    ------
+    CpunetError
+        If another process holds the lock.
     """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

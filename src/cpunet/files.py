@@ -28,6 +28,11 @@ def written_aside(target: Path) -> Iterator[Path]:
     """Yield a temporary file name beside `target`; on success, move the file to `target`.
 
     On an exception the temporary file is removed and `target` is unchanged.
+
+    Raises
+    ------
+    CpunetError
+        If the folder of `target` is not writable.
     """
     target = Path(target)
     try:
@@ -69,13 +74,22 @@ def folder_written_aside(
 
     Parameters
     ----------
+    target
+        Folder to create.
     kind
         Kind of the folder.  With `force`, only an empty folder or one of the same kind is
         replaced, and in it only files that the program wrote.
     inputs
         Files and folders that are read; `target` must not be, contain or lie in any of them.
+    force
+        Whether to replace an existing folder.
     note
         Function called with a message about files kept from an old folder.
+
+    Raises
+    ------
+    CpunetError
+        If `target` exists and must not be replaced, or its parent is not writable.
     """
     target = Path(target)
     refuse_existing(target, *inputs, force=force)

@@ -76,7 +76,13 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
 
 
 def resolved(path: Path) -> Path:
-    """A path with all links resolved."""
+    """A path with all links resolved.
+
+    Raises
+    ------
+    CpunetError
+        If the links form a loop.
+    """
     try:
         return path.resolve()
     except (OSError, RuntimeError) as error:  # before Python 3.13, the latter

@@ -12,6 +12,11 @@ def require_file(path: Path | str) -> Path:
     """Return the path, unless it is neither a file nor a folder.
 
     Missing or inaccessible paths are left to the code that opens them.
+
+    Raises
+    ------
+    CpunetError
+        If the path is a pipe, a socket or a device.
     """
     file = Path(path)
     try:

@@ -165,10 +165,17 @@ def yaml_fields(text: str, source: str, *, invalid: str, empty: str) -> dict[str
 
     Parameters
     ----------
+    text
+        YAML or JSON text.
     source
         Start of error messages, such as ``"detector V01.yaml"``.
     invalid, empty
         Error messages for a text that is not YAML, and for one without fields.
+
+    Raises
+    ------
+    CpunetError
+        If the text is not a mapping of fields.
 
     Examples
     --------

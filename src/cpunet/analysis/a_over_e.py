@@ -105,6 +105,12 @@ def ae_survival(
     Survival
         Cut, and survival in percent by peak.
 
+    Raises
+    ------
+    CpunetError
+        If `acceptance` is not between 0 and 1, or fewer than 20 events of the DEP have a
+        finite amplitude.
+
     Examples
     --------
     Of 99 equidistant values the cut at 90 % is the 10th, and 90 of the 99 survive:
@@ -174,6 +180,11 @@ def survival_table(
             method minus data, in percentage points.
         ``sigma``
             difference divided by its error.
+
+    Raises
+    ------
+    CpunetError
+        If the data lack the DEP, or a method a peak of the data.
     """
     if DEP not in data:
         raise CpunetError(f"the data lack peak {DEP}; the A/E cut needs it")
@@ -228,6 +239,11 @@ def sideband_survival(
         Survival and its error in percent, from the Poisson errors of surviving and removed
         events (binomial if `scale` is 0), without the error of the cut.  NaN if no event of
         the peak is left.
+
+    Raises
+    ------
+    CpunetError
+        If more events survive than there are, or a number is negative.
 
     Examples
     --------

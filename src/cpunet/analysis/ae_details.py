@@ -47,6 +47,11 @@ def ae_against_drift_time(
         are outside the edges or lack a finite amplitude or time; and ``methods``, for each
         method and the data a list of bins with ``n``, ``time_ns`` (median), and ``q16``,
         ``median`` and ``q84`` with ``…_error`` of each; or ``missing`` with the reason.
+
+    Raises
+    ------
+    CpunetError
+        If the data have no event, or the arrays of a method differ in length.
     """
     known = {
         method: _finite_pairs(method, values, drift_time[method])

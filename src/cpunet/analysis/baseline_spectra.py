@@ -50,6 +50,8 @@ def baseline_spectra(
         Sample at which each pulse begins, by method, shape (n,); NaN if unknown.
     samples
         Maximum number of samples that are compared, from the start of the window.
+    dt_ns
+        Sampling period in ns.
 
     Returns
     -------
@@ -60,6 +62,11 @@ def baseline_spectra(
         the data also ``rms_ratio``, its ``sigma`` from 1, ``worst_band_sigma``, and
         ``spectrum_sigma``, which corrects the latter for the number of bands; or ``missing``
         with the reason.
+
+    Raises
+    ------
+    CpunetError
+        If the data are missing, or the numbers of pulses and start samples differ.
 
     Examples
     --------

@@ -105,6 +105,8 @@ def superpulse_views(
         charge.
     slices
         Names of the slices, by peak or common to all peaks.
+    dt_ns
+        Sampling period in ns.
     n_before
         Sample at which the pulses are aligned.
     """
@@ -143,11 +145,18 @@ def pulse_views(
     pulses
         Noise-free pulses by peak and method, shape ``(n, samples)``; each row is the same
         simulated event for all methods.
+    dt_ns
+        Sampling period in ns.
     measured
         Measured pulses by peak.  The nearest to an event has the smallest root-mean-square
         difference from its truth, or else from its REN translation, among `SEARCHED` pulses.
     events
         Number of selectable events, equally spaced over the rows.
+
+    Raises
+    ------
+    CpunetError
+        If the methods of a peak have different numbers of pulses.
     """
     window = (BEFORE, AFTER)
     peaks: View = {}

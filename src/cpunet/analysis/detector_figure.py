@@ -44,6 +44,8 @@ def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True
     ----------
     detector
         Detector whose outline is drawn.
+    fields
+        Field maps of the detector.
     paths
         Whether to draw drift paths of electrons and holes over the potential.
     """

@@ -96,6 +96,11 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     slices
         Number of slices; one more edge is returned, in ns.
 
+    Raises
+    ------
+    CpunetError
+        If `slices` is less than 1, or no time is finite.
+
     Examples
     --------
     >>> slice_edges(np.arange(101.0), slices=4)
@@ -124,6 +129,11 @@ def superpulses(
         Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
     before, after
         Number of samples before the crossing of half the maximum, and from it on.
+
+    Raises
+    ------
+    CpunetError
+        If the numbers of times and pulses differ, or the pulses have another shape.
     """
     if rise_time.shape != (len(windows),):
         raise CpunetError(
@@ -154,6 +164,11 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
     -------
     tuple
         Residual of each slice; None where a side has fewer than 10 pulses.
+
+    Raises
+    ------
+    CpunetError
+        If the two were not sliced and cut out alike.
     """
     alike = np.array_equal(data.edges, method.edges) and data.before == method.before
     if not alike or data.pulses[0].mean.shape != method.pulses[0].mean.shape:
@@ -178,6 +193,8 @@ def slice_table(
     ----------
     sets
         Superpulses by method, the measured ones under ``"data"``.
+    dt_ns
+        Sampling period in ns.
     edge_samples
         Half-width of the evaluated window: ``2 * edge_samples + 1`` samples around the
         crossing.

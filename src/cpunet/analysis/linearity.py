@@ -104,6 +104,12 @@ def linearity_residual(
 
         The last six are ``{"median": …, "q90": …}`` over pairs.  If no pair is left
         there is ``missing`` with the reason instead.
+
+    Raises
+    ------
+    CpunetError
+        If there are fewer than 2 pulses, `pairs` is less than 1, or the translation has
+        another shape.
     """
     if windows.ndim != 2 or len(windows) < 2 or pairs < 1:
         raise CpunetError(

@@ -47,6 +47,11 @@ def spectrum_figure(
         Energy of each line in keV, by name.
     bin_kev
         Bin width in keV; wider bins are used if there would be more than 2000.
+
+    Raises
+    ------
+    CpunetError
+        If no energy is finite, or the width is not positive.
     """
     finite = {m: values[np.isfinite(values)] for m, values in energy_kev.items()}
     everything = np.concatenate([np.empty(0), *finite.values()])
@@ -95,6 +100,11 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
     tuple
         Row of the pulse, and its RMS difference from 100 samples before the crossing to 150
         after it, in pulse heights.
+
+    Raises
+    ------
+    CpunetError
+        If the target or all pulses lack a crossing of half the maximum.
 
     Examples
     --------
@@ -148,6 +158,11 @@ class DataPulse(NamedTuple):
         The simulated pulse is that of ``"ren"``, or else of ``"truth"``, or else the first.
         `data` are measured windows of shape ``(n, length)``; for the other parameters see
         `single_pulse_figure`.
+
+        Raises
+        ------
+        CpunetError
+            If there are no pulses, or if the pulse or all data lack an edge or a tail.
         """
         if not pulses:
             raise CpunetError("no pulse to draw; give one by method")
@@ -180,6 +195,8 @@ def single_pulse_figure(
         Noise-free pulses show the electronics alone.
     data
         Measured pulse for comparison.
+    dt_ns
+        Sampling period in ns.
     samples_before
         Sample of the windows' alignment, after which the tail begins.
     title

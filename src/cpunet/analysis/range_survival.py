@@ -51,6 +51,11 @@ def peak_survival(
         in the ranges and of those that survive; ``scale``, the width of the peak's range over
         that of the sidebands; ``undefined``, events in the ranges without a finite amplitude,
         which are not counted.  If the survival is undefined, ``missing`` with the reason.
+
+    Raises
+    ------
+    CpunetError
+        If a range is empty or overlaps another, or the arrays differ in length.
     """
     if amplitude.shape != energy_kev.shape:
         raise CpunetError(

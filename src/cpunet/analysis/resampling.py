@@ -90,6 +90,8 @@ def both_resampled(n_a: int, n_b: int, draws: int, seed: int | np.random.Generat
         Numbers of events of the datasets.
     draws
         Number of samples.
+    seed
+        Seed or random generator.
     """
     rng = np.random.default_rng(seed)
     return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
@@ -108,6 +110,8 @@ def resampled_twice(
         Numbers of events of the two samples of a pair.
     draws
         Number of pairs.
+    seed
+        Seed or random generator.
     """
     rng = np.random.default_rng(seed)
     return Resampled.of(events, n_sim, draws, rng), Resampled.of(events, n_data, draws, rng)
@@ -130,6 +134,8 @@ def resampled_quantiles(
         Quantile, 0 … 1.
     draws
         Number of bootstrap samples.
+    rng
+        Random generator.
     """
     ordered, n = np.sort(values), len(values)
     rank = quantile * (n + 1)  # counted from 1; usually between two values

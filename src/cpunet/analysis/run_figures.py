@@ -55,6 +55,11 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
         order.
     window
         Number of records in the moving average.
+
+    Raises
+    ------
+    CpunetError
+        If there are no records.
     """
     if not records:
         raise CpunetError("the training log is empty: there are no losses to draw; train first")
@@ -113,6 +118,8 @@ def cycle_figure(
         row is the same event in all three.
     titles
         Titles of the three panels.
+    dt_ns
+        Sampling period in ns.
     pulses
         Number of pulses that are drawn.
     """
@@ -207,6 +214,8 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     sets
         Mean pulses by method, the measured one under ``"data"``; methods are drawn in this
         order, later ones on top.
+    dt_ns
+        Sampling period in ns.
     peak
         Name of the gamma line, for the title.
     """

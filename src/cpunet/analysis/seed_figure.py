@@ -35,6 +35,11 @@ def seed_distributions(metrics: Sequence[Mapping[str, Any]]) -> Scores:
         ``missing``, the number of trainings without one; ``median``, ``mean``, ``std``,
         ``low`` and ``high`` of the scores (None without scores; ``std`` also with only one);
         ``ceiling`` and ``ceiling_std``, means over the trainings.
+
+    Raises
+    ------
+    CpunetError
+        If there are no metrics, or none of them has a scored peak.
     """
     if not metrics:
         raise CpunetError("no scores of trainings to compare; give one metrics.json or more")

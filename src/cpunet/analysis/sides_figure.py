@@ -34,6 +34,8 @@ def sides_figure(
         ``"data"``.
     parameters
         Values of two quantities by axis label and side.
+    dt_ns
+        Sampling period in ns.
     """
     figure = Figure(figsize=(9.0, 6.0))
     (whole, edge), below = figure.subplots(2, 2)

@@ -23,6 +23,8 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     sets
         Superpulses by method, the measured ones under ``"data"``; drawn in this order, later
         ones on top.
+    dt_ns
+        Sampling period in ns.
     peak
         Name of the gamma line, for the title.
 

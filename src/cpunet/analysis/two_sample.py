@@ -105,6 +105,12 @@ def classifier_auc(
     -------
     TwoSample
         AUC in five-fold cross-validation, and its null.
+
+    Raises
+    ------
+    CpunetError
+        If the shapes or the names of the features of the two sides differ, or a side has
+        fewer than 40 pulses with only finite values.
     """
     sides = (data, others)
     extras = _extras(sides, features)

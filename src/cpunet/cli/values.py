@@ -33,6 +33,11 @@ def parse_events(
         The lines known.
     window_kev
         Half-width about a line.
+
+    Raises
+    ------
+    CpunetError
+        If a number or a line cannot be understood, or the lines are named twice.
     """
     from cpunet.jobs.simulation.hit_sources import energy_windows
 
@@ -48,6 +53,11 @@ def parse_events(
 
 def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:
     """`n` finite numbers separated by commas.
+
+    Raises
+    ------
+    CpunetError
+        If `text` is anything else; it names the `option`.
 
     Examples
     --------
@@ -84,7 +94,13 @@ def parse_resolution(text: str | None) -> Resolution | None:
 
 
 def event_count(text: str) -> int:
-    """A number of events."""
+    """A number of events.
+
+    Raises
+    ------
+    CpunetError
+        If `text` is none, or there are too many.
+    """
     # underscores and signs, which int() takes, are more likely slips
     digits = text.strip().lstrip("0") or "0"
     if not text.strip().isdecimal():

@@ -176,6 +176,8 @@ class BaselineNoise:
             Energy of each pulse in keV, shape ``(n,)``.
         length
             Number of samples per pulse.
+        rng
+            Random generator.
 
         Returns
         -------

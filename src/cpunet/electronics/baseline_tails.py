@@ -37,6 +37,8 @@ def read_baselines(
     ----------
     baselines
         First samples of the traces, shape ``(n, samples)``.
+    dt_ns
+        Sampling period in ns.
     decay_us
         Decay time in us.
 

@@ -34,6 +34,8 @@ def respond(
     pulses
         Ideal pulses from 0 to 1 with energies. Their sampling period must divide that of the
         digitiser.
+    electronics
+        The readout chain.
     shift_ns
         Start of each pulse after `n_pre` samples, in ns; shape ``(n,)`` or a number.
 
@@ -67,7 +69,13 @@ def respond(
 
 
 def required_energy_kev(pulses: Pulses) -> FloatArray:
-    """Energies of the pulses in keV."""
+    """Energies of the pulses in keV.
+
+    Raises
+    ------
+    CpunetError
+        If an energy is unknown or not positive.
+    """
     bad = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
     if bad.any():
         i = int(bad.argmax())
@@ -121,6 +129,8 @@ def distorted(signal_kev: FloatArray, figures: NonLinearity, dt_ns: float) -> Fl
         Signals in keV, shape ``(n, samples)``.
     figures
         The non-linearity.
+    dt_ns
+        Sampling period in ns.
 
     Examples
     --------

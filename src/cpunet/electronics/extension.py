@@ -23,6 +23,8 @@ def extended(
         Shape (n, config.length); rows of NaN stay that.
     config
         How they were prepared; `decay_fit_samples` at the end of each give its decay.
+    dt_ns
+        Sampling period in ns.
     length, n_pre
         Samples of the result, and those before the aligned one.
 

@@ -45,6 +45,8 @@ def finish(
         ``(n, samples)``.
     config
         Preparation settings of the data.
+    dt_ns
+        Sampling period in ns.
     noise
         Noise to add, with or without the tails of earlier pulses. None gives noise-free
         windows.

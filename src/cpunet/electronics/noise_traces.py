@@ -108,6 +108,11 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
         Waveform file in any format that `open_pulses` reads.
     length, dt_ns
         Number of samples and sampling period in ns of the traces to be cut from them.
+
+    Raises
+    ------
+    CpunetError
+        If the baselines are too short, have another sampling period, or are constant.
     """
     source = open_pulses(path)
     if not np.isclose(source.dt_ns, dt_ns):
@@ -142,6 +147,8 @@ def cut_noise(
         Output of `read_baselines`.
     n, length
         Number of windows and of samples in each.
+    rng
+        Random generator.
     """
     trace = rng.integers(len(baselines), size=n)
     begin = rng.integers(baselines.shape[1] - length + 1, size=n)
@@ -153,6 +160,15 @@ def noise_of(
     electronics: Electronics, n: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
     """Noise in keV of `n` traces of a chain, shape ``(n, electronics.length)``.
+
+    Parameters
+    ----------
+    electronics
+        The readout chain.
+    n
+        Number of traces.
+    rng
+        Random generator.
 
     Raises
     ------

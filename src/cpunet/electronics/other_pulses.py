@@ -51,6 +51,8 @@ def draw_other_pulses(
         Pulses of the traces. Second pulses take their shapes.
     electronics
         The readout chain with the rates.
+    rng
+        Random generator.
     """
     remains, second, slow = rng.spawn(3)
     added_kev = _remains(len(pulses), electronics, remains)

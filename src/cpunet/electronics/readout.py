@@ -69,6 +69,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     pulses
         Charge pulses from 0 to 1 with true energies, sampled more finely than the digitiser
         (1 to 4 ns). All are held in memory: split large sets into blocks.
+    electronics
+        The readout chain.
     seed
         Seed of the random generator. The same seed gives the same traces.
 

@@ -131,6 +131,8 @@ class Remains:
         ----------
         blocks
             Measured traces of one channel with their energies, from any mixture of peaks.
+        config
+            Preparation settings.
         decay_us
             Decay time of the preamplifier in us, if known. Otherwise it is taken from large
             remainders or, if there are none, from the tails of the pulses.

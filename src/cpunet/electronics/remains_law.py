@@ -174,10 +174,14 @@ def earlier_pulses(
 
     Parameters
     ----------
+    n
+        Number of traces.
     rate_khz, longest_us
         Rate in kHz and length of the interval in us.
     energies_kev
         Quantiles of the energies in keV, see `RemainsLaw`.
+    rng
+        Random generator.
 
     Returns
     -------

@@ -57,6 +57,8 @@ class SecondPulses:
 
         Parameters
         ----------
+        n
+            Number of traces.
         rate_khz
             Rate of the pulses in kHz.
         energies_kev
@@ -64,6 +66,13 @@ class SecondPulses:
             `cpunet.electronics.remains_law.RemainsLaw`.
         before_ns, record_ns
             Part of the record before the trace's own pulse, and the whole of it, in ns.
+        rng
+            Random generator.
+
+        Raises
+        ------
+        CpunetError
+            If more than `MOST_EXPECTED` pulses are expected in a record.
 
         Examples
         --------
@@ -138,6 +147,8 @@ class SecondPulses:
             shape ``(pulses, length + reach)``.
         energy_kev
             Energies of the traces' own pulses in keV, shape ``(n,)``.
+        dt_ns
+            Sampling period in ns.
         length
             Number of samples of a record.
 

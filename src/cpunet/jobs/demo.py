@@ -46,11 +46,15 @@ def demonstrate(
     ----------
     electronics, detector, kind
         Of the stand, as for `cpunet.jobs.simulation.stand.make_stand`.
+    recipe
+        Of the training.
     events
         Wanted on either side, by line.
     out
         Folder of ``stand``, ``run`` and ``report``. Parts that are there from an
         interrupted demonstration of the same options are kept.
+    force
+        Make all parts anew.
     seed, device, monitor
         As for `cpunet.jobs.training.train.train_run`.
 
@@ -58,6 +62,12 @@ def demonstrate(
     -------
     dict
         The content of the report's ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the report exists, a part that is there was made with other options, a step
+        fails, or, with `force`, something else is in the place of a part.
     """
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is no folder; give another --out")

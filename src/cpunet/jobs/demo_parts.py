@@ -34,6 +34,12 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
         Of the stand.
     recipe, peak
         Of the training; its seed is the stand's.
+
+    Raises
+    ------
+    CpunetError
+        If a part was made otherwise (it names the first difference) or cannot be read,
+        or if the run's stand is gone.
     """
     stand, run, _ = (out / part for part in PARTS)
     if is_there(out, "stand"):
@@ -62,6 +68,11 @@ def remove_parts(out: Path, note: Note) -> None:
     """Remove all parts, or none if anything else is in the place of one.
 
     What the program did not write there is kept, and told.
+
+    Raises
+    ------
+    CpunetError
+        If a part's place holds something else, or a part cannot be removed.
     """
     for part, kind in _KINDS.items():
         require_replaceable(out / part, kind)

@@ -71,6 +71,11 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
     CutWindows
         Windows for ``tail_slope``, ``chi2`` (upper bound only), ``baseline`` and
         ``baseline_slope``; none with fewer than ten pulses.
+
+    Raises
+    ------
+    CpunetError
+        If the set is empty.
     """
     if not len(prepared):
         raise CpunetError("no pulses to draw quality cuts from; select more energies or files")

@@ -129,6 +129,8 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     ----------
     waveforms
         Pulses of shape ``(n, length)`` with the baseline at 0.
+    dt_ns
+        Sampling period in ns.
     start_fraction
         Fraction of the maximum at which the interval begins (0.01 in the paper).
 
@@ -178,6 +180,8 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     ----------
     waveforms
         Pulses of shape ``(n, length)`` with the baseline at 0.
+    dt_ns
+        Sampling period in ns.
     fit_samples
         Number of samples at the end of the pulse that are fitted.
 

@@ -113,6 +113,11 @@ def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelecti
     peaks
         Known gamma lines.
 
+    Raises
+    ------
+    CpunetError
+        If a part is neither a known line nor a range; the message lists the lines.
+
     Examples
     --------
     >>> parse_selection("300-2000", {}).select([299.9, 300, 1999, 2000]).tolist()

@@ -201,6 +201,11 @@ def prepare(
     Prepared
         Accepted pulses; ``codes`` holds the outcome of every input pulse.
 
+    Raises
+    ------
+    CpunetError
+        If the traces have no samples.
+
     Examples
     --------
     >>> from cpunet.recipes.schema import PreparationConfig

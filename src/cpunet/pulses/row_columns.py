@@ -52,6 +52,8 @@ class RowColumns:
 
         Parameters
         ----------
+        path
+            LH5 or HDF5 file.
         waveforms
             Path of the waveforms in the file.
         n_pulses

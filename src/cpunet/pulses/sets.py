@@ -93,6 +93,11 @@ def load_prepared(
     -------
     Prepared
         Accepted pulses of the file; every pulse read has a code.
+
+    Raises
+    ------
+    CpunetError
+        If no pulse is left; the message gives the file, the counts by reason and a remedy.
     """
     sets: list[Prepared] = []
     n_read = n_kept = 0

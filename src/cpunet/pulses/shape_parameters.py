@@ -173,6 +173,11 @@ def all_parameters(
         Float64 arrays of shape ``(n,)`` in the units and the order of `SHAPE_PARAMETERS`.
         NaN where a pulse has a non-finite sample or the parameter is undefined.
 
+    Raises
+    ------
+    CpunetError
+        If the pulses do not have the length of the preparation, or too few samples.
+
     Examples
     --------
     >>> import numpy as np

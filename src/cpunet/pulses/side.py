@@ -53,10 +53,20 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
 
     Parameters
     ----------
+    source
+        File of pulses.
     wanted
         Side as which the file was given.
     remedy
         Remedy to suggest if the pulses are of the other side.
+    insist
+        Whether to override a guess.
+
+    Raises
+    ------
+    CpunetError
+        If the file states that its pulses are of the other side, or if they look like it
+        and `insist` is False.
     """
     found = recorded_side(source)
     if found is None and not insist:

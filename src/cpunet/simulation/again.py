@@ -63,6 +63,8 @@ class SameHits:
 
         Parameters
         ----------
+        detector, settings
+            Detector and simulation settings.
         mode
             ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` merges more hits
             and takes longer steps, for differences between two sets of physics: its errors

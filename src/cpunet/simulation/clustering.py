@@ -33,6 +33,11 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     distance_mm
         Maximum distance between neighbours in mm. 0 merges only hits at the same position.
 
+    Raises
+    ------
+    CpunetError
+        If the distance is negative or not a number.
+
     Examples
     --------
     >>> hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 9]], [100, 300, 50], [0, 3])

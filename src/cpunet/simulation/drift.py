@@ -163,8 +163,12 @@ def drift_paths(
 
     Parameters
     ----------
+    fields
+        Field maps of the detector.
     x_mm, y_mm, z_mm
         Starting points in mm.
+    settings
+        Simulation settings.
 
     Returns
     -------

@@ -74,6 +74,11 @@ def drift_maps(fields: Maps, settings: SimulationSettings) -> DriftMaps:
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
+
+    Raises
+    ------
+    CpunetError
+        If no cell of the maps has a field.
     """
     stacked = np.stack(
         [

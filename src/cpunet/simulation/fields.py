@@ -45,6 +45,8 @@ def compute_fields(
 
     Parameters
     ----------
+    detector
+        Geometry, impurities and bias.
     cache, progress
         See `cpunet.simulation.superposition.solve`.
 
@@ -114,6 +116,11 @@ def scaled_to_depletion(detector: Detector) -> Detector:
 
     Manufacturers measure impurity densities to about 10 %, while the depletion voltage is
     known to a few volts.
+
+    Raises
+    ------
+    CpunetError
+        If the detector has no ``measured_depletion_V``, or no scale leads to it.
     """
     measured = detector.measured_depletion_V
     if not measured:
@@ -142,6 +149,8 @@ def electric_field(
     ----------
     potential
         Potential in V, shape (nr, nz).
+    grid
+        Nodes of the potential.
     mirror
         Whether z = 0 is a mirror plane, as the axis always is.
 

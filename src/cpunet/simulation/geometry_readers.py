@@ -50,6 +50,11 @@ def read_detector(
         LEGEND file of the crystal from which a diode was cut, with its impurities. By
         default ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``.
 
+    Raises
+    ------
+    CpunetError
+        If a file cannot be read or the detector is invalid.
+
     Examples
     --------
     >>> detector = read_detector("icpc", ["bias_V=3500"])

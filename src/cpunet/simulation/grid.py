@@ -52,7 +52,13 @@ class Grid:
 
 
 def make_grid(detector: Detector) -> Grid:
-    """Place nodes over the crystal, up to the first ones on or beyond its surfaces."""
+    """Place nodes over the crystal, up to the first ones on or beyond its surfaces.
+
+    Raises
+    ------
+    CpunetError
+        If ``grid_mm`` gives more nodes than fit into the memory.
+    """
     h = detector.grid_mm
     nr, nz = (
         int(np.ceil(size / h - 1e-6)) + 1

@@ -150,6 +150,11 @@ class Hits:
         A number without an event gives an event without hits, so the result has one event for
         each number.
 
+        Raises
+        ------
+        CpunetError
+            If several events share one of the numbers.
+
         Examples
         --------
         >>> hits = Hits.of([[0, 0, 1], [0, 0, 2]], [100, 300], [0, 1, 2], [7, 9])

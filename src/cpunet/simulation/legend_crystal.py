@@ -48,6 +48,11 @@ def impurity_values(
     length_mm
         Length of the detector along the axis in mm.
 
+    Raises
+    ------
+    CpunetError
+        If the curve, a parameter or the slice is missing or unknown.
+
     Examples
     --------
     A constant 10 x 1e9/cm3 net acceptors are -1e10/cm3.

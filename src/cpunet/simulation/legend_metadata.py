@@ -77,6 +77,12 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     FCCD) come from ``characterization``, where 0 means unknown. Impurities come from
     ``production.impcc`` (a straight line through its points, with net acceptors counted as
     negative), unless all its values are 0.
+
+    Raises
+    ------
+    CpunetError
+        If the geometry has an unknown key (for example, one without its unit), lacks one, or
+        is not axially symmetric.
     """
     kind = diode.get("type")
     if kind is not None and kind not in _SIMULATED:

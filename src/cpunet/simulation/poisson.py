@@ -172,6 +172,8 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
 
     Parameters
     ----------
+    detector, grid
+        Detector and nodes.
     impurity
         Net impurity at the nodes in 1e10/cm3.
     """

@@ -79,6 +79,11 @@ hole_velocity_low_factor, hole_velocity_high_factor
     def of(cls, parts: Iterable[str]) -> Shift:
         """Combine YAML files and ``"KEY=VALUE"`` strings. Later ones take precedence.
 
+        Raises
+        ------
+        CpunetError
+            If a file cannot be read, or a key or value is not allowed.
+
         Examples
         --------
         >>> Shift.of(["temperature_K=2", "self_repulsion=0.5"]).self_repulsion
@@ -100,7 +105,13 @@ hole_velocity_low_factor, hole_velocity_high_factor
             raise CpunetError(f"shift: {_problem(error, cls)}") from error
 
     def detector(self, detector: Detector) -> Detector:
-        """Shifted detector for a detector as simulated."""
+        """Shifted detector for a detector as simulated.
+
+        Raises
+        ------
+        CpunetError
+            If the shifted detector is invalid.
+        """
         values = detector.model_dump()
         values["impurity_scale"] *= self.impurity_factor
         values["temperature_K"] += self.temperature_K
@@ -116,7 +127,13 @@ hole_velocity_low_factor, hole_velocity_high_factor
             ) from error
 
     def settings(self, settings: SimulationSettings) -> SimulationSettings:
-        """Shifted settings for the settings of the simulation."""
+        """Shifted settings for the settings of the simulation.
+
+        Raises
+        ------
+        CpunetError
+            If a value is outside the allowed range.
+        """
         values = settings.model_dump()
         for name in ("cloud_fwhm_mm", "diffusion_constant", "self_repulsion"):
             values[name] = values[name] if getattr(self, name) is None else getattr(self, name)

@@ -64,6 +64,11 @@ _NOT_OF_THE_DETECTOR = (
 def detector_values(text: str, name: str) -> dict[str, Any]:
     r"""Fields of `Detector` from the content `text` of the configuration file `name`.
 
+    Raises
+    ------
+    CpunetError
+        If a key is unknown or has no number.
+
     Examples
     --------
     >>> detector_values("xtal_length 96.0  # mm\nxtal_HV 4000\n", "V.config")

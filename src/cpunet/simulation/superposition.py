@@ -93,7 +93,13 @@ class Superposition:
         )
 
     def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
-        """Scale of the impurities at which the detector just depletes at `depletion_V`."""
+        """Scale of the impurities at which the detector just depletes at `depletion_V`.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such scale.
+        """
         low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
         what = f"detector {self.detector.name}: {depletion_V:g} V"
         if self._pocket(depletion_V, low, impurity_tilt):
@@ -143,6 +149,8 @@ def solve(
 
     Parameters
     ----------
+    detector
+        Geometry and impurities.
     cache
         Whether to keep the parts on disk (in ``$CPUNET_CACHE`` or the user's cache folder)
         and to load them if the same detector was solved before, at any bias and any scale and

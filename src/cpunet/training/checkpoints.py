@@ -126,6 +126,11 @@ def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     then, now
         What determines the weights, by kind (``"recipe"``, ``"seed"``, …): values, or
         nested mappings of such.
+
+    Raises
+    ------
+    CpunetError
+        Naming the first difference.
     """
     for kind in now:
         for difference in differences(then.get(kind), now[kind]):

@@ -65,6 +65,11 @@ def energy_bands(
     list of EnergyBand
         Lines first.  Pulses of energies with too few of one side are in none.
 
+    Raises
+    ------
+    CpunetError
+        If no band has enough pulses of both sides.
+
     Examples
     --------
     >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}

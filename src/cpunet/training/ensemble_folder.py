@@ -58,7 +58,13 @@ def member_folder(ensemble: Path, seed: int) -> Path:
 
 
 def finished_members(ensemble: Path) -> list[Path]:
-    """Run folders of the seeds whose training is done, by seed."""
+    """Run folders of the seeds whose training is done, by seed.
+
+    Raises
+    ------
+    CpunetError
+        If there is none.
+    """
     runs = [path.parent for path in Path(ensemble).glob(f"seed_*/{INFO}")]
     if not runs:
         raise CpunetError(
@@ -97,14 +103,23 @@ def working_folder(
 
     Parameters
     ----------
+    out
+        The folder.
     kind
         What it is; others are never replaced.
     resume
         Go on in an existing folder.
+    force
+        Without `resume`, remove what the program wrote in an existing folder.
     alone
         Keep other processes out.
     note
         Receiver of notes on what is kept of an old folder.
+
+    Raises
+    ------
+    CpunetError
+        As by `require_usable`; if it cannot be written to, or another process works there.
     """
     out = Path(out)
     require_usable(out, kind, resume=resume, force=force)
@@ -131,7 +146,13 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """Read a mapping; None if there is no such file."""
+    """Read a mapping; None if there is no such file.
+
+    Raises
+    ------
+    CpunetError
+        If it cannot be read or is no mapping.
+    """
     try:
         content = plain_json(read_text(path, MAX_BYTES))
     except FileNotFoundError:
@@ -159,7 +180,13 @@ class _Study(BaseModel):
 
 
 def read_study(path: Path, begun_with: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Read what a study was begun with, which must be the same; None if it was not begun."""
+    """Read what a study was begun with, which must be the same; None if it was not begun.
+
+    Raises
+    ------
+    CpunetError
+        If the file was damaged, or the study begun with other settings or pulses.
+    """
     content = read_json(path)
     if content is None:
         return None

@@ -51,7 +51,13 @@ def share_state(group: ProcessGroup, state: State | None) -> State | None:
 
 
 def require_same_everywhere(group: ProcessGroup, fingerprint: dict[str, Any]) -> None:
-    """Refuse to train together on other pulses or with other settings."""
+    """Refuse to train together on other pulses or with other settings.
+
+    Raises
+    ------
+    CpunetError
+        Naming a process whose fingerprint differs from the leader's.
+    """
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).digest()
     digests = group.gathered(torch.frombuffer(bytearray(digest), dtype=torch.uint8))
     for rank, other in enumerate(digests):

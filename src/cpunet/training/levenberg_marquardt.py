@@ -77,8 +77,15 @@ def levenberg_marquardt(
         With the parameters to be found.
     steps
         The most there may be.
+    listener
+        Called with step and chi-square.
     coarse
         Whether it begins far from the data.
+
+    Raises
+    ------
+    CpunetError
+        If chi-square is not finite in the end.
     """
     parameters = problem.parameters
     vector, taken = parameters.vector(), 0

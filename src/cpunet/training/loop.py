@@ -87,6 +87,8 @@ def train(
         Networks and training settings.
     seed
         Of the initial weights, the dealing of batches, dropout and latent noise.
+    device
+        ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
         Fills the networks with weights to start from, in place of the closed-form start.
     surroundings

@@ -109,7 +109,13 @@ class Moments:
     def of_data(
         cls, windows: FloatArray, config: MatchingConfig, preparation: PreparationConfig
     ) -> Moments:
-        """Draw up the moments from prepared measured pulses, shape (pulses, samples)."""
+        """Draw up the moments from prepared measured pulses, shape (pulses, samples).
+
+        Raises
+        ------
+        CpunetError
+            If there are too few pulses.
+        """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
         some = whole[np.linspace(0, len(whole) - 1, min(len(whole), DRAWN)).astype(int)]
         level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0

@@ -48,6 +48,11 @@ def learn_pairs(
         The passes behind a chain, if there is one.
     group
         Who learns, each from its share of the pairs.
+
+    Raises
+    ------
+    CpunetError
+        If a loss is no number.
     """
     outside, teacher = surroundings.outside, surroundings.teacher
     if (behind is None or outside is None) and teacher is None:

@@ -54,7 +54,13 @@ class ProcessGroup:
         return self.rank == 0
 
     def share_of(self, batch_size: int) -> int:
-        """How many pulses of a batch each process takes."""
+        """How many pulses of a batch each process takes.
+
+        Raises
+        ------
+        CpunetError
+            If they cannot be shared equally.
+        """
         if batch_size % self.size:
             raise CpunetError(
                 f"training.batch_size={batch_size} cannot be shared equally by {self.size} "
@@ -149,7 +155,13 @@ class Launch:
 
 
 def launch() -> Launch | None:
-    """Return the launch by torchrun; None if it started no process, or only one."""
+    """Return the launch by torchrun; None if it started no process, or only one.
+
+    Raises
+    ------
+    CpunetError
+        If it is not whole.
+    """
     known = os.environ
     if not {"RANK", "WORLD_SIZE"} <= known.keys() or known["WORLD_SIZE"] == "1":
         return None
@@ -171,6 +183,12 @@ def meeting(launched: Launch) -> Iterator[Callable[[str], ProcessGroup]]:
     """Meet the other processes; give what makes them a group that trains on a device.
 
     The group lasts as the meeting.  Of several errors inside, the first alone is told.
+
+    Raises
+    ------
+    CpunetError
+        If the processes do not find together, or the error that was raised inside, in the
+        process that was the first to have one; a `ToldElsewhereError` from it in the others.
     """
     if not distributed.is_available():
         raise CpunetError("this build of torch knows no other processes; install a usual one")

@@ -150,6 +150,8 @@ def fit_response(
         if that leads nowhere the recipe's own starts are tried.
     remains
         Of earlier pulses, that the data have and the translations are to be given.
+    listener
+        Called with step and chi-square.
 
     Raises
     ------

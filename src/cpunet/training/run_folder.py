@@ -76,7 +76,13 @@ def write_run(
 
 
 def read_info(run: Path) -> dict[str, Any]:
-    """Provenance of a run."""
+    """Provenance of a run.
+
+    Raises
+    ------
+    CpunetError
+        If the folder is no finished run, or of a newer version.
+    """
     path = Path(run) / INFO
     absent = f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
     info = json_mapping(path, absent, "train again")
@@ -150,7 +156,13 @@ def _is_record(record: Any) -> bool:
 
 
 def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") -> nn.Module:
-    """Fill `network` with the weights saved under `name` (``"ren"``, ``"iren"``, …)."""
+    """Fill `network` with the weights saved under `name` (``"ren"``, ``"iren"``, …).
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, damaged or of another architecture.
+    """
     path = Path(run) / WEIGHTS
     weights = _weights_of(run, device)
     prefix = f"{name}."
@@ -187,7 +199,13 @@ def fill_networks(run: Path, model: nn.Module) -> None:
 
 
 def weights_sha256(run: Path) -> str:
-    """Fingerprint of a run's weights."""
+    """Fingerprint of a run's weights.
+
+    Raises
+    ------
+    CpunetError
+        If there are none.
+    """
     path = Path(run) / WEIGHTS
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -14,7 +14,13 @@ ROOMS = ("generator", "discriminator", "training")
 
 
 def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
-    """The search space of a recipe, every value of which the recipe could have."""
+    """The search space of a recipe, every value of which the recipe could have.
+
+    Raises
+    ------
+    CpunetError
+        If there is none, or a key or value in it is not allowed: names the key.
+    """
     if not recipe.search:
         raise CpunetError(
             f"recipe {recipe.name}: has no search space; add one, as "
@@ -33,7 +39,13 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
 
 
 def value_of(recipe: Recipe, key: str) -> Any:
-    """The value of a setting."""
+    """The value of a setting.
+
+    Raises
+    ------
+    CpunetError
+        If the recipe has none of that name.
+    """
     node: Any = recipe.model_dump(mode="json")
     for part in key.split("."):
         if not isinstance(node, dict) or part not in node:

@@ -76,13 +76,24 @@ def unfinished_folder(
 
     Parameters
     ----------
+    out
+        The run folder to be.
     inputs
         Files and folders that are read.
     resume
         Whether an unfinished training may be there; it is left for `UnfinishedRun` to go
         on with.
+    force
+        Replace an existing run folder, and begin anew where an unfinished one is.
     note
         Told of what is kept of either.
+
+    Raises
+    ------
+    CpunetError
+        If `out` exists and may not be replaced, an unfinished training is there and is
+        neither to go on nor to be replaced, another process works on it, or the folder
+        cannot be written to.
     """
     out = Path(out)
     refuse_existing(out, *inputs, force=force)

@@ -154,7 +154,13 @@ class NoisyNetworkBackend(NetworkBackend):
         self.noise, self.config, self.remains = noise, config, remains
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Run the network, add noise in proportion to 1/energy, and prepare like data."""
+        """Run the network, add noise in proportion to 1/energy, and prepare like data.
+
+        Raises
+        ------
+        CpunetError
+            If noise is wanted and an energy is not known.
+        """
         energy_kev, second = drawn.energy_kev, drawn.second
         if drawn.noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
@@ -195,7 +201,13 @@ class ResponseBackend(Backend):
         self.config = config
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
+        """Apply the chain, add noise proportional to 1/energy, and prepare like data.
+
+        Raises
+        ------
+        CpunetError
+            If noise is requested and an energy is unknown.
+        """
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         energy_kev, second = drawn.energy_kev, drawn.second
         if drawn.noise and energy_kev is None:

@@ -57,7 +57,13 @@ class EnsembleREN(REN):
 
     @classmethod
     def load(cls, ensemble: str | Path, device: str = "cpu") -> Self:
-        """Load all finished seeds from a folder of `cpunet ensemble`."""
+        """Load all finished seeds from a folder of `cpunet ensemble`.
+
+        Raises
+        ------
+        CpunetError
+            If fewer than two seeds are finished, or a run cannot be loaded.
+        """
         runs = finished_members(Path(ensemble))
         if len(runs) < 2:
             raise CpunetError(f"{ensemble}: one finished seed only; continue with --resume")

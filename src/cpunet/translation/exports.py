@@ -151,6 +151,8 @@ def export(graph: Graph, path: Path, form: Format) -> float:
     ----------
     graph
         Result of `graph_of`.
+    path
+        File to write.
     form
         Format: ``"onnx"`` (opset 18), ``"torchscript"`` or ``"torch-export"``, all with
         variable batch size.
@@ -159,6 +161,11 @@ def export(graph: Graph, path: Path, form: Format) -> float:
     -------
     float
         Largest difference of any sample.
+
+    Raises
+    ------
+    CpunetError
+        If a package is missing or the file differs from the run by more than 1e-4.
     """
     if form not in FORMATS:
         raise CpunetError(f"format {form!r} is not known; use {', '.join(FORMATS)}")

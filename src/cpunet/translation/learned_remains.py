@@ -35,10 +35,17 @@ def wanted_remains(
 
     Parameters
     ----------
+    translator
+        Trained run.
     wanted
         ``"learned"`` for the remains of the data, ``"none"``, or a rate in kHz.
     raw
         Whether the remains are for raw traces, which have not passed any cuts.
+
+    Raises
+    ------
+    CpunetError
+        If `wanted` is invalid, or the run lacks the necessary information.
     """
     if wanted == NONE:
         return None
@@ -62,8 +69,15 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
 
     Parameters
     ----------
+    translator
+        Trained run.
     rate_khz
         Rate in kHz; 0 for none.
+
+    Raises
+    ------
+    CpunetError
+        If the rate is no such number, or the run does not know the energies.
     """
     if not (np.isfinite(rate_khz) and rate_khz >= 0):
         raise CpunetError(f"--pile-up-khz {rate_khz:g}: expected a rate in kHz, 0 or more")

@@ -161,6 +161,8 @@ def aligned_currents(
     ----------
     charge
         Translated templates, shape (n, samples); rows of NaN remain NaN.
+    dt_ns
+        Sampling period in ns.
 
     Returns
     -------
@@ -196,6 +198,11 @@ def linearity(translate: TemplateTranslator, templates: FloatArray) -> Linearity
     templates
         Translatable templates, shape (n, samples); sums of three with random weights are
         compared.
+
+    Raises
+    ------
+    CpunetError
+        If none of the sums can be translated.
     """
     rng = np.random.default_rng(0)
     sites = rng.integers(len(templates), size=(EVENTS, SITES))

@@ -23,6 +23,11 @@ def components(templates: Floats, rank: int) -> Floats:
     """Leading principal components, without centring: orthonormal, shape ``(rank, samples)``.
 
     They minimise the squared error of templates of shape ``(n, samples)``.
+
+    Raises
+    ------
+    CpunetError
+        If there are fewer templates than components.
     """
     if len(templates) < rank:
         raise CpunetError(

@@ -35,7 +35,13 @@ State = dict[str, Tensor]
 
 
 def load_state(path: Path) -> State:
-    """Read a state dict with torch's loader of plain tensors."""
+    """Read a state dict with torch's loader of plain tensors.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or is not a mapping of names to tensors.
+    """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
@@ -61,6 +67,12 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
         File of the state dict.
     length
         Samples per pulse.
+
+    Raises
+    ------
+    CpunetError
+        If the file is not a published generator, or its tensors or positional maps belong to
+        another architecture; the message names missing, extra or differently shaped tensors.
     """
     state = load_state(path)
     first = state.get("inc.double_conv.0.weight")
@@ -87,6 +99,11 @@ def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
 
     Weights are assigned by name.  The published network never calls its attention matrix
     and batch norm, so outputs of the network here differ from its own.
+
+    Raises
+    ------
+    CpunetError
+        See `read_generator`.
     """
     state = load_state(path)
     table, hidden = state.get("embedding.weight"), state.get("RNNLayer.weight_hh_l0")

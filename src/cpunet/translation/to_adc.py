@@ -92,11 +92,18 @@ def adc_scale(
     ----------
     run
         Folder of the run, whose ``run.json`` describes the data.
+    ren
+        The loaded run.
     adc_per_kev
         Height of a fast pulse above the baseline in ADC counts per keV, the inverse of
         ``--kev-per-adc`` of the data.
     baseline
         Baseline in ADC counts.
+
+    Raises
+    ------
+    CpunetError
+        If one of the two is neither given nor known, or is not a positive number.
     """
     for name, value in (("--adc-per-kev", adc_per_kev), ("--baseline", baseline)):
         if value is not None and not (np.isfinite(value) and value >= 0):

@@ -33,6 +33,8 @@ class BaselineMethod(Protocol):
         ----------
         sim, data
             Prepared windows, shape ``(n, length)``. Simulated ones range from 0 to 1.
+        dt_ns
+            Sampling period in ns.
         align
             Sample at which both are aligned.
 

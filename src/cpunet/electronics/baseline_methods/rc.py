@@ -56,7 +56,14 @@ class RC:
 
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Match the mode of the current amplitudes and the tails, see `BaselineMethod.fit`."""
+        """Match the mode of the current amplitudes and the tails, see `BaselineMethod.fit`.
+
+        Raises
+        ------
+        CpunetError
+            For the reasons of `BaselineMethod.fit`, or if the data are slower than the maximum
+            tau.
+        """
         check_sets(sim, data, dt_ns, align)
         slope = fitted_tail_slope(data, dt_ns, align)
         steps = without_decay(data[:MOST], slope, dt_ns, align).astype(np.float32)

@@ -45,7 +45,13 @@ def tail_samples(length: int, align: int) -> int:
 
 
 def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
-    """Median logarithmic slope of the tails, in 1/ms."""
+    """Median logarithmic slope of the tails, in 1/ms.
+
+    Raises
+    ------
+    CpunetError
+        If no tail is positive.
+    """
     slopes = tail_slope(data, dt_ns, tail_samples(data.shape[1], align))
     slopes = slopes[np.isfinite(slopes)]
     if not slopes.size:
@@ -68,6 +74,8 @@ def without_decay(
         Windows of shape ``(n, length)`` with the baseline at 0.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms.
+    dt_ns
+        Sampling period in ns.
     align
         Sample at which the windows are aligned.
 
@@ -124,6 +132,11 @@ def slices(current: Values) -> Groups:
     ----------
     current
         Currents of pulses of unit height, shape ``(n, length)``.
+
+    Raises
+    ------
+    CpunetError
+        If too few pulses rise from baseline to top.
     """
     rise = rise_times(np.cumsum(current, axis=1))
     rows = np.flatnonzero(np.isfinite(rise))

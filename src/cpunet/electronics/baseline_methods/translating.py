@@ -38,6 +38,11 @@ def translate_like_data(
     -------
     Pulses
         The same events. A row is NaN if the pulse cannot be prepared.
+
+    Raises
+    ------
+    CpunetError
+        If the sampling period differs from that of the fit, or for the reasons of `finish`.
     """
     if not np.isclose(pulses.dt_ns, method.dt_ns):
         raise CpunetError(

@@ -86,6 +86,8 @@ def respond(
         Transfer function of the kernel at the frequencies of the record.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms, negative for a decay.
+    dt_ns
+        Sampling period in ns.
 
     Returns
     -------

@@ -36,6 +36,11 @@ def read_electronics(path: str | Path) -> Electronics:
         Name of a preset (see `electronics_names`) or a YAML file with the fields of
         `Electronics`.
 
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or the chain is invalid. The message names the field.
+
     Examples
     --------
     >>> read_electronics("ornl").decays[0].tau_us

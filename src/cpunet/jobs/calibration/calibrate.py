@@ -124,6 +124,8 @@ class Calibration:
         ----------
         out
             Output folder; it appears when it is complete.
+        force, monitor
+            See `cpunet.jobs.training.train.train_run`.
 
         Returns
         -------
@@ -176,6 +178,8 @@ class Calibration:
         ----------
         out
             Folder for ``plan.json`` and ``plan.png``; None for none.
+        force, monitor
+            See `run`.
 
         Returns
         -------

@@ -57,6 +57,11 @@ class Freedom:
     def of(cls, free: str, fixed: str, given: Sequence[str]) -> Freedom:
         """Parse the options of the command line.
 
+        Raises
+        ------
+        CpunetError
+            If a parameter is unknown, or a prior is not of the form ``NAME=VALUE±ERROR``.
+
         Examples
         --------
         >>> Freedom.of("auto", "tilt", ["temperature=90±0.5"]).priors
@@ -167,6 +172,13 @@ def read_sides(
         See `cpunet.jobs.calibration.calibrate.Calibration`.
     folder
         Folder for pulses that are simulated only as a starting point.
+    monitor
+        Receiver of the progress.
+
+    Raises
+    ------
+    CpunetError
+        If an input cannot be used.
     """
     selection = parse_selection(peak, recipe.peaks)
     data = load_measured(data_file, recipe, selection, monitor)

@@ -46,6 +46,11 @@ def channels_of(file: InputFile) -> dict[str, InputFile]:
     """Each channel of a file whose table is ``"all"``, by its short name.
 
     In the name of the energy column ``{channel}`` stands for the name of the channel.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, or its format has no tables.
     """
     tables = tables_of(file.path)
     if not tables:
@@ -125,6 +130,11 @@ def one_by_one(
         Told which channel is begun, and why one failed.
     ends
         Errors that end everything, such as a request to stop.
+
+    Raises
+    ------
+    CpunetError
+        If `out` is the output of one channel, or an error of `ends` occurs.
     """
     if out.is_file() or (out / MARKER).exists():
         raise CpunetError(

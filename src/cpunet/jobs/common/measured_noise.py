@@ -29,6 +29,8 @@ def measured_noise(
         File of measured pulses, preferably raw traces.
     windows
         Prepared pulses of the file, used if its traces have no long baselines.
+    config
+        Preparation of the pulses.
     remains
         Remains of earlier pulses under the traces; baselines with remains are left out.
 
@@ -57,6 +59,11 @@ def noise_of_traces(
 
     If traces have remains of earlier pulses, only those at the level of empty baselines are
     used.
+
+    Raises
+    ------
+    CpunetError
+        If the baselines are too few or too short.
     """
     block = next(iter(data_file.open().blocks(NOISE_TRACES)), None)
     if block is None:

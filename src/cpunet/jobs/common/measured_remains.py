@@ -48,6 +48,10 @@ def find_remains(
     ----------
     data_file, data
         Measured file, and its pulses that passed the cuts.
+    config
+        Preparation of the pulses.
+    monitor
+        Told of the rate, or why there is none.
     """
     found, reason = measured_remains(data_file, config)
     if found is None:
@@ -94,6 +98,8 @@ def drawn_like(
         Remains measured in the file.
     data_file, data
         Measured file, and its pulses that passed the cuts.
+    config
+        Preparation of the pulses.
     """
     windows = data.prepared.pulses.waveforms
     begins = (

@@ -19,6 +19,11 @@ def only_writer(target: Path) -> Iterator[None]:
     Temporary files of killed processes are removed first.
     The lock is a hidden file beside `target`, see `cpunet.file_locks`.  On file systems without
     locks, the last output to be moved into place wins.
+
+    Raises
+    ------
+    CpunetError
+        If another process is writing `target`, or the folder is not writable.
     """
     path = target.parent / f".{target.name}.lock"
     try:

@@ -125,6 +125,12 @@ def work_off(
         called with each item.  It, items and results must be picklable.
     items
         Items to process, in this order.
+    jobs
+        Number of parallel processes.
+    threads
+        CPU threads per process.
+    monitor
+        Receiver of notes, each only once.
 
     Yields
     ------

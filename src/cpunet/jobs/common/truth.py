@@ -89,7 +89,13 @@ class Responses:
         self._shape, self._dtype = shape, dtype
 
     def blocks(self, size: int = BLOCK) -> Iterator[FloatArray]:
-        """Float32 traces of the pulses in use, in order, `size` at a time."""
+        """Float32 traces of the pulses in use, in order, `size` at a time.
+
+        Raises
+        ------
+        CpunetError
+            If the file is damaged, or none of its traces is finite.
+        """
         n, samples = self._shape
         waiting, finite = np.empty((0, samples), np.float32), not len(self._index)
         with self._readable(), npz_files.member(self.path, _NAME) as stream:

@@ -88,6 +88,10 @@ def describe_responses(
         True chain of the data, if known (`stand_electronics`).
     out
         Folder to create, with ``response.json`` and ``response.png``; None for none.
+    force
+        Whether to replace an existing folder.
+    monitor
+        Receiver of notes about files kept from it.
 
     Returns
     -------
@@ -100,6 +104,11 @@ def describe_responses(
         from it, and ``sigma``, the difference divided by the error or the spread, whichever
         is larger.  A quantity without an error has no sigma: the runs share their data, so
         their spread shows how well they agree, not how accurate they are.
+
+    Raises
+    ------
+    CpunetError
+        If a run has no readout chain, or runs or truth are incompatible.
     """
     if out is not None:
         refuse_existing(out, *runs, force=force)
@@ -144,7 +153,13 @@ def chain_of(run: Path) -> Chain:
 
 
 def stand_electronics(stand: Path) -> Electronics:
-    """The true electronics of a virtual test stand, from its ``stand.json``."""
+    """The true electronics of a virtual test stand, from its ``stand.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the folder is not a virtual test stand.
+    """
     path = Path(stand) / "stand.json"
     try:
         text = read_text(path, MAX_BYTES)

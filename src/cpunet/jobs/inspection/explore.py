@@ -67,6 +67,8 @@ def explore_runs(
         Approximate number of grid points, `MIN_N` to `MOST`.
     settings
         Settings of the simulation; ``dt_ns`` must be that of the runs, which is the default.
+    device, force, monitor
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -75,6 +77,12 @@ def explore_runs(
         the others by reason; ``measured``, ``unaligned`` and ``drawn``, the numbers of data
         pulses read, of those without a complete edge, and of those on the page; ``bytes``,
         the size of the page.
+
+    Raises
+    ------
+    CpunetError
+        If the page exists, runs, settings or data are inconsistent, the detector is not
+        depleted, or no grid point has a pulse.
     """
     refuse_existing(out, *runs, *([] if data is None else data.files), force=force)
     if not MIN_N <= points <= MOST:

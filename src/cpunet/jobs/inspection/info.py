@@ -69,6 +69,10 @@ def describe(
     without_remains
         LH5 file to write: the traces after subtraction of their remains, with columns
         ``remains_kev`` and ``remains_error_kev``.
+    out
+        HTML page to write.
+    force
+        Whether to replace these files.
 
     Returns
     -------

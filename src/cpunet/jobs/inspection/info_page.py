@@ -20,6 +20,8 @@ def write_info_page(out: Path, told: Mapping[str, Any], spectra: Spectra) -> Non
 
     Parameters
     ----------
+    out
+        Page to write.
     told
         Result of `cpunet.jobs.inspection.info.describe`.
     spectra

@@ -49,7 +49,13 @@ class Places:
 
 
 def settings_at(dt_ns: float, settings: SimulationSettings | None) -> SimulationSettings:
-    """Settings of a simulation with sampling period `dt_ns`; others keep their defaults."""
+    """Settings of a simulation with sampling period `dt_ns`; others keep their defaults.
+
+    Raises
+    ------
+    CpunetError
+        If `settings` contain another ``dt_ns``, or a time step that does not divide it.
+    """
     values = settings.model_dump(exclude_unset=True) if settings else {}
     if not np.isclose(values.get("dt_ns", dt_ns), dt_ns):
         raise CpunetError(

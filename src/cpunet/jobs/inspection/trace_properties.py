@@ -44,6 +44,11 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
         ``decay_us`` (median of the tails); ``rejected`` (number of traces by reason: the
         selection of preparation and quality cuts without energies), with ``saturated`` and
         ``pile_up`` (tails that do not fit a decay) also as shares in percent.
+
+    Raises
+    ------
+    CpunetError
+        If too few traces hold a pulse.
     """
     seen = list(islice(blocks, BLOCKS))
     found = [_edges(block) for block in seen]

@@ -33,6 +33,8 @@ def describe_fields(
 
     Parameters
     ----------
+    detector
+        Geometry, impurities and bias.
     picture
         File to make, ``.png``, ``.pdf`` or ``.svg``; None for none.
     impurity_from
@@ -40,6 +42,10 @@ def describe_fields(
         ``measured_depletion_V``.
     paths
         Draw drift paths.
+    force
+        Replace an existing picture.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------
@@ -47,6 +53,12 @@ def describe_fields(
         Text by name, with units: capacitance, depletion voltage (and the measured one, if
         known), the scale of the impurities if it is not 1, bias, and the lowest and highest
         field in the bulk.
+
+    Raises
+    ------
+    CpunetError
+        If the detector is not depleted, or the picture exists, cannot be written or is of
+        no known format.
     """
     if picture is not None:
         if picture.suffix.lower() not in PICTURE_FORMATS:

@@ -47,6 +47,10 @@ def write_library(
 
     Parameters
     ----------
+    detector
+        Geometry, impurities and bias.
+    out
+        LH5 file to write.
     settings
         Of the simulation; by default with 5000 samples of 1 ns.
     grid_mm
@@ -59,6 +63,11 @@ def write_library(
     dict
         ``templates`` (places times angles), ``written``, ``outside`` (no signal there) and
         ``late`` (not collected within the record).
+
+    Raises
+    ------
+    CpunetError
+        If the detector is not depleted, the grid is empty, or the file cannot be written.
     """
     refuse_existing(out, force=force)
     if not (math.isfinite(grid_mm) and grid_mm > 0):

@@ -79,6 +79,8 @@ def simulate_file(
 
     Parameters
     ----------
+    detector
+        Geometry, impurities, bias and temperature.
     source
         Of the hits.
     out
@@ -99,6 +101,14 @@ def simulate_file(
         Of the energies written; the pulses stay as they are.
     seed
         Of the resolution (the Monte Carlo has its own).
+    force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
+
+    Raises
+    ------
+    CpunetError
+        If the file exists, the detector is not depleted, the hits cannot be used, or none
+        gives a signal.
     """
     clock = Clock()
     made_by = f"cpunet simulate {cpunet.__version__}"

@@ -27,6 +27,11 @@ def load_settings(
     values
         Fields that go before those of the file; None leaves a field as it is.
 
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, or a field or value is not allowed.
+
     Examples
     --------
     >>> load_settings(values={"dt_ns": 10, "diffusion": None}).dt_ns
@@ -48,6 +53,11 @@ def load_settings(
 
 def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]]:
     """Of ``KEY=VALUE`` words, those of the detector, and values of settings by their key.
+
+    Raises
+    ------
+    CpunetError
+        If a setting's value is no plain one.
 
     Examples
     --------

@@ -122,6 +122,8 @@ def make_stand(
         Of the source, a disc above the crystal.
     seed
         Of everything random; the sides draw independently.
+    force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
 
     Raises
     ------

@@ -118,7 +118,14 @@ class StandPlan:
         radius_mm: float = 5.0,
         seed: int = 0,
     ) -> Self:
-        """Plan a stand, see `cpunet.jobs.simulation.stand.make_stand`."""
+        """Plan a stand, see `cpunet.jobs.simulation.stand.make_stand`.
+
+        Raises
+        ------
+        CpunetError
+            If a window has no events, the chain's period is no multiple of the pulses', the
+            settings give a period, or there can be no detector shifted so.
+        """
         for window, number in zip(windows, events, strict=True):
             if number < 1:
                 raise CpunetError(f"--events {window.name}={number}: give at least 1 event")

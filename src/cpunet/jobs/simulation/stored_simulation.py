@@ -42,6 +42,12 @@ class StoredSimulation:
         """Read a file.
 
         Hits of events that have no pulse in the file are left out.
+
+        Raises
+        ------
+        CpunetError
+            If the file cannot be read, does not tell how it was made, or lacks the hits of
+            a pulse.
         """
         file = Path(path)
         made, numbers = _record(file)

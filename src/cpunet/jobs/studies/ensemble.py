@@ -66,6 +66,8 @@ def train_ensemble(
         See `cpunet.jobs.training.train.train_run`.
     out
         Folder of the run folders; an interrupted job can be resumed.
+    seeds
+        Number of seeds.
     jobs
         Number of parallel processes; by default one per core, or one on a GPU.
     threads
@@ -77,11 +79,21 @@ def train_ensemble(
     resume
         Whether to resume: finished seeds are kept, unfinished and failed ones are trained.
         The number of seeds can be increased; everything else must be unchanged.
+    force
+        Whether to replace an existing ensemble, without `resume`.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------
     dict
         Content of ``ensemble.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, the folder exists or was begun with other settings, or
+        every seed failed.
     """
     if seeds < 1:
         raise CpunetError(f"--seeds {seeds}: give 1 or more")

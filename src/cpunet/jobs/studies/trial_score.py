@@ -67,7 +67,13 @@ class HeldOut:
     def of(
         cls, sim: InputSet, data: InputSet, data_file: InputFile, recipe: Recipe, seed: int
     ) -> Self:
-        """Split both sides at random."""
+        """Split both sides at random.
+
+        Raises
+        ------
+        CpunetError
+            If too few pulses would be held out.
+        """
         rng = np.random.default_rng(seed)
         parts = []
         for side in (sim, data):
@@ -94,6 +100,11 @@ class HeldOut:
 
         over the pulse-shape parameters :math:`p`, with the mean of the null in the
         denominator.
+
+        Raises
+        ------
+        CpunetError
+            If pulses cannot be translated.
         """
         generator = ren.seeded(self.seed)
         remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None

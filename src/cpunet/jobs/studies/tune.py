@@ -98,12 +98,22 @@ def tune_recipe(
         See `cpunet.jobs.studies.ensemble.train_ensemble`.
     resume
         Whether to resume a search, or join it from another machine; all else must be unchanged.
+    force
+        Whether to replace an existing search, without `resume`.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------
     dict
         ``best`` (number, score, values), ``first`` (score of the unchanged recipe, or None),
         ``trials`` (number, state, score, values and reason of each), ``importances``.
+
+    Raises
+    ------
+    CpunetError
+        If optuna is missing, the search space or the input cannot be used, the folder exists
+        or was begun with other settings, or no trial has a score.
     """
     require_optuna()
     if trials < 1:

@@ -26,7 +26,13 @@ WORKER, REASON, SECONDS, LOST = "worker", "reason", "seconds", "lost"
 
 
 def require_optuna() -> Any:
-    """Import optuna with its log messages silenced."""
+    """Import optuna with its log messages silenced.
+
+    Raises
+    ------
+    CpunetError
+        If optuna is not installed.
+    """
     try:
         import optuna
     except ImportError as error:
@@ -38,7 +44,13 @@ def require_optuna() -> Any:
 
 
 def open_study(folder: Path, recipe: Recipe) -> Study:
-    """Open the study in a folder, or create a new one."""
+    """Open the study in a folder, or create a new one.
+
+    Raises
+    ------
+    CpunetError
+        If its journal cannot be read: it was damaged, or its last line cut off by a full disk.
+    """
     optuna = require_optuna()
     from optuna.storages.journal import JournalFileBackend
 
@@ -145,7 +157,13 @@ def _plain(params: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict
 
 
 def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> dict[str, Any]:
-    """Results of the trials, ready for JSON; see `cpunet.jobs.studies.tune.tune_recipe`."""
+    """Results of the trials, ready for JSON; see `cpunet.jobs.studies.tune.tune_recipe`.
+
+    Raises
+    ------
+    CpunetError
+        If no trial has a score.
+    """
     rows: list[dict[str, Any]] = [
         {
             "number": trial.number,

@@ -50,7 +50,13 @@ def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
 
 
 def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
-    """The response of a run, to start from."""
+    """The response of a run, to start from.
+
+    Raises
+    ------
+    CpunetError
+        If the run has none.
+    """
     recipe, part = read_recipe(run), "ren"
     if recipe.chain is not None:
         recipe, part = recipe.of_chain, "chain"
@@ -80,6 +86,12 @@ def match(
         What to fit to.
     recipe
         With a response to be matched.
+    seed
+        Seed of all random numbers.
+    listen
+        Called with step and chi-square.
+    monitor
+        Receiver of notes.
     known
         A response to start from.
 

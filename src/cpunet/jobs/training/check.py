@@ -102,10 +102,14 @@ def check(
 
     Parameters
     ----------
+    sim, data
+        Simulated and measured pulses.
     recipe
         How they are prepared and cut.
     peak
         Energies, as of a training.
+    monitor
+        Receiver of the progress.
 
     Raises
     ------
@@ -128,7 +132,13 @@ def check(
 
 
 def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
-    """Draw the pulses of both sides."""
+    """Draw the pulses of both sides.
+
+    Raises
+    ------
+    CpunetError
+        If the picture exists, or is of no known format.
+    """
     from cpunet.analysis.sides_figure import sides_figure
 
     if picture.suffix.lower() not in PICTURE_FORMATS:

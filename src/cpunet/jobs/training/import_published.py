@@ -48,6 +48,8 @@ def import_weights(
 
     Parameters
     ----------
+    out
+        Folder to make.
     ren, iren
         Generators: ``fep_REN.pt`` (simulation to data), ``fep_IREN.pt``; one at least.
     discriminator_data, discriminator_sim
@@ -56,11 +58,21 @@ def import_weights(
         Sampling period of the pulses they were trained on in ns.
     peak
         What they were trained on.
+    force
+        Replace an existing run folder.
+    monitor
+        Receiver of notes on what is kept.
 
     Returns
     -------
     dict
         What is in ``run.json``.
+
+    Raises
+    ------
+    CpunetError
+        If no generator is given, a file is no plain state dict or of another architecture,
+        the two generators differ in width, or `out` may not be written.
     """
     given = {
         "ren": ren,
@@ -139,12 +151,21 @@ def import_pulses(
         Sampling period in ns; the pickles do not tell.
     table, units
         Where in the LH5 file the pulses go, and the units of their samples.
+    force
+        Replace an existing file.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------
     dict
         ``read`` (entries), ``written``, ``rejections`` (counts by reason) and ``truncated``
         (the file ends within an entry, or is damaged there).
+
+    Raises
+    ------
+    CpunetError
+        If the pickle asks for more than arrays and plain containers, or holds no pulse.
     """
     refuse_existing(out, source, force=force)
     counts: Counter[str] = Counter()

@@ -65,6 +65,13 @@ def network_start(
         Of the chain's fit.
     init
         A run to start from: of the same networks, or matched, which then makes pairs.
+    monitor
+        Receiver of notes on the fit.
+
+    Raises
+    ------
+    CpunetError
+        If `init` does not fit the recipe, or there are no baselines to take noise from.
     """
     matched = init is not None and isinstance(read_recipe(init).generator, ResponseConfig)
     fill = None

@@ -49,11 +49,15 @@ def train_run(
 
     Parameters
     ----------
+    sim, data
+        Simulated and measured pulses.
     out
         The run folder; it appears when the training is done. A CycleGAN works in
         ``OUT.unfinished`` until then, see `cpunet.training.unfinished`.
     stop
         Asked after each iteration of a CycleGAN whether to store its state and stop.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------

@@ -66,12 +66,20 @@ def export_run(
 
     Parameters
     ----------
+    run
+        Folder of a training run.
+    out
+        File to write.
     form
         ``"onnx"``, ``"torchscript"`` or ``"torch-export"``.
     inverse
         Export IREN instead of REN.
     report
         Folder of a report on this run, whose scores go into the card.
+    force
+        Replace existing files.
+    monitor
+        Receiver of the progress.
 
     Raises
     ------

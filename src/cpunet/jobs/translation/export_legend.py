@@ -72,6 +72,8 @@ def export_legend_pars(
     ----------
     run
         Folder of a training run with a readout chain.
+    out
+        Folder to make.
     detector
         Name of the entries; by default that of the detector that the run was trained with,
         or else ``default``.
@@ -80,6 +82,8 @@ def export_legend_pars(
         not written.
     library
         Library of ideal charge pulses, on which the error of two numbers is measured.
+    force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------

@@ -39,12 +39,19 @@ def write_lithium_library(
         Its numbers.
     step_mm
         From depth to depth.
+    force
+        Replace an existing file.
 
     Returns
     -------
     dict
         ``dead_mm``, the depth at which half of the charge arrives, and ``half_ns``, by when a
         charge from there has delivered half of what it will.
+
+    Raises
+    ------
+    CpunetError
+        If the step is no part of the layer, or the file cannot be written.
     """
     refuse_existing(out, force=force)
     if not (math.isfinite(step_mm) and 0 < step_mm <= layer.thickness_mm):

@@ -53,7 +53,13 @@ class IdealLibrary:
 
     @classmethod
     def of(cls, file: h5py.File, path: str, source: Path) -> Self:
-        """Read the axes of a library."""
+        """Read the axes of a library.
+
+        Raises
+        ------
+        CpunetError
+            If these are no nodes, or templates are not sampled every nanosecond.
+        """
         where = f"{source}: {path or '/'}"
         if not path:
             raise CpunetError(
@@ -115,6 +121,11 @@ def chosen_libraries(
         Names that the user gives; empty for no choice.
     known
         The detector that the run was trained with, if it tells.
+
+    Raises
+    ------
+    CpunetError
+        If one is not there, or none is of the run's detector.
     """
     there = libraries(file)
     if not there:
@@ -165,7 +176,14 @@ def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
 def require_complete(
     inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary, source: Path
 ) -> None:
-    """Refuse a library that lacks whole rows of places between others."""
+    """Refuse a library that lacks whole rows of places between others.
+
+    Raises
+    ------
+    CpunetError
+        If an azimuth has no template, or a row of r or of z has none although rows on both
+        sides of it have.
+    """
     for angle, mask in inside.items():
         if not mask.any():
             raise CpunetError(

@@ -151,7 +151,13 @@ class RealisticLibrary:
         return stored if self._basis is None else np.asarray(stored @ self._basis)
 
     def for_reboost(self, angle: int = 0) -> Any:
-        """As `reboost.hpge.psd.maximum_current` takes it, 0 where there is no template."""
+        """As `reboost.hpge.psd.maximum_current` takes it, 0 where there is no template.
+
+        Raises
+        ------
+        CpunetError
+            If reboost is not installed.
+        """
         try:
             utils, units = map(import_module, ("reboost.hpge.utils", "reboost.units"))
         except ImportError as error:
@@ -173,6 +179,11 @@ def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
         LH5 file that `cpunet library translate --format simflow` or `merge` made.
     detector
         Name of the library; may be left out if the file has one.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such library in the file.
     """
     with opened(path) as file:
         require_all_stored(path, file)
@@ -241,11 +252,21 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
     ----------
     sources
         Files of whole templates or of components, each of one detector or more.
+    out
+        File to write.
+    force
+        Replace an existing file.
 
     Returns
     -------
     list of str
         Names of the detectors.
+
+    Raises
+    ------
+    CpunetError
+        If a file holds no realistic library, two are of one detector, or their time axes
+        differ.
     """
     refuse_existing(out, *sources, force=force)
     first: dict[str, tuple[Path, tuple[float, float, int]]] = {}
@@ -295,7 +316,13 @@ def _require_new(
 
 
 def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]:
-    """Make whole templates of components, so that reboost can read the file."""
+    """Make whole templates of components, so that reboost can read the file.
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no library of components.
+    """
     refuse_existing(out, source, force=force)
     done: list[str] = []
     with opened(source) as file:

@@ -76,8 +76,12 @@ def translate_for_simflow(
 
     Parameters
     ----------
+    run
+        Folder of a training run.
     source
         LH5 file of one library or more, of charge sampled every nanosecond.
+    out
+        LH5 file to write.
     detectors
         Names of the libraries to translate; by default the one of the detector that the run
         was trained with, or all if the run does not tell it.
@@ -86,6 +90,8 @@ def translate_for_simflow(
     rank
         Write this many components and the coefficients of each node in place of templates; see
         `cpunet.jobs.translation.simflow_files.read_library`.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -93,6 +99,11 @@ def translate_for_simflow(
         By name of the library ``templates`` (places times angles), ``translated``,
         ``padded``, ``healed`` (single places inside the crystal that had none),
         ``mode_per_ns`` (A/E that currents are divided by), and ``loss`` of the components.
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no such library, or it is damaged, of another detector or sampling.
     """
     refuse_existing(out, run, source, force=force)
     if not 0 <= rings <= 100:

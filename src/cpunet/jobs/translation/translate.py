@@ -234,10 +234,14 @@ def translate_file(
 
     Parameters
     ----------
+    run
+        Folder of a training run.
     source
         Simulated pulses, or measured ones for the inverse.
     resume
         Leave an output as it is that was made of this source with this run and these options.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------

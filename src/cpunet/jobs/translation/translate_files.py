@@ -53,19 +53,35 @@ def translate_files(
 
     Parameters
     ----------
+    run
+        Folder of a training run.
+    sources
+        Files of pulses.
     out
         Folder; made if it is not there.
     options
         How to translate, see `cpunet.jobs.translation.translate.translate_file`.
     jobs
         Number of processes, with a thread each.
+    device
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
     resume
         Skip files whose outputs are there, made of the same sources in the same way.
+    force
+        Replace outputs that are there.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------
     dict
         ``files`` and ``skipped`` (numbers of files), and the counts of all their rows.
+
+    Raises
+    ------
+    CpunetError
+        Before anything is read, if the run cannot be used, or outputs are there (without
+        `resume` and `force`) or would have the same names; in the end, if files failed.
     """
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
     read = [run, *(given for source in sources for given in source.files)]
@@ -101,7 +117,13 @@ def translate_files(
 
 
 def expanded(names: Sequence[Path]) -> list[Path]:
-    """File names, those with ``*``, ``?`` or ``[`` replaced by the files that fit them."""
+    """File names, those with ``*``, ``?`` or ``[`` replaced by the files that fit them.
+
+    Raises
+    ------
+    CpunetError
+        If no file fits.
+    """
     found: list[Path] = []
     for name in names:
         if name.exists() or not glob.has_magic(str(name)):

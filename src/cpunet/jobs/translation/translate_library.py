@@ -91,13 +91,19 @@ def translate_library(
 
     Parameters
     ----------
+    run
+        Folder of a training run.
     source
         LH5 file of one library or more.
+    out
+        LH5 file to write.
     currents
         Write currents instead, as `reboost.hpge.psd.maximum_current` takes them: in 1/ns,
         averaged as for a current amplitude, the highest sample at time 0, which ``t0`` then
         counts from; ``drift_time_*_deg`` become the times of that sample, so that a template
         shifted by its own stands where its pulse was.
+    device, force, monitor
+        As for `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -105,6 +111,11 @@ def translate_library(
         ``libraries`` (their paths), ``templates``, ``translated``, ``outside`` (all NaN),
         ``rejections`` (counts by reason) and ``linearity`` (see
         `cpunet.translation.library_mode.Linearity`).
+
+    Raises
+    ------
+    CpunetError
+        If the file holds no library of charge templates, or the run cannot translate it.
     """
     refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))

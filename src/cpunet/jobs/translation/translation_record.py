@@ -27,7 +27,13 @@ class Stamped(Protocol):
 
 
 def source_print(source: InputFile) -> Record:
-    """Sizes and times of change of the files that are read."""
+    """Sizes and times of change of the files that are read.
+
+    Raises
+    ------
+    CpunetError
+        If one is not there.
+    """
     paths = [source.path]
     elsewhere = (source.energy or "").rpartition(":")[0]
     if elsewhere and Path(elsewhere).is_file():
@@ -76,6 +82,12 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
         A translated file.
     wanted
         ``source``, ``run`` and ``options``.
+
+    Raises
+    ------
+    CpunetError
+        If it says nothing of how it was made, or was made of another source, with another
+        run or with other options.
     """
     found = _read(out)
     for what, value in wanted.items():

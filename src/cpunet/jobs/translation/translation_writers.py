@@ -36,12 +36,21 @@ def writer_of(
     ----------
     pulses
         The file that is translated.
+    out
+        The file to write.
     form
         Type, units and start of the samples.
     options
         Name the table or the column.
     attrs
         Of the table or the column.
+    force
+        Replace an existing file.
+
+    Raises
+    ------
+    CpunetError
+        If `out` exists, or a column is to be appended to a file that is none of LH5.
     """
     if options.append_column is None:
         return PulseWriter(

@@ -62,10 +62,14 @@ def fit_baseline_methods(
         Measured file, for its baselines.
     fit_on
         Energies on which the methods are fitted: those of the training.
+    recipe
+        Recipe of the run.
     remains
         Remains of earlier pulses as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
+    monitor
+        Receiver of the progress.
 
     Returns
     -------

@@ -35,11 +35,19 @@ def compare_reports(
         Method that is scored.
     out
         HTML page to write; None for none.
+    force
+        Whether to replace an existing page.
 
     Returns
     -------
     SideBySide
         Scores of the runs, which have the names of their folders, made unique.
+
+    Raises
+    ------
+    CpunetError
+        If a report cannot be read, none has a score of `method`, or `out` exists or
+        is not writable.
     """
     if out is not None:
         if out.is_dir():
@@ -55,7 +63,13 @@ def compare_reports(
 
 
 def read_metrics(file: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``."""
+    """Read a ``metrics.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or does not contain the scores of a validation.
+    """
     try:
         content = plain_json(read_text(file, MAX_BYTES))
     except (OSError, ValueError) as error:

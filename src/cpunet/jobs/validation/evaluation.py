@@ -111,7 +111,13 @@ class ValidateOptions:
 def evaluate(
     run: Path, sim: InputFile, data: InputFile, how: ValidateOptions, monitor: Monitor
 ) -> Evaluation:
-    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`."""
+    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
+
+    Raises
+    ------
+    CpunetError
+        If the input cannot be used, or no peak can be scored.
+    """
     info, device = read_info(run), resolve_device(how.device)
     ren, iren = REN.load(run, device), IREN.load(run, device)
     recipe = ren.recipe

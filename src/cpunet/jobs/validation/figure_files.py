@@ -48,6 +48,8 @@ def draw_figures(
     sim, data
         Simulated and measured pulses, for a run; not needed if results of the run are stored,
         nor for its losses.
+    out
+        Output folder, created if missing.
     suffix
         File format: ``.png``, ``.pdf`` or ``.svg``.
     how
@@ -57,6 +59,12 @@ def draw_figures(
     -------
     list of Path
         Paths of the files written.
+
+    Raises
+    ------
+    CpunetError
+        If a name matches no figure (the message lists them), required pulses are missing,
+        or a file exists.
     """
     if suffix not in FORMATS:
         raise CpunetError(f"format {suffix!r} is not known; use {', '.join(FORMATS)}")
@@ -105,6 +113,11 @@ def _scored(
 
 def chosen_names(names: list[str], known: Collection[str]) -> list[str]:
     """Names of the figures that match the given names in full or in part.
+
+    Raises
+    ------
+    CpunetError
+        If a name matches no figure; the message lists them.
 
     Examples
     --------

@@ -49,7 +49,13 @@ def write_drawings(file: Path, drawings: Mapping[str, Drawing], made: Made) -> N
 
 
 def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
-    """Read stored figures by name, and their inputs."""
+    """Read stored figures by name, and their inputs.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read.
+    """
     try:
         arrays = npz_files.read_arrays(file, npz_files.keys(file))
         index = json.loads(str(arrays[_INDEX]))

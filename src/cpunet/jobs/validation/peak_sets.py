@@ -136,6 +136,8 @@ def peak_sets(
     ----------
     name
         Name of a peak of the recipe, or a range in keV.
+    recipe
+        Recipe of the run.
     sim_set, data_set
         Prepared pulses of both sides.
     made

@@ -24,6 +24,8 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     ----------
     peak
         Pulses of the peak.
+    recipe
+        Recipe of the run.
     seed
         Seed of bootstraps and folds.
 

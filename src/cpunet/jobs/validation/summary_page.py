@@ -42,11 +42,19 @@ def summarise_reports(
         Detector and period of each report, if known otherwise.
     missing_ok
         Whether to list missing or unfinished reports instead of raising.
+    force
+        Whether to replace an existing page.
 
     Returns
     -------
     list of Entry
         Entries of the reports, in their order.
+
+    Raises
+    ------
+    CpunetError
+        If a report is missing or cannot be read, two reports have the same detector and
+        period, no report exists, or `out` exists or is not writable.
     """
     if out.is_dir():
         raise CpunetError(f"{out}: is a folder; give the name of a page, as index.html")

@@ -104,6 +104,8 @@ def translate_all(
         True noise-free records of these pulses, if known.
     seed
         Seed of the noise, common to all methods.
+    monitor
+        Receiver of the progress.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
     others = [*rivals.methods, *(["truth"] if responses is not None else [])]

@@ -40,6 +40,10 @@ def validate_run(
 
     Parameters
     ----------
+    run
+        Folder of the training run.
+    sim, data
+        Simulated and measured pulses.
     out
         Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, from
         which `cpunet.jobs.validation.figure_files.draw_figures` redraws the figures.

@@ -80,6 +80,12 @@ def resolve_energies(
     taken if it is in energy units, or if `kev_per_adc` calibrates it; else the
     amplitude times `kev_per_adc`; else energies are not known.  `energy` names
     another column, or ``FILE:path/to/column``.
+
+    Raises
+    ------
+    CpunetError
+        If the column is not there, has another length than the waveforms, is not
+        in energy units although asked for, or is in keV beside `kev_per_adc`.
     """
     if energy is None:
         usual = next((name for name in _USUAL if name in columns), None)

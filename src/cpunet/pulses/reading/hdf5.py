@@ -57,7 +57,13 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
 
 
 def column_of(path: Path, name: str) -> Hdf5Column:
-    """Return a column of an HDF5 file by its path in the file."""
+    """Return a column of an HDF5 file by its path in the file.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file or column; the message lists the other columns of the group.
+    """
     with opened(path) as file:
         found = file.get(name)
         if is_column(found):

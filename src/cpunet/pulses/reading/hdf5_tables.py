@@ -43,7 +43,13 @@ class WaveformColumn:
 
 
 def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> WaveformColumn:
-    """Choose the waveforms at `table`: a table, a waveform column, or a group around one."""
+    """Choose the waveforms at `table`: a table, a waveform column, or a group around one.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such table, or not exactly one choice; the message lists the choices.
+    """
     if table is None or not table.strip("/"):
         found = list(_walk(file, set()))
         if not found:

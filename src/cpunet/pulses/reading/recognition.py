@@ -39,7 +39,14 @@ _TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
 
 
 def recognise(path: Path) -> Format:
-    """Return the format of a file, from its content."""
+    """Return the format of a file, from its content.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file, or it is a folder, empty, of an unknown format, or of another
+        format than its suffix says.
+    """
     head = _head(path)
     found = _by_content(head, path)
     claimed = _SUFFIXES.get(path.suffix.lower())

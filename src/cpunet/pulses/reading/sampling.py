@@ -53,6 +53,11 @@ def resolve_sampling(
 
     A column without units is in ns if its name ends in ``_ns``; else it says
     nothing and `dt_ns` is needed; the `hint` says what is known of it.
+
+    Raises
+    ------
+    CpunetError
+        If neither tells, if they disagree, or if the period is no positive number.
     """
     ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
     if column is None or ns_per_unit is None:

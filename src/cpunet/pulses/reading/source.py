@@ -152,6 +152,12 @@ class PulseSource(ABC):
         """Yield the pulses of the file in order, at most `size` at a time.
 
         Blocks of long traces are smaller, so that none exceeds `BLOCK_BYTES`.
+
+        Raises
+        ------
+        CpunetError
+            If the file is damaged or contains no pulses, or if its events differ in length or
+            sampling period.
         """
         if size < 1:
             raise ValueError(f"block size is {size}; expected at least 1")

@@ -96,6 +96,12 @@ def simulate_gammas(
         Events with a deposit. ``event_number`` is the number of the primary.
     GammaStatistics
         Counts over all primaries, including events that were not kept.
+
+    Raises
+    ------
+    CpunetError
+        If the source is not above the crystal, a window is empty or beyond the line, or
+        `n_primaries` do not give the requested events.
     """
     _check(source_height_mm, source_radius_mm, n_primaries, energy_kev, wanted)
     shape = CrystalShape.of(detector)
@@ -173,6 +179,13 @@ def with_resolution(
         True energies in keV.
     noise_kev2, fano_kev
         Coefficients :math:`a` of the electronic noise and :math:`b` of the Fano statistics.
+    seed
+        Seed of the random generator.
+
+    Raises
+    ------
+    CpunetError
+        If a coefficient is negative.
 
     Examples
     --------

@@ -38,7 +38,14 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
 
 
 def read_hit_table(path: Path, units: Units) -> Steps:
-    """Read the steps of the table, in the frame of the crystal in which they were written."""
+    """Read the steps of the table, in the frame of the crystal in which they were written.
+
+    Raises
+    ------
+    CpunetError
+        If the table cannot be read, lacks a column or a unit, has columns of different
+        lengths, or has no hits for an event whose pulse is in the file.
+    """
     values, named = {}, {}
     with opened(path) as file:
         for name in ("event_number", *_AXES, "edep"):

@@ -49,6 +49,8 @@ def read_hits(
 
     Parameters
     ----------
+    path
+        Path of the file.
     detector
         Detector to read: the name of the table in remage files, the number of the volume in
         g4simple files, the number of the detector in other CSV files. Not needed if there is

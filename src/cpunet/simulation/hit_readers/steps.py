@@ -72,7 +72,13 @@ class ReadHits:
 
 
 def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
-    """Group steps by event, in the order of the file, in the frame of the crystal."""
+    """Group steps by event, in the order of the file, in the frame of the crystal.
+
+    Raises
+    ------
+    CpunetError
+        If a step has no finite position or energy, or a negative energy.
+    """
     # written so that NaN fails
     placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
     bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MAX_KEV))
@@ -107,7 +113,13 @@ def require_some(path: Path, n_events: int) -> None:
 
 
 def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Convert a column of whole numbers, which may be stored as floats, to int64."""
+    """Convert a column of whole numbers, which may be stored as floats, to int64.
+
+    Raises
+    ------
+    CpunetError
+        If a value is not a whole number or too large.
+    """
     kind = values.dtype.kind
     fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MAX_NUMBER).all())
     if fit and kind == "f":
