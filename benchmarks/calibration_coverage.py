@@ -22,8 +22,8 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import Search
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe

@@ -20,7 +20,8 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -34,16 +35,18 @@ def scores_of(
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        train_run(sim, data, run, load_recipe(recipe, overrides), seed=seed)
+        train_run(sim, data, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
         return evaluate(
             run,
             sim,
             data,
-            truth=truth if truth.exists() else None,
-            rivals=rivals,
-            seed=seed,
-            device="auto",
-            monitor=Monitor(),
+            ValidateOptions(
+                truth=truth if truth.exists() else None,
+                baselines=rivals,
+                seed=seed,
+                device="auto",
+            ),
+            Monitor(),
         ).metrics
 
 

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
-from cpunet.training.matching import fit_response
+from cpunet.training.response_fit import fit_response
 
 
 def first(pulses: Pulses, n: int) -> Pulses:

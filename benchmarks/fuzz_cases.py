@@ -77,7 +77,16 @@ def kinds() -> list[tuple[float, Kind]]:
     made.append((3, with_file("recipe.yaml", words)))
     for name in ("sim.lh5", "data.lh5"):
         made.append((1, with_file(name, TRAIN)))
-    words = ["validate", "run", *sides(), "--no-rivals", "--truth", "truth.npz", "--out", "out"]
+    words = [
+        "validate",
+        "run",
+        *sides(),
+        "--no-baselines",
+        "--truth",
+        "truth.npz",
+        "--out",
+        "out",
+    ]
     made.append((1.5, with_file("truth.npz", words)))
     words = ["library", "translate", "learned", "psl.lh5", "--out", "out.lh5"]
     made.append((3, with_file("psl.lh5", words)))

@@ -91,7 +91,7 @@ def make_base(base: Path) -> None:
     make_hits(base)
     make_settings(base)
     call(["train", "--sim", "sim.lh5", "--data", "data.lh5", "--out", "run", *tiny()], base)
-    call(["validate", "run", *sides(), "--no-rivals", "--out", "report"], base)
+    call(["validate", "run", *sides(), "--no-baselines", "--out", "report"], base)
     make_response(base)
     words = ["--detector", "detector.yaml", "--grid-mm", "12", "--dt-ns", "16", "--length-ns"]
     call(["library", "make", *words, "3600", "--out", "psl.lh5"], base)

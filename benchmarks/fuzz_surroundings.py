@@ -36,7 +36,7 @@ WORDS = {
     "ensemble": ["ensemble", *sides(), *tiny(), "--seeds", "1", "--no-validate", *STUDY],
     "tune": ["tune", *sides(), *tuning()],
     "translate": ["translate", "run", "sim.lh5", "--insist"],
-    "validate": ["validate", "run", *sides(), "--no-rivals"],
+    "validate": ["validate", "run", *sides(), "--no-baselines"],
     "compare": ["compare", "report", "report", "--out", "out.html"],
     "summary": ["summary", "report", "--out", "out.html"],
     "response": ["response", "learned"],
@@ -298,7 +298,16 @@ def truths(folder: Path, rng: Rng) -> Case:
     else:
         (folder / "truth.npz").unlink()
         shutil.copytree(folder / "run", folder / "truth.npz")
-    words = ["validate", "run", *sides(), "--no-rivals", "--truth", "truth.npz", "--out", "out"]
+    words = [
+        "validate",
+        "run",
+        *sides(),
+        "--no-baselines",
+        "--truth",
+        "truth.npz",
+        "--out",
+        "out",
+    ]
     return Case(words, f"truth: {kind}", must_fail=True)
 
 

@@ -18,16 +18,16 @@ import torch
 
 from cpunet.electronics.finishing import finish
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
-from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training import matching
+from cpunet.training import response_fit
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
@@ -144,7 +144,7 @@ def main() -> None:
     data = load_measured(files[1], RECIPE, selection, Monitor()).prepared.pulses
     noise, _ = measured_noise(files[1], data, RECIPE.preparation)
     windows, wanted = judged(arguments.stand)
-    start, _ = matching.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
+    start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
     state = {name: value.clone() for name, value in start.state_dict().items()}
     shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
     n = arguments.pulses
@@ -156,7 +156,7 @@ def main() -> None:
         problem = ResponseProblem(response, [band])
         levenberg_marquardt(problem, 20, None, coarse=False)
         shifts["moments"].append(shift(response, windows, wanted))
-        for _ in range(matching.ROUNDS):
+        for _ in range(response_fit.ROUNDS):
             refine(problem, [band], TRAINING.conditional_bins)
         shifts["weighted"].append(shift(response, windows, wanted))
         print(

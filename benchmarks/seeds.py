@@ -21,7 +21,8 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -37,16 +38,18 @@ def one_seed(
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         before = time.process_time()
-        info = train_run(*files, run, load_recipe(recipe, overrides), seed=seed)
+        info = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
         cpu = time.process_time() - before
         metrics = evaluate(
             run,
             *files,
-            truth=truth if truth.exists() and sim == stand else None,
-            rivals=False,
-            seed=seed,
-            device="auto",
-            monitor=Monitor(),
+            ValidateOptions(
+                truth=truth if truth.exists() and sim == stand else None,
+                baselines=False,
+                seed=seed,
+                device="auto",
+            ),
+            Monitor(),
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
     if "network" in info:

@@ -24,7 +24,7 @@ from cpunet.cli.messages import monitor
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_options import Adc
+from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter
@@ -121,7 +121,7 @@ def main() -> None:
                 folder / "run",
                 InputFile(folder / "sim.lh5"),
                 folder / "out.lh5",
-                adc=adc,
+                TranslateOptions(adc=adc),
                 monitor=monitor(),
             )
         seconds = time.perf_counter() - begin

@@ -19,7 +19,8 @@ from rich.table import Table
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
@@ -57,7 +58,7 @@ def main() -> None:
         folder = Path(name)
         known = folder / "known"
         sides = [InputFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
-        train_run(sides[0], sides[1], known, load_recipe("fast"), device="cpu")
+        train_run(sides[0], sides[1], known, load_recipe("fast"), TrainOptions(device="cpu"))
         few = few_of(data, arguments.pulses, folder)
         for title, start, measured in (
             ("fresh, all pulses", None, data),
@@ -66,16 +67,15 @@ def main() -> None:
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
             recipe = load_recipe("fast")
-            info = train_run(sim, measured, run, recipe, init=start, device="cpu")
+            info = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
             scored = evaluate(
                 run,
                 sim,
                 data,
-                truth=arguments.stand / "truth.npz",
-                rivals=False,
-                seed=0,
-                device="cpu",
-                monitor=Monitor(),
+                ValidateOptions(
+                    truth=arguments.stand / "truth.npz", baselines=False, seed=0, device="cpu"
+                ),
+                Monitor(),
             )
             rows[title] = (info["seconds"], scored.metrics)
     show(rows)

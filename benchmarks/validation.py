@@ -91,7 +91,7 @@ def validated(folder: Path, n: int, *, rivals: bool) -> str:
     sim, data, truth = make_files(folder, n)
     report = folder / f"report_{n}"
     words = ["--sim", str(sim), "--data", str(data), "--truth", str(truth)]
-    words += ["--out", str(report), "--force", "--rivals" if rivals else "--no-rivals"]
+    words += ["--out", str(report), "--force", "--baselines" if rivals else "--no-baselines"]
     wall, cpu, memory_mb = measured(cpunet("validate", str(folder / "run"), *words))
     peaks = json.loads((report / "metrics.json").read_text())["peaks"]
     methods = max(len(peak.get("two_sample", {})) for peak in peaks.values())

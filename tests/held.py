@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.cli.main import main
-from cpunet.jobs.studies.held_out import HeldOut
+from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.training.unfinished import UnfinishedRun
 
 AFTER = 2  # iterations

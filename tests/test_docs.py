@@ -22,6 +22,7 @@ from cpunet.cli.main import app
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe, recipe_names
@@ -169,7 +170,7 @@ def home(tmp_path_factory) -> Path:
     write_pulses(folder / "fine.lh5", fine)
     recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")
-    train_run(*sides, folder / "run", recipe, device="cpu")
+    train_run(*sides, folder / "run", recipe, TrainOptions(device="cpu"))
     for seed in ("seed_000", "seed_001"):
         shutil.copytree(folder / "run", folder / "ens" / seed)
     return folder

@@ -10,11 +10,13 @@ import json
 import reprlib
 from collections.abc import Mapping
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from cpunet.errors import CpunetError
+from cpunet.regular_files import read_text
 
 MAX_BYTES = 10_000_000  # of a settings file
 _MAX_DEPTH = 50
@@ -81,6 +83,27 @@ def plain_json(text: str | bytes) -> Any:
         raise ValueError("nested too deeply") from error
     _require_plain(found)
     return found
+
+
+def json_mapping(path: Path, absent: str, remedy: str) -> dict[str, Any]:
+    """Read a mapping from a JSON file.
+
+    Parameters
+    ----------
+    absent
+        Error message if the file cannot be read.
+    remedy
+        What to do if it is damaged.
+    """
+    try:
+        content = plain_json(read_text(path, MAX_BYTES))
+    except OSError as error:
+        raise CpunetError(absent) from error
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); {remedy}") from error
+    if not isinstance(content, dict):
+        raise CpunetError(f"{path}: damaged (no mapping); {remedy}")
+    return content
 
 
 def shown(value: Any) -> str:

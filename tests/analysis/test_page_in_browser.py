@@ -50,7 +50,7 @@ def neighbour(path: Path) -> ModuleType:
     return module
 
 
-synthetic = neighbour(HERE / "synthetic_views.py")
+synthetic = neighbour(HERE / "synthetic_charts.py")
 browser = neighbour(HERE.parent / "browser.py")
 
 

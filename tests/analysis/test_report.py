@@ -13,11 +13,11 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from cpunet.analysis.chart_data import distributions, method_looks
 from cpunet.analysis.comparisons import compare
 from cpunet.analysis.html_pages import DPI, figure_png
 from cpunet.analysis.nested_tables import nested_html
 from cpunet.analysis.report import write_report
-from cpunet.analysis.views import distributions, method_looks
 from cpunet.recipes import load_recipe
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})

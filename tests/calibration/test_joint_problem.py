@@ -15,7 +15,7 @@ import pytest
 from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
 from cpunet.calibration.nearby import Nearby
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings

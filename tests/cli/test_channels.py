@@ -34,7 +34,7 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     info = json.loads((tmp_path / "runs" / "ch2" / "run.json").read_text())
     assert info["data"]["read_as"] == {"table": "ch2/raw"}
 
-    words = [*files, "--no-rivals", "--out", tmp_path / "reports"]
+    words = [*files, "--no-baselines", "--out", tmp_path / "reports"]
     validated = command("validate", tmp_path / "runs", *words)
     assert validated.code == 2
     assert (tmp_path / "reports" / "ch1" / "report.html").is_file()

@@ -202,7 +202,7 @@ def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch
     (run / "run.json").write_text(json.dumps(info))
     seen: list[InputFile] = []
 
-    def evaluated(_run: Path, sim: InputFile, data: InputFile, **_: object) -> None:
+    def evaluated(_run: Path, sim: InputFile, data: InputFile, *_: object) -> None:
         seen.extend([sim, data])
         raise SeenError
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from cpunet.cli.main import main
 from cpunet.jobs.validation import validate
-from cpunet.jobs.validation.figures import drawings
+from cpunet.jobs.validation.drawings import drawings
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 
@@ -340,7 +340,7 @@ def unscorable(monkeypatch):
 
 def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):
     out = tmp_path / "figures"
-    words = ("figure", run, *stand.inputs, "--no-rivals", "--out", out, "--format")
+    words = ("figure", run, *stand.inputs, "--no-baselines", "--out", out, "--format")
     outcome = command(*words, "svg", "spectrum", "SEP single_pulse")
     assert outcome.code == 0
     assert listing(out) == ["SEP_single_pulse.svg", "spectrum.svg"]
@@ -360,7 +360,7 @@ def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):
 
 def test_figures_of_a_report(command, trained, stand, tmp_path, undrawn, unscorable):
     report, out = tmp_path / "report", tmp_path / "figures"
-    words = ("validate", trained, *stand.inputs, "--no-rivals", "--out", report)
+    words = ("validate", trained, *stand.inputs, "--no-baselines", "--out", report)
     assert command(*words).code == 0
     unscorable()
     assert command("figure", report, "SEP mean pulse", "--out", out).code == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cpunet.cli.response import response_table
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 
 

@@ -15,6 +15,7 @@ import torch
 
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes import load_recipe
 from cpunet.training.checkpoints import CHECKPOINT
 from cpunet.training.run_folder import LOSSES
@@ -216,13 +217,13 @@ def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
     recipe = load_recipe("small", overrides)
     files = InputFile(stand.sim), InputFile(stand.data)
-    train_run(*files, tmp_path / "whole", recipe, seed=5, device="cpu")
+    train_run(*files, tmp_path / "whole", recipe, TrainOptions(seed=5, device="cpu"))
     for moment in MOMENTS:
         given = {"MOMENT": moment, "ARGUMENTS": (*files, tmp_path / "run", recipe)}
         job = held.forked(__file__, given, PROCESS)
         job.join()
         assert job.exitcode == -signal.SIGKILL, moment
-    train_run(*files, tmp_path / "run", recipe, seed=5, device="cpu", resume=True)
+    train_run(*files, tmp_path / "run", recipe, TrainOptions(seed=5, device="cpu", resume=True))
     assert result(tmp_path / "run") == result(tmp_path / "whole")
     # one killed before its first checkpoint began again
     info = json.loads((tmp_path / "run" / "run.json").read_text())
@@ -234,4 +235,4 @@ if __name__ == PROCESS:
     asked = globals()
     torch.set_num_threads(1)
     die_at(*asked["MOMENT"])
-    train_run(*asked["ARGUMENTS"], seed=5, device="cpu", resume=True)
+    train_run(*asked["ARGUMENTS"], TrainOptions(seed=5, device="cpu", resume=True))

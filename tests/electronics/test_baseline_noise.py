@@ -9,7 +9,7 @@ import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish, finish_both
-from cpunet.electronics.noise import coloured_noise, noise_power
+from cpunet.electronics.noise_traces import coloured_noise, noise_power
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses

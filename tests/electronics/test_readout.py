@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum, Wander
-from cpunet.electronics.noise import coloured_noise, cut_noise, noise_power, read_baselines
+from cpunet.electronics.noise_traces import (
+    coloured_noise,
+    cut_noise,
+    noise_power,
+    read_baselines,
+)
 from cpunet.electronics.other_pulses import draw_other_pulses
 from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.readout import RawTraces, read_out

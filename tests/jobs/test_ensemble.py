@@ -18,6 +18,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.studies.ensemble import train_ensemble
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses
@@ -109,7 +110,7 @@ def weights(run: Path) -> bytes:
 
 
 def test_a_seed_is_what_a_single_training_gives(files, made, tmp_path):
-    train_run(*files, tmp_path / "1", RECIPE, seed=1, device="cpu")
+    train_run(*files, tmp_path / "1", RECIPE, TrainOptions(seed=1, device="cpu"))
     assert weights(made.folder / "seed_001") == weights(tmp_path / "1")
     assert weights(made.folder / "seed_000") != weights(tmp_path / "1")
 

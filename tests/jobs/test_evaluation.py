@@ -14,10 +14,11 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.drawings import drawings, figure_names
 from cpunet.jobs.validation.energy_ranges import validation_selection
-from cpunet.jobs.validation.evaluation import Evaluation, evaluate
+from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.figure_store import read_drawings, write_drawings
-from cpunet.jobs.validation.figures import drawings, figure_names
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
@@ -76,13 +77,17 @@ def files(tmp_path_factory) -> dict[str, InputFile]:
 @pytest.fixture(scope="module")
 def run(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("run") / "run"
-    train_run(files["sim"], files["data"], out, RECIPE, seed=0, device="cpu")
+    train_run(files["sim"], files["data"], out, RECIPE, TrainOptions(seed=0, device="cpu"))
     return out
 
 
 def evaluated(run: Path, sim: InputFile, data: InputFile) -> Evaluation:
     return evaluate(
-        run, sim, data, truth=None, rivals=False, seed=0, device="cpu", monitor=Monitor()
+        run,
+        sim,
+        data,
+        ValidateOptions(truth=None, baselines=False, seed=0, device="cpu"),
+        Monitor(),
     )
 
 
@@ -99,9 +104,12 @@ def test_peaks_sidebands_and_continua_are_loaded() -> None:
 
 def test_a_sample_of_both_sides_is_compared(run, files, monkeypatch) -> None:
     few = evaluate(
-        run, files["sim"], files["data"], truth=None, rivals=False, seed=0, device="cpu",
-        monitor=Monitor(), most=250,
-    )  # fmt: skip
+        run,
+        files["sim"],
+        files["data"],
+        ValidateOptions(truth=None, baselines=False, seed=0, device="cpu", most=250),
+        Monitor(),
+    )
     assert len(few.sim.prepared) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
     assert len(few.data.energies_kev) == 380
@@ -183,7 +191,11 @@ def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkey
         "cpunet.jobs.validation.validate.drawings", lambda found: {}
     )  # drawn above
     metrics = validate_run(
-        run, files["sim"], files["no DEP"], tmp_path / "report", rivals=False, device="cpu"
+        run,
+        files["sim"],
+        files["no DEP"],
+        tmp_path / "report",
+        ValidateOptions(baselines=False, device="cpu"),
     )
     assert metrics["peaks"]["DEP"]["missing"].startswith("no measured pulses")
     assert "DEP" in metrics["ae_survival"]["missing"]
@@ -209,11 +221,8 @@ def found(run, files, tmp_path_factory):
         run,
         files["sim"],
         files["data"],
-        truth=path,
-        rivals=True,
-        seed=0,
-        device="cpu",
-        monitor=Monitor(),
+        ValidateOptions(truth=path, baselines=True, seed=0, device="cpu"),
+        Monitor(),
     )
 
 

@@ -13,6 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_simulated
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
@@ -104,14 +105,14 @@ def files(tmp_path_factory) -> dict[str, InputFile]:
 @pytest.fixture(scope="module")
 def chain(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("chain") / "run"
-    train_run(files["sim"], files["one"], out, FAST, device="cpu")
+    train_run(files["sim"], files["one"], out, FAST, TrainOptions(device="cpu"))
     return out
 
 
 @pytest.fixture(scope="module")
 def network(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("network") / "run"
-    train_run(files["sim"], files["one"], out, TINY, device="cpu")
+    train_run(files["sim"], files["one"], out, TINY, TrainOptions(device="cpu"))
     return out
 
 
@@ -122,9 +123,15 @@ def poles(run: Path) -> list[float]:
 
 @pytest.mark.slow
 def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> None:
-    cold = train_run(files["sim"], files["other"], tmp_path / "cold", FAST, device="cpu")
+    cold = train_run(
+        files["sim"], files["other"], tmp_path / "cold", FAST, TrainOptions(device="cpu")
+    )
     warm = train_run(
-        files["sim"], files["other"], tmp_path / "warm", FAST, init=chain, device="cpu"
+        files["sim"],
+        files["other"],
+        tmp_path / "warm",
+        FAST,
+        TrainOptions(init=chain, device="cpu"),
     )
     assert warm["init"] == str(chain)
     assert warm["fit"]["steps"] < cold["fit"]["steps"]
@@ -136,7 +143,9 @@ def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> N
 
 def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None:
     # a training whose rates are next to nothing stays where it began
-    train_run(files["sim"], files["other"], tmp_path / "run", TINY, init=network, seed=5)
+    train_run(
+        files["sim"], files["other"], tmp_path / "run", TINY, TrainOptions(init=network, seed=5)
+    )
     before, after = (load_file(r / "weights.safetensors") for r in (network, tmp_path / "run"))
     kept = [n for n in before if n.startswith(("ren.", "iren.")) and "running" not in n]
     assert kept
@@ -146,15 +155,21 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
 
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
     with pytest.raises(CpunetError, match="from which no readout chain can start"):
-        train_run(files["sim"], files["one"], tmp_path / "a", FAST, init=network)
+        train_run(files["sim"], files["one"], tmp_path / "a", FAST, TrainOptions(init=network))
     wider = load_recipe("paper", ["generator.width=4"])
     with pytest.raises(CpunetError, match="weights of another network"):
-        train_run(files["sim"], files["one"], tmp_path / "b", wider, init=network)
+        train_run(files["sim"], files["one"], tmp_path / "b", wider, TrainOptions(init=network))
     with pytest.raises(CpunetError, match="no finished run"):
-        train_run(files["sim"], files["one"], tmp_path / "c", TINY, init=tmp_path / "none")
+        train_run(
+            files["sim"],
+            files["one"],
+            tmp_path / "c",
+            TINY,
+            TrainOptions(init=tmp_path / "none"),
+        )
     fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
-        train_run(*fast_sampled, tmp_path / "d", FAST, init=chain)
+        train_run(*fast_sampled, tmp_path / "d", FAST, TrainOptions(init=chain))
     assert not any((tmp_path / name).exists() for name in "abcd")
 
 
@@ -166,7 +181,13 @@ def test_networks_learn_the_pairs_of_a_matched_run(files, chain, tmp_path) -> No
         changed = {"pairs": pairs, "batch_size": 16, "statistics_batches": 4}
         training = TINY.training.model_copy(update=changed)
         recipe = TINY.model_copy(update={"training": training})
-        train_run(files["sim"], files["one"], tmp_path / name, recipe, init=chain, device="cpu")
+        train_run(
+            files["sim"],
+            files["one"],
+            tmp_path / name,
+            recipe,
+            TrainOptions(init=chain, device="cpu"),
+        )
         sim = load_simulated(files["sim"], recipe, parse_selection("FEP", recipe.peaks), QUIET)
         windows = sim.prepared.pulses.waveforms[:50]
         wanted = REN.load(chain).apply(windows, noise=False)
@@ -185,7 +206,9 @@ def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> Non
         ],
     )
     with pytest.raises(CpunetError, match=r"know windows of 800 of 400 \+ 400 samples") as told:
-        train_run(files["sim"], files["one"], tmp_path / "a", shorter, init=network)
+        train_run(
+            files["sim"], files["one"], tmp_path / "a", shorter, TrainOptions(init=network)
+        )
     assert "this recipe has 784 of 400 + 384" in str(told.value)
     assert "\n" not in str(told.value)
 
@@ -193,12 +216,16 @@ def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> Non
 def test_a_matched_run_of_another_sampling_makes_no_pairs(chain, tmp_path) -> None:
     sides = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
-        train_run(*sides, tmp_path / "d", TINY, init=chain)
+        train_run(*sides, tmp_path / "d", TINY, TrainOptions(init=chain))
 
 
 def test_behind_a_chain_a_run_tells_its_fit_and_may_be_a_start(files, chain, tmp_path) -> None:
     begun = train_run(
-        files["sim"], files["one"], tmp_path / "begun", CHAINED, init=chain, device="cpu"
+        files["sim"],
+        files["one"],
+        tmp_path / "begun",
+        CHAINED,
+        TrainOptions(init=chain, device="cpu"),
     )
     assert begun["fit"]["parameters"]
     assert REN.load(tmp_path / "begun").needs_energies
@@ -207,19 +234,24 @@ def test_behind_a_chain_a_run_tells_its_fit_and_may_be_a_start(files, chain, tmp
         files["one"],
         tmp_path / "again",
         CHAINED,
-        init=tmp_path / "begun",
-        device="cpu",
+        TrainOptions(init=tmp_path / "begun", device="cpu"),
     )
     assert again["fit"]["steps"] <= begun["fit"]["steps"]
     own = load_recipe("paper", ["generator.width=2"])
     with pytest.raises(CpunetError, match="networks know windows of 528 of 400"):
-        train_run(files["sim"], files["one"], tmp_path / "x", own, init=tmp_path / "begun")
+        train_run(
+            files["sim"],
+            files["one"],
+            tmp_path / "x",
+            own,
+            TrainOptions(init=tmp_path / "begun"),
+        )
 
 
 def test_noise_needs_baselines(tmp_path) -> None:
     recipe = load_recipe("paper-noise", ["generator.width=2", "training.iterations=1"])
     few = [write(tmp_path / f"{k}.lh5", k, p, n=20) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match=r"2\.lh5: no baselines to draw noise from") as told:
-        train_run(*few, tmp_path / "run", recipe, device="cpu")
+        train_run(*few, tmp_path / "run", recipe, TrainOptions(device="cpu"))
     assert "--set training.noise=none" in str(told.value)
     assert "\n" not in str(told.value)

@@ -24,8 +24,10 @@ from cpunet.jobs.common.inputs import (
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.common.truth import load_truth
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
@@ -176,7 +178,9 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
 
 def test_a_training_tells_what_it_does(files, tmp_path):
     monitor = Listening()
-    info = train_run(*files, tmp_path / "run", RECIPE, seed=7, device="cpu", monitor=monitor)
+    info = train_run(
+        *files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"), monitor=monitor
+    )
     assert monitor.stages == {
         "Preparing sim.lh5": [N, N],
         "Preparing data.lh5": [N, N],
@@ -188,7 +192,9 @@ def test_a_training_tells_what_it_does(files, tmp_path):
 
 
 def test_a_range_of_energies(files, tmp_path):
-    info = train_run(*files, tmp_path / "run", RECIPE, peak="1500-2200", device="cpu")
+    info = train_run(
+        *files, tmp_path / "run", RECIPE, TrainOptions(peak="1500-2200", device="cpu")
+    )
     assert info["peak"] == "1500-2200"
     assert info["sim"]["used"] == 20
 
@@ -196,11 +202,13 @@ def test_a_range_of_energies(files, tmp_path):
 @pytest.mark.parametrize("inverse", [False, True])
 def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, inverse):
     source = files[1] if inverse else files[0]
-    options = {"inverse": inverse, "noise": False, "device": "cpu"}
-    whole = translate_file(run, source, tmp_path / "whole.lh5", **options)
+    options = TranslateOptions(inverse=inverse, noise=False)
+    whole = translate_file(run, source, tmp_path / "whole.lh5", options, device="cpu")
     monkeypatch.setattr(translate_job, "BLOCK_SIZE", 7)
     monitor = Listening()
-    parts = translate_file(run, source, tmp_path / "parts.lh5", monitor=monitor, **options)
+    parts = translate_file(
+        run, source, tmp_path / "parts.lh5", options, device="cpu", monitor=monitor
+    )
     assert whole == parts == {"read": N, "translated": N, "rejections": {}}
     assert monitor.stages == {"Translating": [N, 7, 7, 7, 7, 2]}
     found = [open_pulses(tmp_path / name).read() for name in ("whole.lh5", "parts.lh5")]

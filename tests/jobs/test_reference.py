@@ -8,6 +8,8 @@ import pytest
 
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.recipes import load_recipe
 
@@ -19,9 +21,13 @@ def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_pat
     """Trained on FEP, judged on SEP and DEP, which it has not seen."""
     folder = reference_data / "closure"
     sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
-    train_run(sim, data, tmp_path / "run", load_recipe("small"), device="cpu")
+    train_run(sim, data, tmp_path / "run", load_recipe("small"), TrainOptions(device="cpu"))
     metrics = validate_run(
-        tmp_path / "run", sim, data, tmp_path / "report", truth=folder / "truth.npz"
+        tmp_path / "run",
+        sim,
+        data,
+        tmp_path / "report",
+        ValidateOptions(truth=folder / "truth.npz"),
     )
     worse = []
     for peak in ("SEP", "DEP"):
@@ -63,7 +69,9 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
             "chain.training.ringing_mhz=[]",
         ],
     )
-    info = train_run(sim, data, tmp_path / "run", recipe, peak="300-", device="cpu")
+    info = train_run(
+        sim, data, tmp_path / "run", recipe, TrainOptions(peak="300-", device="cpu")
+    )
     assert 200 < info["data"]["used"] < 1000
     metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")
     scores = metrics["peaks"]["300-"]

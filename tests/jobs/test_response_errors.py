@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpunet.jobs.inspection.response_errors import propagated
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 
 RESPONSE = ElectronicsResponse(

@@ -213,7 +213,11 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path)
 def test_realisations_repeat_rows(run, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
     told = translate_file(
-        run, source, tmp_path / "out.lh5", realisations=3, seed=4, device="cpu"
+        run,
+        source,
+        tmp_path / "out.lh5",
+        TranslateOptions(realisations=3, seed=4),
+        device="cpu",
     )
     assert told["translated"] == 3 * N
     table = lh5.read("geds/ren", tmp_path / "out.lh5")
@@ -222,7 +226,7 @@ def test_realisations_repeat_rows(run, tmp_path):
     rows = np.repeat(np.arange(N), 3)
     for name in ("edep", "drift_time", "vertex", "position", "names", "event_number"):
         assert plain(table[name]) == plain(before[name], rows)
-    translate_file(run, source, tmp_path / "one.lh5", seed=4, device="cpu")
+    translate_file(run, source, tmp_path / "one.lh5", TranslateOptions(seed=4), device="cpu")
     waveforms = table.waveform.values.nda.reshape(N, 3, 800)
     np.testing.assert_array_equal(waveforms[:, 0], values(tmp_path / "one.lh5"))
     noise = waveforms[..., :300] - waveforms[..., :300].mean(axis=1, keepdims=True)
@@ -236,7 +240,13 @@ def test_a_column_appended_to_a_copy(run, tmp_path):
         file["elsewhere/note"] = 5
     before = source.read_bytes()
     out = tmp_path / "out.lh5"
-    translate_file(run, InputFile(source), out, append_column="waveform_ren", device="cpu")
+    translate_file(
+        run,
+        InputFile(source),
+        out,
+        TranslateOptions(append_column="waveform_ren"),
+        device="cpu",
+    )
     assert source.read_bytes() == before
     table = lh5.read("geds/sim", out)
     assert isinstance(table.waveform_ren, WaveformTable)
@@ -249,9 +259,9 @@ def test_a_column_appended_to_a_copy(run, tmp_path):
     np.testing.assert_array_equal(table.waveform_ren.values.nda, values(tmp_path / "plain.lh5"))
     with h5py.File(out) as file:
         assert file["elsewhere/note"][()] == 5
-    again = {"append_column": "waveform_ren", "device": "cpu"}
+    again = TranslateOptions(append_column="waveform_ren")
     with pytest.raises(CpunetError, match="has a column waveform_ren already"):
-        translate_file(run, InputFile(out), tmp_path / "again.lh5", **again)
+        translate_file(run, InputFile(out), tmp_path / "again.lh5", again, device="cpu")
     assert names(tmp_path) == ["out.lh5", "plain.lh5", "sim.lh5"]
 
 
@@ -442,7 +452,7 @@ def test_windows_are_extended_by_their_decay():
 @pytest.mark.parametrize("adc", [Adc(), ADC])
 def test_traces_in_adc_counts(run, tmp_path, adc):
     source, out = sim_file(tmp_path / "sim.lh5"), tmp_path / "out.lh5"
-    told = translate_file(run, InputFile(source), out, adc=adc, device="cpu")
+    told = translate_file(run, InputFile(source), out, TranslateOptions(adc=adc), device="cpu")
     assert (told["translated"], told["saturated"]) == (N, 0)
     length, n_pre = adc.length or 800, adc.n_pre or 400
     table = lh5.read("geds/ren", out)
@@ -460,7 +470,9 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     # prepared again they are what translation gives without ADC
     config = load_recipe("fast").preparation
     clean = tmp_path / "clean.lh5"
-    translate_file(run, InputFile(source), clean, adc=adc, noise=False, device="cpu")
+    translate_file(
+        run, InputFile(source), clean, TranslateOptions(adc=adc, noise=False), device="cpu"
+    )
     back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
     assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
     windows = REN.load(run).translate(charge(), noise=False)
@@ -475,7 +487,7 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
     run, network, tmp_path
 ):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
-    translate_file(run, source, tmp_path / "chain.lh5", adc=ADC, device="cpu")
+    translate_file(run, source, tmp_path / "chain.lh5", TranslateOptions(adc=ADC), device="cpu")
     traces = values(tmp_path / "chain.lh5").astype(float)
     for part in (slice(0, 250), slice(1150, 1400)):
         steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
@@ -486,8 +498,7 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
         network,
         source,
         tmp_path / "unet.lh5",
-        adc=given,
-        noise=False,
+        TranslateOptions(adc=given, noise=False),
         device="cpu",
         monitor=listening,
     )
@@ -500,7 +511,9 @@ def test_gain_is_the_height_of_a_fast_pulse(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5")
     given = Adc(adc_per_kev=7.0, baseline=100.0)
     out = tmp_path / "out.lh5"
-    translate_file(run, InputFile(source), out, adc=given, noise=False, device="cpu")
+    translate_file(
+        run, InputFile(source), out, TranslateOptions(adc=given, noise=False), device="cpu"
+    )
     table = lh5.read("geds/ren", out)
     height = table.waveform.values.nda.max(axis=1) - 100.0
     np.testing.assert_allclose(height / table.energy.nda, 7.0, rtol=0.01)
@@ -511,7 +524,9 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     waveforms[3] = 0.5
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
-    told = translate_file(run, InputFile(path), tmp_path / "out.lh5", adc=ADC, device="cpu")
+    told = translate_file(
+        run, InputFile(path), tmp_path / "out.lh5", TranslateOptions(adc=ADC), device="cpu"
+    )
     assert told == {
         "read": 6,
         "translated": 4,
@@ -541,8 +556,8 @@ def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
 
 def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
-    out, options = tmp_path / "out.lh5", {"realisations": 40, "device": "cpu"}
-    translate_file(busy, source, out, remains="learned", **options)
+    out, many = tmp_path / "out.lh5", {"realisations": 40}
+    translate_file(busy, source, out, TranslateOptions(remains="learned", **many), device="cpu")
     left = left_in(out)
     assert len(left) == 40 * N
     assert left.max() < 40
@@ -551,7 +566,9 @@ def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     higher = values(out)[:, 410:440].mean(axis=1)
     share = left / lh5.read("geds/ren/energy", out).nda
     assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate_file(busy, source, tmp_path / "rate.lh5", remains="1", **options)
+    translate_file(
+        busy, source, tmp_path / "rate.lh5", TranslateOptions(remains="1", **many), device="cpu"
+    )
     assert left_in(tmp_path / "rate.lh5").max() > 100
 
 
@@ -559,7 +576,9 @@ def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     for remains in ("none", "3"):
         out = tmp_path / f"{remains}.lh5"
-        translate_file(busy, source, out, adc=ADC, remains=remains, seed=3, device="cpu")
+        translate_file(
+            busy, source, out, TranslateOptions(adc=ADC, remains=remains, seed=3), device="cpu"
+        )
     left = left_in(tmp_path / "3.lh5")
     none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
     assert (left > 20).sum() > 5
@@ -577,9 +596,17 @@ def piled(out):
 
 def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
-    options = {"adc": ADC, "seed": 3, "device": "cpu", "realisations": 5}
-    translate_file(busy, source, tmp_path / "none.lh5", **options)
-    translate_file(busy, source, tmp_path / "some.lh5", pile_up_khz=20, **options)
+    options = {"adc": ADC, "seed": 3, "realisations": 5}
+    translate_file(
+        busy, source, tmp_path / "none.lh5", TranslateOptions(**options), device="cpu"
+    )
+    translate_file(
+        busy,
+        source,
+        tmp_path / "some.lh5",
+        TranslateOptions(pile_up_khz=20, **options),
+        device="cpu",
+    )
     with h5py.File(tmp_path / "none.lh5") as file:
         assert "n_piled" not in file["geds/ren"]
     count, kev, after_ns = piled(tmp_path / "some.lh5")
@@ -599,8 +626,8 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
 
 def test_second_pulses_are_within_windows(busy, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
-    out, options = tmp_path / "some.lh5", {"seed": 3, "device": "cpu", "realisations": 10}
-    translate_file(busy, source, out, pile_up_khz=20, **options)
+    out, options = tmp_path / "some.lh5", {"seed": 3, "realisations": 10}
+    translate_file(busy, source, out, TranslateOptions(pile_up_khz=20, **options), device="cpu")
     count, kev, after_ns = piled(out)
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
@@ -629,7 +656,9 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
 def test_remains_that_cannot_be(busy, tmp_path, options, said):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
-        translate_file(busy, source, tmp_path / "out.lh5", device="cpu", **options)
+        translate_file(
+            busy, source, tmp_path / "out.lh5", TranslateOptions(**options), device="cpu"
+        )
 
 
 def test_an_ensemble_has_the_remains_of_its_members(busy):
@@ -647,9 +676,17 @@ def test_runs_that_tell_of_no_remains(run, network, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of remains"):
-            translate_file(folder, source, tmp_path / "o.lh5", remains="1", device="cpu")
+            translate_file(
+                folder, source, tmp_path / "o.lh5", TranslateOptions(remains="1"), device="cpu"
+            )
         with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
-            translate_file(folder, source, tmp_path / "o.lh5", pile_up_khz=1, device="cpu")
+            translate_file(
+                folder,
+                source,
+                tmp_path / "o.lh5",
+                TranslateOptions(pile_up_khz=1),
+                device="cpu",
+            )
 
 
 def test_adc_needs_to_be_known(network, tmp_path):
@@ -657,7 +694,13 @@ def test_adc_needs_to_be_known(network, tmp_path):
 
     def refused(**adc):
         with pytest.raises(CpunetError) as error:
-            translate_file(network, source, tmp_path / "o.lh5", adc=Adc(**adc), device="cpu")
+            translate_file(
+                network,
+                source,
+                tmp_path / "o.lh5",
+                TranslateOptions(adc=Adc(**adc)),
+                device="cpu",
+            )
         return str(error.value)
 
     assert "give --adc-per-kev" in refused()
@@ -736,7 +779,9 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path, options):
     listing = r"out.lh5: cannot be written \(File too large\); nothing was left$"
     for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
         with largest_file(size), pytest.raises(CpunetError, match=listing):
-            translate_file(run, InputFile(source), out, device="cpu", **options)
+            translate_file(
+                run, InputFile(source), out, TranslateOptions(**options), device="cpu"
+            )
         assert names(out.parent) == []
 
 

@@ -18,7 +18,7 @@ from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.studies.held_out import HeldOut
+from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
 from cpunet.jobs.studies.tuning_study import _is_gone, open_study, this_worker
 from cpunet.pulses.container import Pulses

@@ -11,7 +11,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import MIN_N, Moments
 
 RECIPE = load_recipe("fast")

@@ -11,7 +11,7 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
-from cpunet.networks.response import ElectronicsResponse, record_length
+from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes import load_recipe
 from cpunet.training.misfit import amplitude_shift

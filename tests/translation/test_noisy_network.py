@@ -21,6 +21,7 @@ from cpunet.training.cyclegan import CycleGan
 from cpunet.training.outside import Outside
 from cpunet.training.run_folder import write_run
 from cpunet.training.surroundings import Surroundings
+from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 
 RECIPE = load_recipe("paper-noise", ["generator.width=2", "generator.residual=true"])
@@ -87,7 +88,8 @@ def test_other_pulses_are_added_with_the_noise(run, sim):
     second = SecondPulses(
         len(sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
     )
-    result, _ = ren.apply_with_codes(sim, generator=ren.seeded(1), second=second, **energies)
+    drawn = Drawn(generator=ren.seeded(1), second=second, **energies)
+    result, _ = ren.apply_with_codes(sim, drawn)
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)

@@ -261,7 +261,7 @@ def require_configured_words(calls: list[list[str]]) -> None:
     assert train[train.index("--sim") + 1] == "sim/of a.lh5"
     assert train[train.index("--data") + 1] == "raw p03/V01.lh5"
     assert "--kev-per-adc=0.5" in words_of(calls, "train", "B02")
-    assert "--no-rivals" in words_of(calls, "validate", "B02")
+    assert "--no-baselines" in words_of(calls, "validate", "B02")
 
 
 def changed(path: str, value: object) -> dict[str, Any]:

@@ -128,7 +128,7 @@ rule validate:
     params:
         reading=reading,
         options=options(seed=config["train"]["seed"], device=config["device"]),
-        rivals="--rivals" if config["validate"]["rivals"] else "--no-rivals",
+        rivals="--baselines" if config["validate"]["rivals"] else "--no-baselines",
     shell:
         "cpunet validate {input.run:q} --sim {input.sim:q} --data {input.data:q}"
         " {params.reading} {params.options} {params.rivals} --out {output:q} --force"

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.response import describe_responses
+from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.outputs import refuse_inputs
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MAX_BYTES, parsed

@@ -26,6 +26,7 @@ Values = npt.NDArray[np.float64]
 PeakTable = dict[str, dict[str, float | None]]
 
 MIN_N = 20  # events of the DEP: two below a cut at 90 %
+DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 
 
@@ -144,9 +145,7 @@ def ae_survival(
 def survival_table(
     data: Mapping[str, Values],
     methods: Mapping[str, Mapping[str, Values]],
-    acceptance: float = 0.9,
     *,
-    dep: str = "DEP",
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
 ) -> dict[str, PeakTable]:
@@ -160,10 +159,6 @@ def survival_table(
         Measured A/E by peak.
     methods
         A/E by method and peak: ``{"raw": …, "ren": …}`` and any others.
-    acceptance
-        Fraction of the DEP that survives.
-    dep
-        Name of the peak that defines the cuts.
     bootstraps, seed
         Number and seed of the bootstraps for the errors of the cuts.
 
@@ -191,8 +186,8 @@ def survival_table(
     CpunetError
         If the data lack the DEP, or a method a peak of the data.
     """
-    if dep not in data:
-        raise CpunetError(f"the data lack peak {dep}; the A/E cut needs it")
+    if DEP not in data:
+        raise CpunetError(f"the data lack peak {DEP}; the A/E cut needs it")
     for method, peaks in methods.items():
         if absent := data.keys() - peaks.keys():
             raise CpunetError(f"{method}: peak {min(absent)} is missing; translate it too")
@@ -200,12 +195,10 @@ def survival_table(
     sets = {"data": data, **methods}
     found: dict[str, Survival | None] = {}
     for method, peaks in sets.items():
-        others = {name: peaks[name] for name in data if name != dep}
-        enough = np.isfinite(peaks[dep]).sum() >= MIN_N
+        others = {name: peaks[name] for name in data if name != DEP}
+        enough = np.isfinite(peaks[DEP]).sum() >= MIN_N
         found[method] = (
-            ae_survival(peaks[dep], others, acceptance, bootstraps=bootstraps, seed=rng)
-            if enough
-            else None
+            ae_survival(peaks[DEP], others, bootstraps=bootstraps, seed=rng) if enough else None
         )
     table: dict[str, PeakTable] = {}
     for name in data:
@@ -213,7 +206,7 @@ def survival_table(
         table[name] = {
             "events": {**finite},
             "missing": {m: len(peaks[name]) - finite[m] for m, peaks in sets.items()},
-            **(_cut_rows(found) if name == dep else _survival_rows(name, found)),
+            **(_cut_rows(found) if name == DEP else _survival_rows(name, found)),
         }
     return table
 

@@ -83,7 +83,6 @@ def two_dimensional(
     amplitude: Mapping[str, Values],
     drift_time: Mapping[str, Values],
     *,
-    max_bins: int = MAX_BINS,
     bootstraps: int = 100,
     seed: int | np.random.Generator = 0,
 ) -> dict[str, Any]:
@@ -96,8 +95,6 @@ def two_dimensional(
     ----------
     amplitude, drift_time
         A/E and drift times by method, see `ae_against_drift_time`.
-    max_bins
-        Maximum number of bins of an axis.
     bootstraps, seed
         Number and seed of the bootstraps for the ceiling and the errors.
 
@@ -126,7 +123,7 @@ def two_dimensional(
     known = {m: _finite_pairs(m, values, drift_time[m]) for m, values in amplitude.items()}
     smallest = min(known, key=lambda method: len(known[method][0]))
     n = len(known[smallest][0])
-    bins = min(max_bins, int(np.sqrt(n / EVENTS_PER_CELL)))
+    bins = min(MAX_BINS, int(np.sqrt(n / EVENTS_PER_CELL)))
     if bins < 2:
         return {
             "missing": f"{smallest} has {n} events "

@@ -20,15 +20,13 @@ MAX_BARS = 30  # bars are 1 % wide, or wider if there would be more
 Scores = dict[str, dict[str, dict[str, Any]]]
 
 
-def seed_distributions(metrics: Sequence[Mapping[str, Any]], method: str = "ren") -> Scores:
+def seed_distributions(metrics: Sequence[Mapping[str, Any]]) -> Scores:
     """IoU of each peak and parameter over trainings that differ in their seed.
 
     Parameters
     ----------
     metrics
         Content of the ``metrics.json`` of each training, validated on the same pulses.
-    method
-        Method whose scores are collected.
 
     Returns
     -------
@@ -56,22 +54,18 @@ def seed_distributions(metrics: Sequence[Mapping[str, Any]], method: str = "ren"
     result: Scores = {}
     for peak, parameter in places:
         of_runs = [_comparison(run, peak, parameter) for run in metrics]
-        result.setdefault(peak, {})[parameter] = _row(of_runs, method)
+        result.setdefault(peak, {})[parameter] = _row(of_runs)
     return result
 
 
 @styled
-def seed_figure(
-    distributions: Scores, method: str = "ren", marked: Mapping[str, Any] | None = None
-) -> Figure:
+def seed_figure(distributions: Scores, marked: Mapping[str, Any] | None = None) -> Figure:
     """Histograms of the IoU over seeds, one row per peak and one column per parameter.
 
     Parameters
     ----------
     distributions
         Result of `seed_distributions`.
-    method
-        Name of the method, for the axes.
     marked
         Metrics of one training to mark, such as the one in use.
     """
@@ -83,13 +77,13 @@ def seed_figure(
         for j, name in enumerate(names):
             row = distributions[peak].get(name)
             chosen = None if marked is None else _comparison(marked, peak, name)
-            score = None if chosen is None else chosen["iou"].get(method)
+            score = None if chosen is None else chosen["iou"].get("ren")
             _panel(grid[i, j], row, score)
             title = PARAMETERS[name].label if name in PARAMETERS else name
             grid[i, j].set_title(f"{peak}, {title}")
         grid[i, 0].set_ylabel("Trainings")
     for axes in grid[-1]:
-        axes.set_xlabel(f"IoU of {label(method)} [%]")
+        axes.set_xlabel(f"IoU of {label('ren')} [%]")
     _legend(figure, marked is not None)
     return figure
 
@@ -99,9 +93,9 @@ def _comparison(run: Mapping[str, Any], peak: str, parameter: str) -> Mapping[st
     return found if isinstance(found, Mapping) else None
 
 
-def _row(of_runs: Sequence[Mapping[str, Any] | None], method: str) -> dict[str, Any]:
+def _row(of_runs: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
     known = [run for run in of_runs if run is not None]
-    iou = _finite([run["iou"].get(method) for run in known])
+    iou = _finite([run["iou"].get("ren") for run in known])
     ceilings = _finite([run["iou"].get("ceiling") for run in known])
     spreads = _finite([run["iou_std"].get("ceiling") for run in known])
     some = len(iou) > 0

@@ -12,7 +12,7 @@ from cpunet.calibration.functions import SlicedFunctions
 from cpunet.calibration.nearby import Nearby
 from cpunet.calibration.nuisances import Physics, Values, priors
 from cpunet.errors import CpunetError
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe

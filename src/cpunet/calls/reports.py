@@ -21,8 +21,9 @@ from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.drawings import Drawing
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.figure_store import STORE, read_drawings
-from cpunet.jobs.validation.figures import Drawing
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
@@ -216,11 +217,9 @@ def validate(
         as_input(sim, "sim"),
         as_input(data, "data"),
         None if out is None else Path(out),
-        truth=None if truth is None else Path(truth),
-        rivals=rivals,
-        seed=seed,
-        ae_range_kev=ae_range_kev,
-        device=device,
+        ValidateOptions(
+            None if truth is None else Path(truth), rivals, seed, ae_range_kev, device=device
+        ),
         force=force,
         monitor=monitor,
     )

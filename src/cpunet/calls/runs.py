@@ -12,15 +12,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.analysis.figures import loss_curves
 from cpunet.analysis.response_figure import response_figure
+from cpunet.analysis.run_figures import loss_curves
 from cpunet.calls import html
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.response import chain_of, describe_responses
+from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, read_losses, read_recipe
@@ -240,12 +241,7 @@ def train(
         as_input(data, "data"),
         Path(out),
         as_recipe(recipe, settings),
-        peak=peak,
-        seed=seed,
-        device=device,
-        init=None if start is None else Path(start),
-        resume=resume,
-        force=force,
+        TrainOptions(peak, seed, device, None if start is None else Path(start), resume, force),
         monitor=monitor,
     )
     return Run(Path(out), info, tuple(monitor.notes))

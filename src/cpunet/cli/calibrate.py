@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, tell
-from cpunet.cli.simulate import EnergyUnit, FlipZ, HitTable, LengthUnit, Origin
-from cpunet.cli.values import parse_numbers
+from cpunet.cli.messages import monitor, show, tell
+from cpunet.cli.simulate import HitFrame
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -110,17 +109,15 @@ Events = Annotated[
 ]
 
 
+@options.grouped
 def calibrate(
+    *,
     data: options.Data,
     out_folder: Out = None,
     sim: SimFile = None,
     detector: DetectorFile = None,
     hits: HitFileName = None,
-    hits_detector: HitTable = None,
-    origin: Origin = None,
-    flip_z: FlipZ = False,
-    length_unit: LengthUnit = None,
-    energy_unit: EnergyUnit = None,
+    frame: HitFrame,
     cluster_mm: ClusterMm = 0.05,
     settings_file: SettingsFile = None,
     set_values: Set = None,
@@ -133,11 +130,7 @@ def calibrate(
     recipe: RecipeName = "fast",
     events: Events = 3000,
     seed: options.Seed = 0,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
+    read_as: options.DataAs,
     force: options.Force = False,
 ) -> None:
     """Calibrate the detector and its electronics together: temperature, impurities, readout.
@@ -152,10 +145,9 @@ def calibrate(
     from cpunet.jobs.calibration.calibrate import Calibration
     from cpunet.jobs.calibration.calibration_inputs import Freedom
     from cpunet.jobs.common.channels import ALL
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes import load_recipe
 
-    if data_table == ALL:
+    if read_as.data_table == ALL:
         raise CpunetError(
             f"--data-table {ALL}: each channel is a detector with physics of its own; calibrate"
             " one after another, with --data-table CHANNEL and the --sim or --detector of each"
@@ -165,10 +157,10 @@ def calibrate(
     if out_folder is not None:
         refuse_inputs(out_folder, recipe, detector, settings_file)
     start = _start(
-        sim, detector, hits, settings_file, set_values or [], crystal, hits_detector,
-        origin, flip_z, length_unit, energy_unit, cluster_mm, insist,
+        sim, detector, hits, settings_file, set_values or [], crystal, frame,
+        cluster_mm, read_as.insist,
     )  # fmt: skip
-    measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
+    measured = read_as.data(data)
     job = Calibration(
         start,
         measured,
@@ -180,12 +172,12 @@ def calibrate(
     )
     if plan:
         for line in plan_lines(job.plan(out_folder, force=force, monitor=monitor())):
-            out.print(line, markup=False, highlight=False, soft_wrap=True)
+            show(line)
         return
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())
     for line in result_lines(content):
-        tell(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_folder}: {line}", plain=True)
 
 
 def _start(
@@ -195,34 +187,22 @@ def _start(
     settings_file: Path | None,
     overrides: list[str],
     crystal: Path | None,
-    hits_detector: str | None,
-    origin: str | None,
-    flip_z: bool,
-    length_unit: str | None,
-    energy_unit: str | None,
+    frame: HitFrame,
     cluster_mm: float,
     insist: bool,
 ) -> Start:
     from cpunet.jobs.calibration.calibration_inputs import Start
     from cpunet.jobs.common.inputs import InputFile
-    from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.simulation.geometry_readers import read_detector
-    from cpunet.simulation.hit_readers import Transform
 
     of_detector, of_settings = split_overrides(overrides)
     if of_detector and detector is None:
         raise CpunetError(f"--set {of_detector[0]}: give the --detector that it is of")
-    source = None
-    if hits is not None:
-        x, y, z = parse_numbers("0,0,0" if origin is None else origin, 3, "--origin")
-        source = HitFile(
-            hits, hits_detector, Transform((x, y, z), flip_z), length_unit, energy_unit
-        )
     given = settings_file is not None or of_settings
     return Start(
         None if sim is None else InputFile(sim, insist=insist),
-        source,
+        None if hits is None else frame.file(hits),
         None if detector is None else read_detector(detector, of_detector, crystal),
         load_settings(settings_file, of_settings) if given else None,
         cluster_mm,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table, tell, tell_table
+from cpunet.cli.messages import print_table, show, tell, tell_table
 
 if TYPE_CHECKING:
     from cpunet.analysis.side_by_side import SideBySide
@@ -40,11 +41,11 @@ def compare(
     compared = compare_reports(reports, method=method, out=out_file, force=force)
     table = comparison_table(compared)
     print_table(table) if out_file is None else tell_table(table)
-    say = out.print if out_file is None else tell
+    say = show if out_file is None else partial(tell, plain=True)
     for note in compared.notes:
-        say(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        say(f"note: {note}")
     if out_file is not None:
-        tell(str(out_file), markup=False, highlight=False, soft_wrap=True)
+        tell(str(out_file), plain=True)
 
 
 def comparison_table(compared: SideBySide) -> Table:

@@ -10,7 +10,7 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
-from cpunet.cli.stand import DetectorFile, Events, Kind, KindOption, wanted_events
+from cpunet.cli.stand import Events, Kind, KindOption, wanted_events
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
@@ -29,7 +29,7 @@ Set = Annotated[
 def demo(
     out_folder: Out = Path("demo"),
     preset: Preset = "legend200",
-    detector: DetectorFile = "icpc",
+    detector: options.DetectorFile = "icpc",
     events: Events = "FEP=2500,SEP=1000,DEP=1000",
     kind: KindOption = Kind.matched,
     recipe: RecipeName = "fast",
@@ -66,4 +66,4 @@ def demo(
         monitor=monitor(),
     )
     print_scores(metrics, leave_out=("FEP",))
-    tell(f"{out_folder / 'report' / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report' / 'report.html'}")

@@ -13,7 +13,6 @@ from cpunet.cli import options
 from cpunet.cli.environment import MAX_THREADS
 from cpunet.cli.messages import err, monitor, tell, tell_table
 from cpunet.cli.scores import PARAMETERS
-from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the run folders to make.")]
@@ -38,21 +37,15 @@ Resume = Annotated[
 ]
 
 
+@options.grouped
 def ensemble(
+    *,
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
     seeds: Seeds = 20,
-    recipe: RecipeName = "fast",
-    peak: Peak = "FEP",
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
-    set_values: Set = None,
+    on: options.TrainOn,
+    read_as: options.ReadAs,
     jobs: Jobs = None,
     threads: Threads = None,
     validate: Validate = True,
@@ -65,19 +58,17 @@ def ensemble(
 
     Example: cpunet ensemble --sim sim.lh5 --data raw.lh5 --seeds 20 --out ens
     """
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.studies.ensemble import FIGURE, train_ensemble
-    from cpunet.recipes import load_recipe
 
-    refuse_inputs(out_folder, recipe)
+    refuse_inputs(out_folder, on.recipe)
     try:
         told = train_ensemble(
-            InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-            InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
+            read_as.sim(sim),
+            read_as.data(data),
             out_folder,
-            load_recipe(recipe, set_values or ()),
+            on.load(),
             seeds=seeds,
-            peak=peak,
+            peak=on.peak,
             jobs=jobs,
             threads=threads,
             validate=validate,
@@ -93,9 +84,9 @@ def ensemble(
     if told["table"]:
         tell_table(_table(told))
     for line in _summary(told):
-        tell(line, markup=False, highlight=False, soft_wrap=True)
+        tell(line, plain=True)
     if told["table"]:
-        tell(str(out_folder / FIGURE), soft_wrap=True)
+        tell(str(out_folder / FIGURE))
 
 
 def _table(told: dict[str, Any]) -> Table:

@@ -14,17 +14,6 @@ from cpunet.outputs import refuse_inputs
 Runs = Annotated[
     list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
 ]
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
-]
 Out = Annotated[Path, typer.Option("--out", help="HTML file to write.")]
 Data = Annotated[
     Path | None, typer.Option("--data", help="File of measured pulses to find the nearest in.")
@@ -35,20 +24,18 @@ SettingsFile = Annotated[
 ]
 
 
+@options.grouped
 def explore(
+    *,
     runs: Runs,
-    detector: DetectorFile,
+    detector: options.DetectorFile,
     out_file: Out,
     data: Data = None,
     points: Points = 400,
-    set_values: Set = None,
+    set_values: options.Set = None,
     crystal: options.Crystal = None,
     settings_file: SettingsFile = None,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
+    read_as: options.DataAs,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
@@ -56,7 +43,6 @@ def explore(
 
     Example: cpunet explore run --detector icpc --data raw.lh5 --out explorer.html
     """
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.inspection.explore import explore_runs
     from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
@@ -64,7 +50,7 @@ def explore(
     refuse_inputs(out_file, detector, settings_file)
     measured = None
     if data is not None:
-        measured = InputFile(data, data_table, data_energy, kev_per_adc, dt, insist)
+        measured = read_as.data(data)
     told = explore_runs(
         runs,
         read_detector(detector, set_values or (), crystal),
@@ -82,7 +68,5 @@ def explore(
         + (f" (none: {left_out})" if left_out else "")
         + (f", {told['drawn']} measured ones beside them" if "drawn" in told else "")
         + f"; {told['bytes'] / 1e6:.1f} MB",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
+        plain=True,
     )

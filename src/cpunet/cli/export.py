@@ -89,10 +89,7 @@ def export(
         monitor=monitor(),
     )
     files = [done.graph, done.card] + ([done.noise] if done.noise else [])
-    tell(
-        f"{', '.join(map(str, files))}: within {done.difference:.1e} of the run",
-        soft_wrap=True,
-    )
+    tell(f"{', '.join(map(str, files))}: within {done.difference:.1e} of the run")
 
 
 def _legend_pars(
@@ -120,8 +117,7 @@ def _legend_pars(
     tell(
         f"{out}: {name}: sigma {two['sigma_ns']:.1f} ns, tau {two['tau_ns']:.1f} ns; the "
         f"current is up to {two['current_error_percent']:.1f} % of its height off, A/E "
-        f"± {two['ae_error_percent']:.1f} % between currents of 1 and 300 ns",
-        soft_wrap=True,
+        f"± {two['ae_error_percent']:.1f} % between currents of 1 and 300 ns"
     )
     if found := two.get("of_library"):
         alone, pairs = found["single_site"], found["two_sites"]
@@ -129,15 +125,13 @@ def _legend_pars(
             f"on {found['templates']} places of {found['library']}, A/E is off by "
             f"{alone['rms_percent']:.2g} % RMS, {alone['largest_percent']:.2g} % at most; "
             f"on pairs of them by {pairs['rms_percent']:.2g} and "
-            f"{pairs['largest_percent']:.2g} %",
-            soft_wrap=True,
+            f"{pairs['largest_percent']:.2g} %"
         )
     for method, one in whole["ae_against_energy"].items():
         line = one["mean"]
         tell(
             f"A/E against energy, {method}: {line['per_mev_percent']:+.3f} ± "
-            f"{line['per_mev_error_percent']:.3f} % per MeV",
-            soft_wrap=True,
+            f"{line['per_mev_error_percent']:.3f} % per MeV"
         )
     if not whole["ae_against_energy"]:
-        tell("A/E against energy: none, since no report was given (--report)", soft_wrap=True)
+        tell("A/E against energy: none, since no report was given (--report)")

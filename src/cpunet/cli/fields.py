@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, tell
+from cpunet.cli.messages import monitor, show, tell
 from cpunet.outputs import refuse_inputs
 
 DetectorFile = Annotated[
@@ -53,6 +54,6 @@ def fields(
         monitor=monitor(),
     )
     width = max(map(len, told))
-    say = out.print if out_file is None else tell
+    say = show if out_file is None else partial(tell, plain=True)
     for name, value in told.items():
-        say(f"{name:<{width}}  {value}", markup=False, highlight=False, soft_wrap=True)
+        say(f"{name:<{width}}  {value}")

@@ -30,23 +30,18 @@ Out = Annotated[Path, typer.Option("--out", help="Folder for the files.")]
 Suffix = Annotated[str, typer.Option("--format", help="png, pdf or svg.")]
 
 
+@options.grouped
 def figure(
+    *,
     folder: Folder,
     names: Names,
     sim: Sim = None,
     data: Data = None,
     out_folder: Out = Path(),
     suffix: Suffix = "png",
-    truth: options.Truth = None,
-    rivals: options.Rivals = True,
+    scored: options.ScoredWith,
     seed: options.Seed = 0,
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
+    read_as: options.ReadAs,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
@@ -56,24 +51,19 @@ def figure(
 
     Example: cpunet figure run "single pulse" --sim sim.lh5 --data raw.lh5 --out figures
     """
-    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.validation.evaluation import ValidateOptions
     from cpunet.jobs.validation.figure_files import draw_figures
 
     files = draw_figures(
         folder,
         names,
-        None if sim is None else InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-        None
-        if data is None
-        else InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
+        None if sim is None else read_as.sim(sim),
+        None if data is None else read_as.data(data),
         out_folder,
         suffix=f".{suffix.removeprefix('.')}",
-        truth=truth,
-        rivals=rivals,
-        seed=seed,
-        device=device,
+        how=ValidateOptions(scored.truth, scored.fitted, seed, device=device),
         force=force,
         monitor=monitor(),
     )
     for file in files:
-        tell(str(file), soft_wrap=True)
+        tell(str(file))

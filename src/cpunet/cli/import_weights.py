@@ -60,7 +60,7 @@ def weights(
         force=force,
         monitor=monitor(),
     )
-    tell(f"{out_folder}: a run of {', '.join(info['imported'])}", soft_wrap=True)
+    tell(f"{out_folder}: a run of {', '.join(info['imported'])}")
 
 
 @import_.command()
@@ -82,7 +82,7 @@ def pulses(
         source, out_file, dt_ns=dt, table=table, units=units, force=force, monitor=monitor()
     )
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
-    tell(f"{out_file}: {told['written']} of {told['read']} pulses{rejected}", soft_wrap=True)
+    tell(f"{out_file}: {told['written']} of {told['read']} pulses{rejected}")
     if told["truncated"]:
         err.print(
             f"{source}: ends within a pulse or is damaged there; what was before it is written",

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table, tell, warn
+from cpunet.cli.messages import out, print_table, show, tell, warn
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
 
@@ -97,7 +97,7 @@ def info(
     else:
         _print(in_words(told))
     if page is not None:
-        tell(f"{page}", soft_wrap=True)
+        tell(f"{page}")
     failed = [n for n, one in told.get("channels", {}).items() if isinstance(one, str)]
     if failed:
         raise CpunetError(
@@ -109,7 +109,7 @@ def info(
 def _print(lines: Lines) -> None:
     width = max(len(name) for name, _ in lines)
     for name, text in lines:
-        out.print(f"{name:<{width}}  {text}", markup=False, highlight=False, soft_wrap=True)
+        show(f"{name:<{width}}  {text}")
 
 
 def _tables(told: Mapping[str, Any]) -> Table:

@@ -21,17 +21,6 @@ library = typer.Typer(
     no_args_is_help=True,
 )
 
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
-]
 Out = Annotated[Path, typer.Option("--out", help="LH5 file to write.")]
 Source = Annotated[Path, typer.Argument(help="LH5 file of a library.", metavar="FILE")]
 Sources = Annotated[
@@ -133,14 +122,14 @@ SettingsFile = Annotated[
 
 @library.command()
 def make(
-    detector: DetectorFile,
+    detector: options.DetectorFile,
     out_file: Out,
     grid_mm: Grid = 1.0,
     angles: Angles = "0,45",
     dt: Dt = None,
     length_ns: Length = None,
     settings: SettingsFile = None,
-    set_values: Set = None,
+    set_values: options.Set = None,
     crystal: options.Crystal = None,
     force: options.Force = False,
 ) -> None:
@@ -169,8 +158,7 @@ def make(
     )
     tell(
         f"{out_file}: {counts['written']} of {counts['templates']} places have a template; "
-        f"{counts['outside']} give no signal, {counts['late']} are not collected in time",
-        soft_wrap=True,
+        f"{counts['outside']} give no signal, {counts['late']} are not collected in time"
     )
 
 
@@ -216,14 +204,12 @@ def translate(
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
     tell(
         f"{out_file}: {told['translated']} of {told['templates']} templates translated; "
-        f"{told['outside']} outside{rejected}",
-        soft_wrap=True,
+        f"{told['outside']} outside{rejected}"
     )
     apart = told["linearity"]
     tell(
         f"sums of {apart['events']} events: sample by sample within {apart['largest']:.1e} of "
-        f"the highest, current amplitude within {apart['current_amplitude']:.1e} of itself",
-        soft_wrap=True,
+        f"the highest, current amplitude within {apart['current_amplitude']:.1e} of itself"
     )
 
 
@@ -236,7 +222,7 @@ def merge(sources: Sources, out_file: Out, force: options.Force = False) -> None
     from cpunet.jobs.translation.simflow_files import merge_libraries
 
     names = merge_libraries(sources, out_file, force=force)
-    tell(f"{out_file}: {len(names)} libraries: {', '.join(names)}", soft_wrap=True)
+    tell(f"{out_file}: {len(names)} libraries: {', '.join(names)}")
 
 
 @library.command()
@@ -248,7 +234,7 @@ def expand(source: Source, out_file: Out, force: options.Force = False) -> None:
     from cpunet.jobs.translation.simflow_files import expand_library
 
     names = expand_library(source, out_file, force=force)
-    tell(f"{out_file}: whole templates of {', '.join(names)}", soft_wrap=True)
+    tell(f"{out_file}: whole templates of {', '.join(names)}")
 
 
 @library.command()
@@ -271,8 +257,7 @@ def lithium(
     told = write_lithium_library(layer, out_file, force=force)
     tell(
         f"{out_file}: half of the charge from {told['dead_mm']:.2f} mm arrives, half of that "
-        f"within {told['half_ns']:.0f} ns",
-        soft_wrap=True,
+        f"within {told['half_ns']:.0f} ns"
     )
 
 
@@ -302,14 +287,12 @@ def _for_simflow(
         tell(
             f"{out_file}: {name}: {one['translated']} of {one['templates']} templates "
             f"translated, {one['padded']} added about the crystal{healed}; "
-            f"A/E is most often {one['mode_per_ns']:.4g}/ns",
-            soft_wrap=True,
+            f"A/E is most often {one['mode_per_ns']:.4g}/ns"
         )
         if loss := one.get("loss"):
             tell(
                 f"{one['rank']} components: samples within {loss['largest']:.1e} of the "
                 f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
                 f"{loss['a_over_e_percent']:.2g} % (RMS "
-                f"{loss['a_over_e_rms_percent']:.2g} %)",
-                soft_wrap=True,
+                f"{loss['a_over_e_rms_percent']:.2g} %)"
             )

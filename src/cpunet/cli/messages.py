@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from rich.progress import (
     BarColumn,
@@ -27,10 +26,18 @@ err = Notes(stderr=True)
 LOG_EVERY_S = 30.0  # between lines of progress in a log file
 
 
-def tell(*objects: Any, **options: Any) -> None:
-    """Print a line about an output that is in place: if it cannot be, that is a warning."""
+def show(text: str) -> None:
+    """Print a line as it is: brackets in it are no markup, and numbers have no colour."""
+    out.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def tell(text: str, *, plain: bool = False) -> None:
+    """Print a line about an output that is in place: if it cannot be, that is a warning.
+
+    With `plain`, brackets in it are no markup and numbers have no colour.
+    """
     try:
-        out.print(*objects, **options)
+        out.print(text, soft_wrap=True, markup=not plain, highlight=not plain)
     except OutputError as error:
         warn(f"{error}; the output is whole")
         out.quiet = True  # once is enough

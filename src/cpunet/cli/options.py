@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from cpunet.cli.environment import MAX_THREADS
+
+if TYPE_CHECKING:
+    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.recipes.schema import Recipe
 
 # Far beyond what anyone needs, and what a job can hold or live to see.
 MAX_SAMPLES = 1 << 20
@@ -41,6 +48,42 @@ class Impurities(StrEnum):
 
     file = "file"
     depletion = "depletion"
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command take options together: a parameter of a dataclass stands for its fields.
+
+    Typer sees the fields as options of the command, in the place of that parameter.
+    """
+    groups: dict[str, Any] = {}
+    parameters = []
+    hints = get_type_hints(command, include_extras=True)
+    for given in inspect.signature(command).parameters.values():
+        kind = hints[given.name]
+        if not is_dataclass(kind):
+            parameters.append(given.replace(annotation=kind))
+            continue
+        groups[given.name] = kind
+        of_fields = get_type_hints(kind, include_extras=True)
+        parameters += [
+            inspect.Parameter(
+                field.name,
+                given.KEYWORD_ONLY,
+                default=field.default,
+                annotation=of_fields[field.name],
+            )
+            for field in fields(kind)
+        ]
+
+    @wraps(command)
+    def expanded(**values: Any) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{f.name: values.pop(f.name) for f in fields(kind)})
+        command(**values)
+
+    vars(expanded)["__signature__"] = inspect.Signature(parameters)
+    expanded.__annotations__ = {given.name: given.annotation for given in parameters}
+    return expanded
 
 
 Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
@@ -98,8 +141,12 @@ Insist = Annotated[
 Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]
-Rivals = Annotated[
-    bool, typer.Option("--rivals/--no-rivals", help="Fit the baseline methods too, or not.")
+Baselines = Annotated[
+    bool,
+    typer.Option("--baselines/--no-baselines", help="Fit the baseline methods too, or not."),
+]
+OldBaselines = Annotated[  # the old spelling, until 0.2
+    bool | None, typer.Option("--rivals/--no-rivals", hidden=True)
 ]
 Crystal = Annotated[
     Path | None,
@@ -115,3 +162,101 @@ ImpurityFrom = Annotated[
         help="depletion: scale them so that the detector depletes at measured_depletion_V.",
     ),
 ]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+]
+DetectorFile = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
+    ),
+]
+Peak = Annotated[
+    str, typer.Option(help="Energies to train on: FEP, SEP, DEP or a range in keV, as 300-.")
+]
+RecipeName = Annotated[
+    str,
+    typer.Option("--recipe", help="fast, best, small, paper, paper-noise, or a YAML file."),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a value: --set training.batch_size=64 (repeatable)."),
+]
+
+
+@dataclass(frozen=True)
+class DataAs:
+    """How a file of measured pulses is read."""
+
+    data_table: DataTable = None
+    data_energy: DataEnergy = None
+    kev_per_adc: KevPerAdc = None
+    dt: Dt = None
+    insist: Insist = False
+
+    def data(self, path: Path) -> InputFile:
+        """The measured file."""
+        from cpunet.jobs.common.inputs import InputFile
+
+        return InputFile(
+            path, self.data_table, self.data_energy, self.kev_per_adc, self.dt, self.insist
+        )
+
+
+@dataclass(frozen=True)
+class SimAs:
+    """Where simulated pulses and their energies are in their file."""
+
+    sim_table: SimTable = None
+    sim_energy: SimEnergy = None
+
+
+@dataclass(frozen=True)
+class ReadAs(DataAs, SimAs):
+    """How the files of both sides are read."""
+
+    def sim(self, path: Path) -> InputFile:
+        """The simulated file."""
+        from cpunet.jobs.common.inputs import InputFile
+
+        return InputFile(
+            path, self.sim_table, self.sim_energy, dt_ns=self.dt, insist=self.insist
+        )
+
+
+@dataclass(frozen=True)
+class ReadAsOrAll(ReadAs):
+    """The same, where all channels may be asked for."""
+
+    data_table: OneTableOrAll = None
+
+
+@dataclass(frozen=True)
+class ScoredWith:
+    """What a validation compares with."""
+
+    truth: Truth = None
+    baselines: Baselines = True
+    rivals: OldBaselines = None
+
+    @property
+    def fitted(self) -> bool:
+        """Whether baseline methods are fitted, by either spelling."""
+        return self.baselines if self.rivals is None else self.rivals
+
+
+@dataclass(frozen=True)
+class TrainOn:
+    """The recipe of a training, and its energies."""
+
+    recipe: RecipeName = "fast"
+    peak: Peak = "FEP"
+    set_values: Overrides = None
+
+    def load(self) -> Recipe:
+        """The recipe, with its values overridden."""
+        from cpunet.recipes import load_recipe
+
+        return load_recipe(self.recipe, self.set_values or ())

@@ -62,7 +62,7 @@ def response(
     Example: cpunet response run1 run2 --stand stand --out response
     """
     from cpunet.electronics.presets import read_electronics
-    from cpunet.jobs.inspection.response import describe_responses, stand_electronics
+    from cpunet.jobs.inspection.chain_description import describe_responses, stand_electronics
 
     if stand is not None and electronics is not None:
         raise CpunetError("--stand and --electronics both name the truth; give one of them")
@@ -78,7 +78,7 @@ def response(
         print_table(response_table(told))
     else:
         tell_table(response_table(told))
-        tell(f"{out_folder / 'response.png'}", soft_wrap=True)
+        tell(f"{out_folder / 'response.png'}")
 
 
 def response_table(told: dict[str, Any]) -> Table:

@@ -33,7 +33,7 @@ def print_scores(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> None
     for peak, scores in metrics["peaks"].items():
         if "missing" in scores and peak not in leave_out:
             line = f"{peak}: not scored, {scores['missing']}"
-            tell(line, markup=False, highlight=False, soft_wrap=True)
+            tell(line, plain=True)
 
 
 def score_table(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> Table:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,19 +16,12 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
-    from cpunet.jobs.simulation.hit_sources import HitSource
+    from cpunet.jobs.simulation.hit_sources import HitFile, HitSource, Window
     from cpunet.jobs.simulation.simulation_summary import Summary
 
 HITS, GAMMAS = "Hits from a file", "Hits from the built-in gamma Monte Carlo"
 PULSES, OUTPUT = "Pulses", "Output"
 
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
 Set = Annotated[
     list[str] | None,
     typer.Option(
@@ -183,8 +178,31 @@ SelfRepulsion = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class HitFrame:
+    """How a file of hits is read."""
+
+    hits_detector: HitTable = None
+    origin: Origin = None
+    flip_z: FlipZ = False
+    length_unit: LengthUnit = None
+    energy_unit: EnergyUnit = None
+
+    def file(self, hits: Path, windows: Sequence[Window] = ()) -> HitFile:
+        """The file, of which only events in `windows` are wanted if there are any."""
+        from cpunet.jobs.simulation.hit_sources import HitFile
+        from cpunet.simulation.hit_readers import Transform
+
+        x, y, z = parse_numbers("0,0,0" if self.origin is None else self.origin, 3, "--origin")
+        transform = Transform((x, y, z), self.flip_z)
+        units = self.length_unit, self.energy_unit
+        return HitFile(hits, self.hits_detector, transform, *units, tuple(windows))
+
+
+@options.grouped
 def simulate(
-    detector: DetectorFile,
+    *,
+    detector: options.DetectorFile,
     out_file: Out,
     hits: HitFileName = None,
     events: Events = None,
@@ -194,11 +212,7 @@ def simulate(
     crystal: options.Crystal = None,
     impurity_from: options.ImpurityFrom = options.Impurities.file,
     temperature: Temperature = None,
-    hits_detector: HitTable = None,
-    origin: Origin = None,
-    flip_z: FlipZ = False,
-    length_unit: LengthUnit = None,
-    energy_unit: EnergyUnit = None,
+    frame: HitFrame,
     source_height_mm: SourceHeight = 20.0,
     source_radius_mm: SourceRadius = 5.0,
     settings_file: SettingsFile = None,
@@ -220,12 +234,11 @@ def simulate(
 
     Example: cpunet simulate --detector V01.yaml --hits stp.lh5 --flip-z --out sim.lh5
     """
-    from cpunet.jobs.simulation.hit_sources import GammaSource, HitFile, energy_windows
+    from cpunet.jobs.simulation.hit_sources import GammaSource, energy_windows
     from cpunet.jobs.simulation.simulate import simulate_file
     from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
-    from cpunet.simulation.hit_readers import Transform
 
     if (hits is None) == (events is None):
         raise CpunetError(
@@ -237,11 +250,7 @@ def simulate(
     source: HitSource
     if hits is not None:
         chosen = energy_windows(peak, peaks, window_kev) if peak else []
-        x, y, z = parse_numbers("0,0,0" if origin is None else origin, 3, "--origin")
-        transform = Transform((x, y, z), flip_z)
-        source = HitFile(
-            hits, hits_detector, transform, length_unit, energy_unit, tuple(chosen)
-        )
+        source = frame.file(hits, chosen)
     else:
         chosen, wanted = parse_events(str(events), peak, peaks, window_kev)
         source = GammaSource(tuple(chosen), wanted, source_height_mm, source_radius_mm, seed)
@@ -272,7 +281,7 @@ def simulate(
         monitor=monitor(),
     )
     for line in summary_lines(summary):
-        tell(f"{out_file}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_file}: {line}", plain=True)
 
 
 def summary_lines(summary: Summary) -> list[str]:

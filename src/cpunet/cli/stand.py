@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from cpunet.jobs.simulation.stand import StandSummary
 
 
+Part = TypeVar("Part")
+
+
 class Kind(StrEnum):
     """Whether the data's detector is the simulated one."""
 
@@ -30,13 +34,6 @@ Preset = Annotated[
     str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder to make.")]
-DetectorFile = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        help="icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.",
-    ),
-]
 Events = Annotated[
     str, typer.Option(help="Events of each peak or range (keV), for sim and data each.")
 ]
@@ -92,7 +89,7 @@ WindowKev = Annotated[
 def stand(
     preset: Preset,
     out_folder: Out,
-    detector: DetectorFile = "icpc",
+    detector: options.DetectorFile = "icpc",
     events: Events = "FEP=4000,SEP=1500,DEP=1500",
     kind: KindOption = Kind.matched,
     shift: ShiftParts = None,
@@ -143,7 +140,7 @@ def stand(
         monitor=monitor(),
     )
     for line in _lines(summary):
-        tell(f"{out_folder}: {line}", markup=False, highlight=False, soft_wrap=True)
+        tell(f"{out_folder}: {line}", plain=True)
 
 
 def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
@@ -162,26 +159,26 @@ def wanted_hum(hum: str | None) -> Hum | None:
     """The wave of ``"50=2"``: 2 keV at 50 Hz."""
     from cpunet.electronics.chain import Hum
 
-    if hum is None:
-        return None
-    try:
-        frequency, amplitude = map(float, hum.split("="))
-        return Hum(frequency_Hz=frequency, amplitude_kev=amplitude)
-    except ValueError as error:
-        raise CpunetError(f"--hum {hum}: expected HZ=KEV, such as 50=2") from error
+    return _pair(hum, Hum, ("frequency_Hz", "amplitude_kev"), "--hum", "HZ=KEV, such as 50=2")
 
 
 def wanted_wander(wander: str | None) -> Wander | None:
     """The wandering of ``"500=3"``: 3 keV RMS, correlated over 500 us."""
     from cpunet.electronics.chain import Wander
 
-    if wander is None:
+    form = "US=KEV, such as 500=3"
+    return _pair(wander, Wander, ("time_us", "rms_kev"), "--wander", form)
+
+
+def _pair(
+    text: str | None, kind: Callable[..., Part], names: tuple[str, str], option: str, form: str
+) -> Part | None:
+    if text is None:
         return None
     try:
-        time, rms = map(float, wander.split("="))
-        return Wander(time_us=time, rms_kev=rms)
+        return kind(**dict(zip(names, map(float, text.split("=")), strict=True)))
     except ValueError as error:
-        raise CpunetError(f"--wander {wander}: expected US=KEV, such as 500=3") from error
+        raise CpunetError(f"{option} {text}: expected {form}") from error
 
 
 def _lines(summary: StandSummary) -> list[str]:

@@ -22,17 +22,6 @@ if TYPE_CHECKING:  # torch takes seconds to import
     from cpunet.training.process_group import Launch
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
-RecipeName = Annotated[
-    str,
-    typer.Option("--recipe", help="fast, best, small, paper, paper-noise, or a YAML file."),
-]
-Peak = Annotated[
-    str, typer.Option(help="Energies to train on: FEP, SEP, DEP or a range in keV, as 300-.")
-]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a value: --set training.batch_size=64 (repeatable)."),
-]
 Resume = Annotated[
     bool,
     typer.Option("--resume", help="Resume OUT.unfinished; give all other options as before."),
@@ -46,21 +35,15 @@ Init = Annotated[
 Board = Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs too.")]
 
 
+@options.grouped
 def train(
+    *,
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
-    recipe: RecipeName = "fast",
-    peak: Peak = "FEP",
+    on: options.TrainOn,
     seed: options.Seed = 0,
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.OneTableOrAll = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
-    set_values: Set = None,
+    read_as: options.ReadAsOrAll,
     threads: options.Threads = None,
     device: options.Device = "auto",
     tensorboard: Board = False,
@@ -81,42 +64,35 @@ def train(
     import torch
 
     from cpunet.jobs.common.channels import ALL, Outcome
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.training.train import train_run
     from cpunet.jobs.training.train_channels import train_channels
-    from cpunet.recipes import load_recipe
+    from cpunet.jobs.training.training_job import TrainOptions
     from cpunet.training.loop import StoppedError
     from cpunet.training.process_group import ToldElsewhereError, launch
 
-    refuse_inputs(out_folder, recipe)
+    refuse_inputs(out_folder, on.recipe)
     if threads is not None:
         torch.set_num_threads(threads)
     shown = monitor()
     launched = launch()
     try:
-        chosen = load_recipe(recipe, set_values or ())
+        chosen = on.load()
     except CpunetError:
         if _follows(launched):  # the process that leads says the same
             raise typer.Exit(2) from None
         raise
-    every = data_table == ALL
+    every = read_as.data_table == ALL
     if every and launched is not None:
         raise CpunetError(f"--data-table {ALL}: trains channel by channel; leave out torchrun")
     work = train_channels if every else train_run
     with _StopRequest(shown, launched) as stop:
         try:
             told = work(
-                InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-                InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
+                read_as.sim(sim),
+                read_as.data(data),
                 out_folder,
                 chosen,
-                peak=peak,
-                seed=seed,
-                device=device,
-                init=init,
-                resume=resume,
-                force=force,
-                tensorboard=tensorboard,
+                TrainOptions(on.peak, seed, device, init, resume, force, tensorboard),
                 stop=stop,
                 monitor=shown,
             )
@@ -131,7 +107,7 @@ def train(
     if isinstance(told, Outcome):
         tell_channels(told, out_folder, _in_words)
     else:
-        tell(f"{out_folder}: {_in_words(told)}", soft_wrap=True)
+        tell(f"{out_folder}: {_in_words(told)}")
     words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]
     report = out_folder.with_name(f"{out_folder.name}-report")
     of_all = ["--data-table", ALL] if every else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -118,7 +119,34 @@ NPre = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class AdcOptions:
+    """Traces in ADC counts."""
+
+    output: Annotated[Output, typer.Option(help="Form of the output.")] = Output.NORMALISED
+    adc_per_kev: AdcPerKev = None
+    baseline: Baseline = None
+    length: Length = None
+    n_pre: NPre = None
+
+    def adc(self) -> Adc | None:
+        """What is asked for, if traces are."""
+        from cpunet.jobs.translation.translate_options import Adc
+
+        adc = Adc(self.adc_per_kev, self.baseline, self.length, self.n_pre)
+        if self.output == Output.ADC:
+            return adc
+        if adc != Adc():
+            raise CpunetError(
+                "--adc-per-kev, --baseline, --length and --n-pre belong to traces in ADC "
+                "counts; add --output adc"
+            )
+        return None
+
+
+@options.grouped
 def translate(
+    *,
     run: options.Run,
     sources: Sources,
     out_name: Out,
@@ -135,11 +163,7 @@ def translate(
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
     insist: options.Insist = False,
-    output: Annotated[Output, typer.Option(help="Form of the output.")] = Output.NORMALISED,
-    adc_per_kev: AdcPerKev = None,
-    baseline: Baseline = None,
-    length: Length = None,
-    n_pre: NPre = None,
+    adc_options: AdcOptions,
     jobs: Jobs = 1,
     resume: Resume = False,
     device: options.Device = "auto",
@@ -160,94 +184,25 @@ def translate(
     from cpunet.jobs.translation.translate_files import expanded, translate_files
     from cpunet.jobs.translation.translate_options import TranslateOptions
 
-    adc = _adc(output, adc_per_kev, baseline, length, n_pre)
+    adc = adc_options.adc()
     files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
     place = Path(out_name)
+    form = TranslateOptions(
+        inverse, noise, seed, out_table, append_column, realisations, adc, remains, pile_up_khz
+    )
+    how: dict[str, Any] = {"device": device, "resume": resume, "force": force}
+    how["monitor"] = monitor()
     if table == ALL:
         if len(files) > 1:
             raise CpunetError(f"--table {ALL} belongs to one file, not to {len(files)}")
-        outcome = translate_channels(
-            run,
-            files[0],
-            place,
-            inverse=inverse,
-            noise=noise,
-            seed=seed,
-            table=out_table,
-            append_column=append_column,
-            realisations=realisations,
-            adc=adc,
-            remains=remains,
-            device=device,
-            resume=resume,
-            force=force,
-            monitor=monitor(),
-        )
+        outcome = translate_channels(run, files[0], place, form, **how)
         tell_channels(outcome, place, lambda told: _in_words(told, adc))
         return
     if len(files) > 1 or out_name.endswith("/") or place.is_dir():
-        form = TranslateOptions(
-            inverse,
-            noise,
-            seed,
-            out_table,
-            append_column,
-            realisations,
-            adc,
-            remains,
-            pile_up_khz,
-        )
-        told = translate_files(
-            run,
-            files,
-            place,
-            form,
-            jobs=jobs,
-            device=device,
-            resume=resume,
-            force=force,
-            monitor=monitor(),
-        )
+        told = translate_files(run, files, place, form, jobs=jobs, **how)
     else:
-        told = translate_file(
-            run,
-            files[0],
-            place,
-            inverse=inverse,
-            noise=noise,
-            seed=seed,
-            table=out_table,
-            append_column=append_column,
-            realisations=realisations,
-            adc=adc,
-            remains=remains,
-            pile_up_khz=pile_up_khz,
-            device=device,
-            resume=resume,
-            force=force,
-            monitor=monitor(),
-        )
-    tell(f"{place}: {_in_words(told, adc)}", soft_wrap=True)
-
-
-def _adc(
-    output: Output,
-    adc_per_kev: float | None,
-    baseline: float | None,
-    length: int | None,
-    n_pre: int | None,
-) -> Adc | None:
-    from cpunet.jobs.translation.translate_options import Adc
-
-    adc = Adc(adc_per_kev, baseline, length, n_pre)
-    if output == Output.ADC:
-        return adc
-    if adc != Adc():
-        raise CpunetError(
-            "--adc-per-kev, --baseline, --length and --n-pre belong to traces in ADC counts; "
-            "add --output adc"
-        )
-    return None
+        told = translate_file(run, files[0], place, form, **how)
+    tell(f"{place}: {_in_words(told, adc)}")
 
 
 def _in_words(told: dict[str, Any], adc: Adc | None) -> str:

@@ -12,7 +12,6 @@ from rich.table import Table
 from cpunet.cli import options
 from cpunet.cli.ensemble import Jobs, Resume, Threads
 from cpunet.cli.messages import err, monitor, tell, tell_table
-from cpunet.cli.train import Peak, RecipeName, Set
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the search to make.")]
@@ -23,22 +22,16 @@ Trials = Annotated[
 SHOWN = 10  # trials
 
 
+@options.grouped
 def tune(
+    *,
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
     trials: Trials = 30,
-    recipe: RecipeName = "fast",
-    peak: Peak = "FEP",
+    on: options.TrainOn,
     seed: options.Seed = 0,
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.DataTable = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
-    set_values: Set = None,
+    read_as: options.ReadAs,
     jobs: Jobs = None,
     threads: Threads = None,
     device: options.Device = "auto",
@@ -49,19 +42,17 @@ def tune(
 
     Example: cpunet tune --sim sim.lh5 --data raw.lh5 --recipe fast --trials 30 --out tuned
     """
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.studies.tune import BEST, tune_recipe
-    from cpunet.recipes import load_recipe
 
-    refuse_inputs(out_folder, recipe)
+    refuse_inputs(out_folder, on.recipe)
     try:
         told = tune_recipe(
-            InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-            InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
+            read_as.sim(sim),
+            read_as.data(data),
             out_folder,
-            load_recipe(recipe, set_values or ()),
+            on.load(),
             trials=trials,
-            peak=peak,
+            peak=on.peak,
             seed=seed,
             jobs=jobs,
             threads=threads,
@@ -79,8 +70,8 @@ def tune(
     tell(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))
     if told["importances"]:
         shares = (f"{key} {share:.2f}" for key, share in told["importances"].items())
-        tell(f"importance: {', '.join(shares)}", highlight=False, soft_wrap=True)
-    tell(str(out_folder / BEST), soft_wrap=True)
+        tell(f"importance: {', '.join(shares)}", plain=True)
+    tell(str(out_folder / BEST))
 
 
 def _table(told: dict[str, Any]) -> Table:

@@ -32,23 +32,18 @@ Most = Annotated[
 Out = Annotated[Path, typer.Option("--out", help="Report folder to make.")]
 
 
+@options.grouped
 def validate(
+    *,
     run: options.Run,
     sim: options.Sim,
     data: options.Data,
     out_folder: Out,
-    truth: options.Truth = None,
-    rivals: options.Rivals = True,
+    scored: options.ScoredWith,
     ae_range: AeRange = None,
     most: Most = 50_000,
     seed: options.Seed = 0,
-    sim_table: options.SimTable = None,
-    sim_energy: options.SimEnergy = None,
-    data_table: options.OneTableOrAll = None,
-    data_energy: options.DataEnergy = None,
-    kev_per_adc: options.KevPerAdc = None,
-    dt: options.Dt = None,
-    insist: options.Insist = False,
+    read_as: options.ReadAsOrAll,
     device: options.Device = "auto",
     force: options.Force = False,
 ) -> None:
@@ -59,7 +54,7 @@ def validate(
     Example: cpunet validate runs --sim sim.lh5 --data raw.lh5 --data-table all --out reports
     """
     from cpunet.jobs.common.channels import ALL, Outcome
-    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.jobs.validation.evaluation import ValidateOptions
     from cpunet.jobs.validation.validate import validate_run
     from cpunet.jobs.validation.validate_channels import INDEX, validate_channels
 
@@ -69,27 +64,22 @@ def validate(
         if not 0 < low < high:
             raise CpunetError(f"--ae-range {ae_range}: give two energies, from < to")
         span = (low, high)
-    work = validate_channels if data_table == ALL else validate_run
+    work = validate_channels if read_as.data_table == ALL else validate_run
     metrics = work(
         run,
-        InputFile(sim, sim_table, sim_energy, dt_ns=dt, insist=insist),
-        InputFile(data, data_table, data_energy, kev_per_adc, dt, insist),
+        read_as.sim(sim),
+        read_as.data(data),
         out_folder,
-        truth=truth,
-        rivals=rivals,
-        seed=seed,
-        ae_range_kev=span,
-        most=most,
-        device=device,
+        ValidateOptions(scored.truth, scored.fitted, seed, span, most, device),
         force=force,
         monitor=monitor(),
     )
     if isinstance(metrics, Outcome):
-        tell(f"{out_folder / INDEX}", soft_wrap=True)
+        tell(f"{out_folder / INDEX}")
         tell_channels(metrics, out_folder, _in_words)
         return
     print_scores(metrics)
-    tell(f"{out_folder / 'report.html'}", soft_wrap=True)
+    tell(f"{out_folder / 'report.html'}")
 
 
 def _in_words(metrics: dict[str, Any]) -> str:

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from cpunet.electronics.chain import Electronics, Wander
+from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import LIFETIMES, earlier_pulses
-from cpunet.electronics.response import linear_response
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.pulses.container import Pulses
 

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics
+from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.noise import noise_of
+from cpunet.electronics.noise_traces import noise_of
 from cpunet.electronics.other_pulses import draw_other_pulses
-from cpunet.electronics.response import distorted, linear_response, required_energy_kev
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.gammas import with_resolution
 
@@ -77,7 +77,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     Raises
     ------
     CpunetError
-        For the reasons of `cpunet.electronics.response.respond` and `noise_of`.
+        For the reasons of `cpunet.electronics.exact_response.respond` and `noise_of`.
 
     Examples
     --------

@@ -14,6 +14,8 @@ from cpunet.jobs.simulation.hit_sources import energy_windows
 from cpunet.jobs.simulation.stand import write_stand
 from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.schema import Recipe
@@ -89,12 +91,14 @@ def demonstrate(
             data,
             run,
             recipe,
-            peak=_PEAK,
-            seed=seed,
-            device=device,
-            # what was begun and not ended goes on, but for --force
-            resume=isinstance(recipe.training, TrainingConfig) and not force,
-            force=force or run.exists(),
+            TrainOptions(
+                _PEAK,
+                seed,
+                device,
+                # what was begun and not ended goes on, but for --force
+                resume=isinstance(recipe.training, TrainingConfig) and not force,
+                force=force or run.exists(),
+            ),
             monitor=monitor,
         )
     return validate_run(
@@ -102,9 +106,7 @@ def demonstrate(
         sim,
         data,
         report,
-        truth=stand / "truth.npz",
+        ValidateOptions(stand / "truth.npz", seed=seed, device=device),
         force=report.exists(),
-        seed=seed,
-        device=device,
         monitor=monitor,
     )

@@ -13,9 +13,8 @@ from cpunet.jobs.simulation.stand import MARKER, STAND
 from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.outputs import Note, made_here, remove_own, require_replaceable, told_kept
 from cpunet.recipes.schema import Recipe
-from cpunet.regular_files import read_text
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
-from cpunet.yaml_files import MAX_BYTES, plain_json
+from cpunet.yaml_files import json_mapping
 
 # in the order they are made; and the file that each has when it is whole
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
@@ -89,18 +88,8 @@ def remove_parts(out: Path, note: Note) -> None:
 
 
 def _read_stand(stand: Path) -> dict[str, Any]:
-    path = stand / MARKER
-    try:
-        made = plain_json(read_text(path, MAX_BYTES))
-    except OSError as error:
-        raise CpunetError(
-            f"{stand}: is no stand ({MARKER} cannot be read); give another --out"
-        ) from error
-    except ValueError as error:
-        raise CpunetError(f"{path}: damaged ({error}); {_WAY_OUT}") from error
-    if not isinstance(made, dict):
-        raise CpunetError(f"{path}: damaged (no mapping); {_WAY_OUT}")
-    return made
+    absent = f"{stand}: is no stand ({MARKER} cannot be read); give another --out"
+    return json_mapping(stand / MARKER, absent, _WAY_OUT)
 
 
 def _content(recipe: Recipe) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.networks.kept_noise import KeptNoise
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 
 

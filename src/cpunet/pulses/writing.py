@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -93,16 +92,11 @@ class PulseWriter:
         self._file = self._stack.enter_context(FileInTheMaking(aside, self.path))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None and self.n_pulses == 0:
+    def __exit__(self, *error: Any) -> None:
+        if error[1] is None and self.n_pulses == 0:
             with self._stack:
                 raise CpunetError(f"{self.path}: no pulses to write; nothing was written")
-        self._stack.__exit__(kind, error, trace)
+        self._stack.__exit__(*error)
 
     def append(
         self,

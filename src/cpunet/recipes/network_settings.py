@@ -23,7 +23,7 @@ class PunetConfig(Config):
 
 
 class ResponseConfig(Config):
-    """A differentiable readout chain, see `cpunet.networks.response`.
+    """A differentiable readout chain, see `cpunet.networks.response_layer`.
 
     ``poles_ns`` and ``decay_us`` are where free times start.  ``slow_ns`` and
     ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free

@@ -111,13 +111,11 @@ def superposed_fields(
     )
 
 
-def scaled_to_depletion(
-    detector: Detector, *, cache: bool = True, progress: Progress | None = None
-) -> Detector:
+def scaled_to_depletion(detector: Detector) -> Detector:
     """Detector with its impurities scaled so that it depletes at the measured voltage.
 
     Manufacturers measure impurity densities to about 10 %, while the depletion voltage is
-    known to a few volts. `cache` and `progress` are those of `compute_fields`.
+    known to a few volts.
 
     Raises
     ------
@@ -130,7 +128,7 @@ def scaled_to_depletion(
             f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
             "add it to the file, or give measured_depletion_V=VALUE"
         )
-    solution = solve(detector, cache=cache, progress=progress)
+    solution = solve(detector)
     scale = solution.scale_of_depletion(measured, detector.impurity_tilt_1e10_per_cm4)
     return detector.model_copy(update={"impurity_scale": scale})
 

@@ -1,7 +1,7 @@
 """Compiled loops of the comparison: records in; aligned pulses, tail slopes, amplitudes out.
 
-The same lines as `cpunet.training.half_maximum.at_half_maximum`, one record at a time and
-without derivatives, ten times faster.
+The same lines as `cpunet.training.half_maximum_alignment.at_half_maximum`, one record at a
+time and without derivatives, ten times faster.
 """
 
 from __future__ import annotations

@@ -14,11 +14,11 @@ from cpunet.networks.chain_unet import TAIL, InverseUNet, UNetCorrection
 from cpunet.networks.hybrid import half_sample
 from cpunet.networks.linear_inverse import LinearInverse, stretch
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.recipes.schema import Recipe
 from cpunet.training.compared import Compared, Judged
-from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.outside import MIN_SCALE, Outside, of_height, tolerance
 
 LATEST = 60  # samples after the expected half maximum from which it is searched backward

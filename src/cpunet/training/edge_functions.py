@@ -16,11 +16,11 @@ import scipy.linalg
 import torch
 from torch import Tensor, nn
 
-from cpunet.networks.response import PADDING_BEFORE
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import Recipe
-from cpunet.training.half_maximum import at_half_maximum
+from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import EDGE, Moments, Values
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.translated import DELAY

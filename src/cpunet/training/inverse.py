@@ -19,8 +19,8 @@ from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
-from cpunet.networks.response import PADDING_BEFORE
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe

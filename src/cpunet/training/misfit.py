@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.moments import Readings, Values
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.response_problem import Band

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.smooth_parameters import SmoothParameters

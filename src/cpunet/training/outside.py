@@ -19,7 +19,7 @@ from torch import Tensor
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.extension import PADDING_BEFORE, with_room
 from cpunet.networks.linear_inverse import stretch
-from cpunet.networks.response import PADDING_AFTER as RESPONSE_ROOM
+from cpunet.networks.response_layer import PADDING_AFTER as RESPONSE_ROOM
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig

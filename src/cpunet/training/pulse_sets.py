@@ -8,7 +8,7 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.networks.response import record_length
+from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
 from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands

@@ -9,7 +9,6 @@ unless its chi-square falls clearly, the correction is made zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -19,16 +18,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import EdgeResidual
-from cpunet.networks.response import PADDING_AFTER
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import PADDING_AFTER
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.network_settings import ResidualConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.held_out import Aim, Kept, judge, split_rows
 from cpunet.training.moments import BLOCK
-
-Listener = Callable[[int, float], None]
 
 DRAWS = 4  # of the noise; while training, these are dealt anew to the pulses
 PER_MILLE = 1e-3  # of a pulse's height: the unit of roughness
@@ -42,7 +39,6 @@ def fit_residual(
     recipe: Recipe,
     *,
     seed: int,
-    listener: Listener | None = None,
 ) -> tuple[EdgeResidual, Kept]:
     """Train a correction of a matched chain's records, and judge it on held-out pulses.
 
@@ -58,8 +54,6 @@ def fit_residual(
         With a residual.
     seed
         Of the held-out pulses, the weights, the batches and the noise.
-    listener
-        Told the iteration and its chi-square.
 
     Returns
     -------
@@ -91,7 +85,7 @@ def fit_residual(
         torch.manual_seed(seed)
         network = EdgeResidual(config)
     aim = Aim(functions, misfit, measured)
-    trained = _train(network, aim, records[own], noise, config, rng, listener)
+    trained = _train(network, aim, records[own], noise, config, rng)
     held_out = Aim(functions, misfit, functions.of_windows(data[held_data]))
     dealt = noise[torch.from_numpy(rng.permutation(len(noise))[: len(held)])]
     found = judge(trained, held_out, records[held], dealt, config.least_fall, rng)
@@ -123,7 +117,6 @@ def _train(
     noise: Tensor,
     config: ResidualConfig,
     rng: np.random.Generator,
-    listener: Listener | None,
 ) -> EdgeResidual:
     """Return the running average of the trained network."""
     average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
@@ -150,8 +143,6 @@ def _train(
         optimiser.step()
         schedule.step()
         averaged.update_parameters(network)
-        if listener is not None:
-            listener(i + 1, value)
     trained = averaged.module
     assert isinstance(trained, EdgeResidual)
     return trained

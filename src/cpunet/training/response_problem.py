@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy.linalg
 import torch
 
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import Translated
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 
 from cpunet.electronics.drawn_remains import KnownDecay
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt

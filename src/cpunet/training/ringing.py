@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.response_problem import ResponseProblem
 

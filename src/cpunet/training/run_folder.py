@@ -34,7 +34,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import read_text, require_file
 from cpunet.training.loop import Record
 from cpunet.training.run_schema import FORMAT, problem
-from cpunet.yaml_files import MAX_BYTES, parsed, plain_json
+from cpunet.yaml_files import MAX_BYTES, json_mapping, parsed, plain_json
 
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
 RUN = FolderKind(
@@ -84,16 +84,8 @@ def read_info(run: Path) -> dict[str, Any]:
         If the folder is no finished run, or of a newer version.
     """
     path = Path(run) / INFO
-    try:
-        info = plain_json(read_text(path, MAX_BYTES))
-    except OSError as error:
-        raise CpunetError(
-            f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
-        ) from error
-    except ValueError as error:
-        raise CpunetError(f"{path}: damaged ({error}); train again") from error
-    if not isinstance(info, dict):
-        raise CpunetError(f"{path}: damaged (no mapping); train again")
+    absent = f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
+    info = json_mapping(path, absent, "train again")
     if wrong := problem(info):
         raise CpunetError(f"{path}: damaged ({wrong}); train again")
     return info

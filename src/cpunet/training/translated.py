@@ -18,7 +18,7 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.networks.response import (
+from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
     ElectronicsResponse,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,54 @@ NO_OTHERS = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is added to a batch of pulses, and what must be known of them.
+
+    Parameters
+    ----------
+    energy_kev
+        Energy of each pulse; electronic noise is scaled by its inverse.
+    noise
+        Whether to add noise.
+    generator
+        Random generator of the noise.
+    remains_kev
+        Remains of earlier pulses under each pulse, in keV.
+    second
+        Second pulses within the records.
+    """
+
+    energy_kev: Energies | None = None
+    noise: bool = True
+    generator: torch.Generator | None = None
+    remains_kev: Energies | None = None
+    second: SecondPulses | None = None
+
+    @property
+    def others(self) -> bool:
+        """Whether there are other pulses under these."""
+        return self.remains_kev is not None or self.second is not None
+
+    def of_rows(self, rows: npt.NDArray[np.integer]) -> Drawn:
+        """The same for some of the pulses."""
+        return replace(
+            self,
+            energy_kev=None if self.energy_kev is None else self.energy_kev[rows],
+            remains_kev=None if self.remains_kev is None else self.remains_kev[rows],
+            second=None if self.second is None else self.second.of_rows(rows),
+        )
+
+    def device(self, default: torch.device) -> torch.device:
+        """Device of the random generator."""
+        return default if self.generator is None else self.generator.device
+
+    def seed(self, default: torch.device) -> int:
+        """Seed of the electronic noise, from the random generator."""
+        device = self.device(default)
+        return int(torch.randint(2**62, (), generator=self.generator, device=device))
+
+
 class Backend(ABC):
     """Translates a batch of prepared windows."""
 
@@ -44,15 +93,7 @@ class Backend(ABC):
         return weights.device
 
     @abstractmethod
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
 
@@ -64,24 +105,15 @@ class NetworkBackend(Backend):
         # created on first use: an importer or exporter may still change or move the network
         self._frozen: FrozenUNet | None = None
 
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network; its output is a prepared window already."""
-        if remains_kev is not None or second is not None:
+        if drawn.others:
             raise CpunetError(
                 "a network has what it was shown; other pulses belong to readout chains, so "
                 "leave out remains_kev and second"
             )
-        del energy_kev
         batch = torch.from_numpy(windows).to(self.device)
-        out = self._translate(batch[:, None], generator, mean=not noise)
+        out = self._translate(batch[:, None], drawn.generator, mean=not drawn.noise)
         result: FloatArray = out[:, 0].cpu().numpy()
         return result, np.zeros(len(windows), np.uint8)
 
@@ -121,15 +153,7 @@ class NoisyNetworkBackend(NetworkBackend):
         super().__init__(network)
         self.noise, self.config, self.remains = noise, config, remains
 
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network, add noise in proportion to 1/energy, and prepare like data.
 
         Raises
@@ -137,20 +161,22 @@ class NoisyNetworkBackend(NetworkBackend):
         CpunetError
             If noise is wanted and an energy is not known.
         """
-        if noise and energy_kev is None:
+        energy_kev, second = drawn.energy_kev, drawn.second
+        if drawn.noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
-        if not noise and (remains_kev is not None or second is not None):
+        if not drawn.noise and drawn.others:
             raise CpunetError(NO_OTHERS)
-        clean, codes = super().__call__(windows, None, noise, generator)
-        if energy_kev is None or not noise:
+        clean, codes = super().__call__(
+            windows, Drawn(noise=drawn.noise, generator=drawn.generator)
+        )
+        if energy_kev is None or not drawn.noise:
             return clean, codes
-        device = self.device if generator is None else generator.device
-        seed = torch.randint(2**62, (), generator=generator, device=device)
+        seed = drawn.seed(self.device)
         dt_ns = self.noise.noise_dt_ns
         records = with_room(clean, self.config, dt_ns)
         added = None
-        if remains_kev is not None or second is not None:
-            added = _left(self.remains, records, energy_kev, remains_kev)
+        if drawn.others:
+            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
         if second is not None and added is not None:
             length = records.shape[1] + second.reach(dt_ns)
             before = PADDING_BEFORE + self.config.samples_before
@@ -162,7 +188,7 @@ class NoisyNetworkBackend(NetworkBackend):
             dt_ns=dt_ns,
             noise=self.noise.noise,
             energy_kev=energy_kev,
-            seed=int(seed),
+            seed=seed,
             added=added,
         )
 
@@ -174,15 +200,7 @@ class ResponseBackend(Backend):
         self.network = self.chain = generator.eval()
         self.config = config
 
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data.
 
         Raises
@@ -191,25 +209,24 @@ class ResponseBackend(Backend):
             If noise is requested and an energy is unknown.
         """
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        if noise and energy_kev is None:
+        energy_kev, second = drawn.energy_kev, drawn.second
+        if drawn.noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
-        drawn = self.chain.noise if noise else None
-        device = self.device if generator is None else generator.device
-        seed = torch.randint(2**62, (), generator=generator, device=device)
+        seed = drawn.seed(self.device)
         added = None
-        if remains_kev is not None or second is not None:
-            if energy_kev is None or not noise:
+        if drawn.others:
+            if energy_kev is None or not drawn.noise:
                 raise CpunetError(NO_OTHERS)
-            added = _left(self.chain.remains, records, energy_kev, remains_kev)
+            added = _left(self.chain.remains, records, energy_kev, drawn.remains_kev)
             if second is not None and len(second.row):
                 added += self._second(windows, energy_kev, second, records.shape[1])
         return finish_with_codes(
             records,
             self.config,
             dt_ns=float(self.chain.response.dt_ns),
-            noise=drawn,
-            energy_kev=energy_kev if noise else None,
-            seed=int(seed),
+            noise=self.chain.noise if drawn.noise else None,
+            energy_kev=energy_kev if drawn.noise else None,
+            seed=seed,
             added=added,
         )
 
@@ -240,17 +257,9 @@ class InverseBackend(Backend):
         self.config = config
         self.dt_ns = dt_ns
 
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Invert the response and suppress the noise; deterministic."""
-        del energy_kev, noise, generator, remains_kev, second
+        del drawn
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")

@@ -12,13 +12,12 @@ import torch
 from torch import nn
 
 from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.half_maximum import Splines, last_below_half
 from cpunet.pulses.preparation import Codes
 from cpunet.training.ensemble_folder import finished_members
-from cpunet.translation.backends import Backend, Energies
+from cpunet.translation.backends import Backend, Drawn
 from cpunet.translation.translator import BATCH, REN
 
 Values = npt.NDArray[np.float64]
@@ -116,34 +115,19 @@ class _Draw(Backend):
         self.backends = backends
         self.network = nn.ModuleList(backend.network for backend in backends)
 
-    def __call__(
-        self,
-        windows: FloatArray,
-        energy_kev: Energies | None,
-        noise: bool,
-        generator: torch.Generator | None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
-    ) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Assign pulses to random backends and translate them."""
-        device = self.device if generator is None else generator.device
-        shape = (len(windows),)
-        drawn = torch.randint(len(self.backends), shape, generator=generator, device=device)
-        chosen = drawn.cpu().numpy()
+        chosen = torch.randint(
+            len(self.backends),
+            (len(windows),),
+            generator=drawn.generator,
+            device=drawn.device(self.device),
+        )
         result, codes = np.empty_like(windows), np.zeros(len(windows), np.uint8)
         for number, backend in enumerate(self.backends):
-            rows = np.flatnonzero(chosen == number)
+            rows = np.flatnonzero(chosen.cpu().numpy() == number)
             if rows.size:
-                energies = None if energy_kev is None else energy_kev[rows]
-                left = None if remains_kev is None else remains_kev[rows]
-                result[rows], codes[rows] = backend(
-                    windows[rows],
-                    energies,
-                    noise,
-                    generator,
-                    left,
-                    None if second is None else second.of_rows(rows),
-                )
+                result[rows], codes[rows] = backend(windows[rows], drawn.of_rows(rows))
         return result, codes
 
 

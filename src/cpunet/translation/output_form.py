@@ -11,7 +11,7 @@ import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.second_pulses import Columns, DrawnPileUp, SecondPulses
-from cpunet.networks.response import PADDING_BEFORE, record_length
+from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes
 from cpunet.translation.translator import Translator

@@ -34,6 +34,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.translation.backends import (
     Backend,
+    Drawn,
     Energies,
     InverseBackend,
     NetworkBackend,
@@ -253,12 +254,8 @@ class Translator:
         index = prepared.index[rows]
         waveforms[index], codes[index] = self.apply_with_codes(
             prepared.pulses.waveforms[rows],
-            energy_kev=pulses.energy_kev[index],
-            noise=noise,
-            generator=generator,
-            progress=progress,
-            remains_kev=None if remains_kev is None else remains_kev[index],
-            second=None if second is None else second.of_rows(index),
+            Drawn(pulses.energy_kev, noise, generator, remains_kev, second).of_rows(index),
+            progress,
         )
         return Translated(pulses.with_waveforms(waveforms), codes)
 
@@ -286,46 +283,24 @@ class Translator:
         remains_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        result, _ = self.apply_with_codes(
-            windows,
-            energy_kev=energy_kev,
-            noise=noise,
-            generator=generator,
-            progress=progress,
-            remains_kev=remains_kev,
-        )
-        return result
+        drawn = Drawn(energy_kev, noise, generator, remains_kev)
+        return self.apply_with_codes(windows, drawn, progress)[0]
 
     def apply_with_codes(
         self,
         windows: FloatArray,
-        *,
-        energy_kev: Energies | None = None,
-        noise: bool = True,
-        generator: torch.Generator | None = None,
+        drawn: Drawn,
         progress: Callable[[int], None] | None = None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Like `apply`, with a `Rejection` for each row."""
         result = np.empty_like(windows)
         codes = np.zeros(len(windows), np.uint8)
         with torch.inference_mode():
             for first in range(0, len(windows), BATCH):
-                rows = slice(first, first + BATCH)
-                energies = None if energy_kev is None else energy_kev[rows]
-                left = None if remains_kev is None else remains_kev[rows]
-                batch = np.arange(len(windows))[rows]
-                result[rows], codes[rows] = self.backend(
-                    windows[rows],
-                    energies,
-                    noise,
-                    generator,
-                    left,
-                    None if second is None else second.of_rows(batch),
-                )
+                rows = np.arange(first, min(first + BATCH, len(windows)))
+                result[rows], codes[rows] = self.backend(windows[rows], drawn.of_rows(rows))
                 if progress is not None:
-                    progress(len(windows[rows]))
+                    progress(len(rows))
         return result, codes
 
     def seeded(self, seed: int | None) -> torch.Generator:

@@ -15,13 +15,6 @@ import scipy.fft
 import scipy.optimize
 
 from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
-from cpunet.electronics.baseline_methods.response import (
-    Spectrum,
-    currents,
-    frequencies_mhz,
-    record_length,
-    respond,
-)
 from cpunet.electronics.baseline_methods.superpulses import (
     Groups,
     crossing,
@@ -29,6 +22,13 @@ from cpunet.electronics.baseline_methods.superpulses import (
     slices,
     superpulses,
     without_decay,
+)
+from cpunet.electronics.baseline_methods.window_response import (
+    Spectrum,
+    currents,
+    frequencies_mhz,
+    record_length,
+    respond,
 )
 from cpunet.pulses.container import FloatArray
 

@@ -16,13 +16,6 @@ import numpy as np
 import scipy.fft
 
 from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
-from cpunet.electronics.baseline_methods.response import (
-    PADDING_BEFORE,
-    Spectrum,
-    currents,
-    record_length,
-    respond,
-)
 from cpunet.electronics.baseline_methods.superpulses import (
     Superpulses,
     crossing,
@@ -30,6 +23,13 @@ from cpunet.electronics.baseline_methods.superpulses import (
     slices,
     superpulses,
     without_decay,
+)
+from cpunet.electronics.baseline_methods.window_response import (
+    PADDING_BEFORE,
+    Spectrum,
+    currents,
+    record_length,
+    respond,
 )
 from cpunet.pulses.container import FloatArray
 

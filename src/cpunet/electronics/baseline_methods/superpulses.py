@@ -14,7 +14,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from cpunet.electronics.baseline_methods.base import Values
-from cpunet.electronics.baseline_methods.response import Spectrum
+from cpunet.electronics.baseline_methods.window_response import Spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import tail_slope

@@ -33,14 +33,14 @@ from cpunet.jobs.calibration.calibration_inputs import (
     read_sides,
 )
 from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.common.remains import drawn_like, measured_remains
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import ResponseTrainer
-from cpunet.jobs.training.training_job import TrainingJob
+from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
@@ -154,10 +154,10 @@ class Calibration:
             again = load_simulated(
                 InputFile(folder / SIM), self.recipe, sides.selection, monitor
             )
+            how = TrainOptions(self.peak, self.seed, "cpu")
             job = TrainingJob(
-                self.recipe, self.peak, self.seed, "cpu", ProcessGroup(), None, again,
-                sides.data, self.data, folder, monitor,
-            )  # fmt: skip
+                self.recipe, how, ProcessGroup(), again, sides.data, self.data, folder, monitor
+            )
             trainer = ResponseTrainer(self.recipe)
             model, info, recipe = trainer.train(job, known=calibrated.response)
             info["sim"]["file"] = str(out / SIM)

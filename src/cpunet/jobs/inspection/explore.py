@@ -26,6 +26,7 @@ from cpunet.pulses.preparation import Rejection
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import read_info
+from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import REN
 
 QUIET = Monitor()
@@ -123,7 +124,7 @@ def _translated(
     results = []
     with monitor.stage("Translating", len(translators) * len(kept)) as advance:
         for run, ren in zip(runs, translators, strict=True):
-            windows, codes = ren.apply_with_codes(places.windows, noise=False, progress=advance)
+            windows, codes = ren.apply_with_codes(places.windows, Drawn(noise=False), advance)
             results.append(windows)
             for i in np.flatnonzero((codes != Rejection.ACCEPTED) & (missing[kept] == "")):
                 why = Rejection(codes[i]).label.replace("_", " ")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.response_problem import Parameters
 
 Numbers = dict[str, float]

@@ -6,8 +6,7 @@ import io
 import shutil
 import zipfile
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -34,12 +33,7 @@ class GrowingArchive:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         self._rows.close()
 
     def append(self, rows: npt.NDArray[np.float32]) -> None:

@@ -22,6 +22,7 @@ from cpunet.simulation.signals import Signals, hit_signals
 QUIET = Monitor()
 # As SolidStateDetectors.jl's libraries are sampled: reboost's surface model wants 1 ns.
 DT_NS, LENGTH_NS = 1.0, 5000.0
+ENERGY_KEV = 1000.0  # of each hit; it matters with self-repulsion only
 ANGLES_DEG = (0, 45)  # <100> and <110>: what reboost interpolates between
 
 
@@ -32,7 +33,6 @@ def write_library(
     settings: SimulationSettings | None = None,
     grid_mm: float = 1.0,
     angles_deg: tuple[int, ...] = ANGLES_DEG,
-    energy_kev: float = 1000.0,
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
@@ -57,12 +57,6 @@ def write_library(
         Spacing in r and z.
     angles_deg
         Azimuths from <100>.
-    energy_kev
-        Of each hit; it matters with self-repulsion only.
-    force
-        Replace an existing file.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -95,7 +89,7 @@ def write_library(
         library = made.h5.create_group(detector.name or "detector")
         _describe(library, r_mm, z_mm, settings)
         for angle in angles_deg:
-            _fill(library, angle, fields, settings, energy_kev, counts, advance)
+            _fill(library, angle, fields, settings, counts, advance)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
     return counts
 
@@ -123,7 +117,6 @@ def _fill(
     angle_deg: int,
     fields: FieldMaps,
     settings: SimulationSettings,
-    energy_kev: float,
     counts: dict[str, int],
     advance: Advance,
 ) -> None:
@@ -136,7 +129,7 @@ def _fill(
     phi = math.radians(angle_deg)
     for i, r in enumerate(r_mm):
         x, y = r * math.cos(phi), r * math.sin(phi)
-        signals = hit_signals(fields, x, y, z_mm, energy_kev, settings)
+        signals = hit_signals(fields, x, y, z_mm, ENERGY_KEV, settings)
         good = signals.valid & signals.collected
         waveforms[i] = _kept(signals, good)
         drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics
+from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
-from cpunet.electronics.response import respond
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor

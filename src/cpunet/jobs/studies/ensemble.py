@@ -20,6 +20,7 @@ from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
@@ -213,28 +214,28 @@ class _Member:
                 self.data,
                 run,
                 self.recipe,
-                peak=self.peak,
-                seed=seed,
-                device=self.device,
-                resume=begun and trainer_for(self.recipe).resumable,
+                TrainOptions(
+                    self.peak,
+                    seed,
+                    self.device,
+                    resume=begun and trainer_for(self.recipe).resumable,
+                ),
                 stop=stop,
                 monitor=_Forwarding(link, seed),
             )
 
     def _score(self, run: Path) -> dict[str, Any]:
         # takes seconds to import in each process: only if needed
-        from cpunet.jobs.validation.evaluation import evaluate
+        from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 
         clock = time.perf_counter()
         metrics = evaluate(
             run,
             self.sim,
             self.data,
-            truth=self.truth,
-            rivals=False,
-            seed=0,  # the same noise and bootstraps for all: they differ only in the training
-            device=self.device,
-            monitor=QUIET,
+            # the same noise and bootstraps for all: they differ only in the training
+            ValidateOptions(self.truth, baselines=False, seed=0, device=self.device),
+            QUIET,
         ).metrics
         write_json(run / METRICS, metrics)
         scores = {

@@ -24,7 +24,7 @@ from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
-from cpunet.jobs.studies.held_out import HeldOut
+from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tuning_study import (
     REASON,
     SECONDS,

@@ -13,7 +13,7 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.network_start import NetworkStart, network_start
-from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
+from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions, losses_shown
 from cpunet.recipes.schema import Recipe
 from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.held_out import Kept
@@ -56,36 +56,28 @@ class CycleGanTrainer:
         self,
         out: Path,
         read: Sequence[Path | str | None],
-        *,
-        resume: bool,
-        force: bool,
+        options: TrainOptions,
         note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of ``OUT.unfinished``, which becomes `out` when the training is complete."""
+        resume, force = options.resume, options.force
         return unfinished_folder(out, *read, resume=resume, force=force, note=note)
 
-    def train(
-        self,
-        job: TrainingJob,
-        *,
-        resume: bool = False,
-        tensorboard: bool = False,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> Trained | None:
+    def train(self, job: TrainingJob) -> Trained | None:
         """Train or resume; return None in a process that does not lead."""
         fingerprint = _fingerprint(job)
         require_same_everywhere(job.group, fingerprint)
         if not job.group.leads:
             state = share_state(job.group, None)
-            hooks = CheckpointHooks(lambda _state: None, state, stop)
+            hooks = CheckpointHooks(lambda _state: None, state, job.stop)
             self._trained(job, self._start(job), hooks, None)
             return None
         run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
-        state = share_state(job.group, run.begin(resume=resume))
+        state = share_state(job.group, run.begin(resume=job.options.resume))
         start = self._start(job)
         left = self.steps - (state["iteration"] if state else 0)
         with (
-            losses_shown(job.folder, wanted=tensorboard) as show,
+            losses_shown(job.folder, wanted=job.options.tensorboard) as show,
             job.monitor.stage("Training", left) as advance,
         ):
 
@@ -94,7 +86,7 @@ class CycleGanTrainer:
                 show(records)
                 advance(len(records))
 
-            hooks = CheckpointHooks(run.save, state, stop)
+            hooks = CheckpointHooks(run.save, state, job.stop)
             model, kept = self._trained(job, start, hooks, listen)
         run.finish()
         if kept is not None and not kept.kept:
@@ -110,7 +102,9 @@ class CycleGanTrainer:
         return Trained(model, info, start.recipe)
 
     def _start(self, job: TrainingJob) -> NetworkStart:
-        return network_start(job.sides, self.recipe, job.seed, job.init, job.monitor)
+        return network_start(
+            job.sides, self.recipe, job.options.seed, job.options.init, job.monitor
+        )
 
     def _trained(
         self,
@@ -124,14 +118,14 @@ class CycleGanTrainer:
         surroundings, recipe, gate = start.surroundings, start.recipe, None
         windows = sim.waveforms, data.waveforms
         if surroundings.chain is not None and recipe.cyclegan.training.held_out:
-            gate = NetworkGate(*windows, sim.energy_kev, recipe, job.seed)
+            gate = NetworkGate(*windows, sim.energy_kev, recipe, job.options.seed)
             windows = sim.waveforms[gate.own], data.waveforms[gate.own_data]
             surroundings = surroundings.of_pulses(gate.own)
         model = train(
             *windows,
             recipe,
-            seed=job.seed,
-            device=job.device,
+            seed=job.options.seed,
+            device=job.options.device,
             init=start.fill,
             surroundings=surroundings,
             listener=listener,
@@ -151,9 +145,9 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
     recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
     told = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
     sides = (("simulation", job.sim), ("data", job.data))
-    settings = {"recipe": recipe, "peak": job.peak, "seed": job.seed}
-    if job.init is not None:
-        settings["init"] = weights_sha256(job.init)
+    settings = {"recipe": recipe, "peak": job.options.peak, "seed": job.options.seed}
+    if job.options.init is not None:
+        settings["init"] = weights_sha256(job.options.init)
     return settings | {
         side: {k: v for k, v in pulses.provenance().items() if k in told}
         for side, pulses in sides
@@ -163,7 +157,7 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
 def _environment(job: TrainingJob) -> dict[str, Any]:
     """What the last bits depend on."""
     return {
-        "device": job.device,
+        "device": job.options.device,
         "processes": job.group.size,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,

@@ -11,9 +11,14 @@ import numpy as np
 
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.training.matching import Sides, known_response, match, remains_of_sides
+from cpunet.jobs.training.chain_and_inverse import (
+    Sides,
+    known_response,
+    match,
+    remains_of_sides,
+)
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.network_settings import PunetConfig, ResponseConfig

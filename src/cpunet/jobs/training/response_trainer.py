@@ -10,9 +10,9 @@ from pathlib import Path
 
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
-from cpunet.jobs.training.matching import known_response, match
-from cpunet.jobs.training.training_job import Trained, TrainingJob, losses_shown
-from cpunet.networks.response import ElectronicsResponse
+from cpunet.jobs.training.chain_and_inverse import known_response, match
+from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions, losses_shown
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup
@@ -45,35 +45,28 @@ class ResponseTrainer:
         self,
         out: Path,
         read: Sequence[Path | str | None],
-        *,
-        resume: bool,
-        force: bool,
+        options: TrainOptions,
         note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of a folder that appears when the fit is complete."""
-        if resume:
+        if options.resume:
             raise CpunetError(
                 f"recipe {self.recipe.name}: takes a minute and keeps no checkpoints; give the "
                 "recipe that the training was begun with, or leave out --resume"
             )
-        return folder_written_aside(out, RUN, *read, force=force, note=note)
+        return folder_written_aside(out, RUN, *read, force=options.force, note=note)
 
     def train(
         self,
         job: TrainingJob,
-        *,
-        resume: bool = False,
-        tensorboard: bool = False,
-        stop: Callable[[], bool] | None = None,
         known: ElectronicsResponse | None = None,
     ) -> Trained:
-        """Fit a readout chain, from a known one or that of ``job.init`` if there is one."""
-        del resume, stop  # it takes a minute
+        """Fit a readout chain, from a known one or that of ``init`` if there is one."""
         started, clock = datetime.now(UTC), time.perf_counter()
-        if job.init is not None:
-            known = known_response(job.init, job.data.dt_ns)
+        if job.options.init is not None:
+            known = known_response(job.options.init, job.data.dt_ns)
         with (
-            losses_shown(job.folder, wanted=tensorboard) as show,
+            losses_shown(job.folder, wanted=job.options.tensorboard) as show,
             # most fits need fewer steps than one start may take
             job.monitor.stage("Matching", self.recipe.matching.training.steps) as advance,
         ):
@@ -87,7 +80,7 @@ class ResponseTrainer:
                 job.monitor.state(f"chi-square {chi_square:.4g}")
 
             model, told, recipe = match(
-                job.sides, self.recipe, job.seed, listen, job.monitor, known
+                job.sides, self.recipe, job.options.seed, listen, job.monitor, known
             )
         seconds = time.perf_counter() - clock
         info = job.info(started.isoformat(timespec="seconds"), seconds)

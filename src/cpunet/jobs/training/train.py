@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,12 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
 from cpunet.jobs.training.launched_group import group_for
 from cpunet.jobs.training.trainers import trainer_for
-from cpunet.jobs.training.training_job import TrainingJob
+from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, write_run
 
-QUIET = Monitor()
+QUIET, AS_USUAL = Monitor(), TrainOptions()
 
 
 def train_run(
@@ -37,14 +38,8 @@ def train_run(
     data: InputFile,
     out: Path,
     recipe: Recipe,
+    options: TrainOptions = AS_USUAL,
     *,
-    peak: str = "FEP",
-    seed: int = 0,
-    device: str = "auto",
-    init: Path | None = None,
-    resume: bool = False,
-    force: bool = False,
-    tensorboard: bool = False,
     stop: Callable[[], bool] = lambda: False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
@@ -59,23 +54,6 @@ def train_run(
     out
         The run folder; it appears when the training is done. A CycleGAN works in
         ``OUT.unfinished`` until then, see `cpunet.training.unfinished`.
-    recipe
-        All settings.
-    peak
-        Energies to train on: a peak of the recipe or a range in keV.
-    seed
-        Seed of all random numbers.
-    device
-        ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
-    init
-        Folder of a run to start from, as of another detector or period: of the same kind, or
-        a matched one, which makes pairs for networks to learn first.
-    resume
-        Resume an unfinished training, if there is one; all else must be unchanged.
-    force
-        Replace an existing folder and, without `resume`, an unfinished training.
-    tensorboard
-        Write TensorBoard logs beside the losses (needs the extra ``tensorboard``).
     stop
         Asked after each iteration of a CycleGAN whether to store its state and stop.
     monitor
@@ -96,13 +74,13 @@ def train_run(
     """
     keep_freed_memory()
     trainer = trainer_for(recipe)
-    with group_for(trainer, device) as (group, device):
-        selection = parse_selection(peak, recipe.peaks)
+    with group_for(trainer, options.device) as (group, device):
+        selection = parse_selection(options.peak, recipe.peaks)
         told = monitor if group.leads else QUIET
-        read = (*sim.files, *data.files, init)
+        read = (*sim.files, *data.files, options.init)
         place: AbstractContextManager[Path] = nullcontext(out)
         if group.leads:  # the others do not write
-            place = trainer.workplace(out, read, resume=resume, force=force, note=told.note)
+            place = trainer.workplace(out, read, options, told.note)
         with place as folder:
             sim_set = load_simulated(sim, recipe, selection, told)
             data_set = load_measured(data, recipe, selection, told)
@@ -112,12 +90,13 @@ def train_run(
             for finding in compare_sides(sim_set, data_set, selection):
                 if finding.level != Level.FINE:
                     told.note(f"warning: {finding}")
-            if init is not None:
-                _require_sampling(init, data_set)
+            if options.init is not None:
+                _require_sampling(options.init, data_set)
+            how = replace(options, device=device)
             sides = sim_set, data_set, data
-            job = TrainingJob(recipe, peak, seed, device, group, init, *sides, folder, told)
+            job = TrainingJob(recipe, how, group, *sides, folder, told, stop)
             with enough_memory(trainer.less_memory(group.size)):
-                done = trainer.train(job, resume=resume, tensorboard=tensorboard, stop=stop)
+                done = trainer.train(job)
             if done is None:
                 return {}
             return write_run(folder, done.model, done.recipe, done.info)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +11,13 @@ from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, p
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import StoppedError
 from cpunet.training.run_folder import INFO, read_info
 from cpunet.training.unfinished import unfinished_name
 
-QUIET = Monitor()
+QUIET, AS_USUAL = Monitor(), TrainOptions()
 
 
 def train_channels(
@@ -22,11 +25,10 @@ def train_channels(
     data: InputFile,
     out: Path,
     recipe: Recipe,
+    options: TrainOptions = AS_USUAL,
     *,
-    init: Path | None = None,
-    resume: bool = False,
+    stop: Callable[[], bool] = lambda: False,
     monitor: Monitor = QUIET,
-    **options: Any,
 ) -> Outcome[dict[str, Any]]:
     """Train a run for each channel of the data, in the folder ``OUT/CHANNEL``.
 
@@ -36,14 +38,11 @@ def train_channels(
         Files; the table of the data is ``"all"``, that of the simulation may be.
     out
         Folder of the run folders.
-    recipe
-        All settings.
-    init
-        A run to start from, or the folder of a run for each channel.
-    resume
-        Keep the runs that are there, and go on with those that are unfinished.
-    monitor, options
-        As for `cpunet.jobs.training.train.train_run`.
+    options
+        The run to start from may be the folder of a run for each channel. To resume keeps the
+        runs that are there, and goes on with those that are unfinished.
+    stop
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -59,17 +58,14 @@ def train_channels(
     """
 
     def train(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
-        if resume and (folder / INFO).is_file():
+        if options.resume and (folder / INFO).is_file():
             monitor.note(f"{name}: trained already")
             return read_info(folder)
-        return train_run(
-            *pair,
-            folder,
-            recipe,
-            init=None if init is None else own_folder(init, name, INFO),
-            resume=resume and unfinished_name(folder).exists(),
-            monitor=monitor,
-            **options,
+        own = replace(
+            options,
+            init=None if options.init is None else own_folder(options.init, name, INFO),
+            resume=options.resume and unfinished_name(folder).exists(),
         )
+        return train_run(*pair, folder, recipe, own, stop=stop, monitor=monitor)
 
     return one_by_one(paired(sim, data), out, train, monitor.note, StoppedError)

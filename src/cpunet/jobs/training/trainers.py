@@ -9,7 +9,7 @@ from typing import Protocol
 
 from cpunet.jobs.training.cyclegan_trainer import CycleGanTrainer
 from cpunet.jobs.training.response_trainer import ResponseTrainer
-from cpunet.jobs.training.training_job import Trained, TrainingJob
+from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.process_group import ProcessGroup
@@ -39,16 +39,12 @@ class Trainer(Protocol):
         self,
         out: Path,
         read: Sequence[Path | str | None],
-        *,
-        resume: bool,
-        force: bool,
+        options: TrainOptions,
         note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of the folder to write to; see `cpunet.jobs.training.train.train_run`."""
 
-    def train(
-        self, job: TrainingJob, *, resume: bool, tensorboard: bool, stop: Callable[[], bool]
-    ) -> Trained | None:
+    def train(self, job: TrainingJob) -> Trained | None:
         """Train or resume; return None in a process that leaves writing to another one."""
 
 

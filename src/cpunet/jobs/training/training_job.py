@@ -15,7 +15,7 @@ from torch import nn
 from cpunet.jobs.common.devices import peak_memory_mb
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.training.matching import Sides
+from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup
@@ -41,35 +41,65 @@ class Trained(NamedTuple):
     recipe: Recipe
 
 
+@dataclass(frozen=True)
+class TrainOptions:
+    """How to train, see `cpunet.jobs.training.train.train_run`.
+
+    Parameters
+    ----------
+    peak
+        Energies to train on: a peak of the recipe or a range in keV.
+    seed
+        Seed of all random numbers.
+    device
+        ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
+    init
+        Folder of a run to start from, as of another detector or period: of the same kind, or
+        a matched one, which makes pairs for networks to learn first.
+    resume
+        Resume an unfinished training, if there is one; all else must be unchanged.
+    force
+        Replace an existing folder and, without `resume`, an unfinished training.
+    tensorboard
+        Write TensorBoard logs beside the losses (needs the extra ``tensorboard``).
+    """
+
+    peak: str = "FEP"
+    seed: int = 0
+    device: str = "auto"
+    init: Path | None = None
+    resume: bool = False
+    force: bool = False
+    tensorboard: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class TrainingJob:
     """What is trained, on which pulses and where.
 
     Parameters
     ----------
-    recipe, peak, seed, device, init
-        See `cpunet.jobs.training.train.train_run`; the device is resolved.
+    options
+        The device is resolved.
     group
         Processes that train together.
     sim, data, data_file
         Prepared pulses of both sides, and the file of the measured ones.
     folder
         Folder to write to.
-    monitor
-        Receiver of the progress.
+    stop
+        Asked after each iteration of a CycleGAN whether to store its state and stop.
     """
 
     recipe: Recipe
-    peak: str
-    seed: int
-    device: str
+    options: TrainOptions
     group: ProcessGroup
-    init: Path | None
     sim: InputSet
     data: InputSet
     data_file: InputFile
     folder: Path
     monitor: Monitor
+    stop: Callable[[], bool] = lambda: False
 
     @property
     def sides(self) -> Sides:
@@ -80,17 +110,18 @@ class TrainingJob:
 
     def info(self, started: str, seconds: float) -> dict[str, Any]:
         """Provenance of a run, for ``run.json``; `seconds` is the time that it took."""
+        how = self.options
         return {
             "recipe": self.recipe.name,
-            "peak": self.peak,
-            "seed": self.seed,
-            "init": None if self.init is None else str(self.init),
-            "device": self.device,
+            "peak": how.peak,
+            "seed": how.seed,
+            "init": None if how.init is None else str(how.init),
+            "device": how.device,
             "processes": self.group.size,
             "threads": torch.get_num_threads(),
             "started": started,
             "seconds": round(seconds, 1),
-            "peak_memory_mb": peak_memory_mb(self.device),
+            "peak_memory_mb": peak_memory_mb(how.device),
             "dt_ns": self.data.dt_ns,
             "versions": versions(),
             "sim": self.sim.provenance(),

@@ -23,7 +23,6 @@ def write_lithium_library(
     layer: LithiumLayer,
     out: Path,
     *,
-    name: str = "lithium",
     step_mm: float = STEP_MM,
     force: bool = False,
 ) -> dict[str, float]:
@@ -38,10 +37,6 @@ def write_lithium_library(
     ----------
     layer
         Its numbers.
-    out
-        LH5 file to write.
-    name
-        Of the group.
     step_mm
         From depth to depth.
     force
@@ -74,7 +69,7 @@ def write_lithium_library(
         "activeness": (share[:, -1].copy(), ""),
     }
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
-        group = made.h5.create_group(name)
+        group = made.h5.create_group("lithium")
         for key, (values, units) in arrays.items():
             group[key] = values
             kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"

@@ -16,7 +16,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.memory import give_back_large_arrays
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.common.output_lock import only_writer
-from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.jobs.translation.translation_blocks import (
     NOISE_ROWS,
     Counts,
@@ -37,12 +37,12 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
-from cpunet.translation.learned_remains import NONE, wanted_pile_up, wanted_remains
+from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
 
-QUIET = Monitor()
+QUIET, DEFAULTS = Monitor(), TranslateOptions()
 BLOCK_SIZE = 4096  # pulses read at a time, fewer of long traces
 BLOCK_SAMPLES = 1 << 24
 
@@ -220,16 +220,8 @@ def translate_file(
     run: Path,
     source: InputFile,
     out: Path,
+    options: TranslateOptions = DEFAULTS,
     *,
-    inverse: bool = False,
-    noise: bool = True,
-    seed: int = 0,
-    table: str | None = None,
-    append_column: str | None = None,
-    realisations: int | None = None,
-    adc: Adc | None = None,
-    remains: str = NONE,
-    pile_up_khz: float = 0.0,
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
@@ -245,29 +237,7 @@ def translate_file(
     run
         Folder of a training run.
     source
-        Simulated pulses, or measured ones for `inverse`.
-    out
-        LH5 file to write.
-    inverse
-        Apply IREN (data → simulation-like) instead of REN.
-    noise, seed
-        Add noise, drawn with this seed, or none.
-    table
-        Where in the LH5 file to put the pulses; ``geds/ren`` or ``geds/iren`` if None.
-    append_column
-        Copy the file and add the pulses to the table that was read, as a column of this name.
-    realisations
-        Number of noise draws for each pulse: its row is repeated, and the column
-        ``realisation`` counts.
-    adc
-        Raw traces in ADC counts instead of normalised windows.
-    remains
-        Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
-        behind the data's quality cuts), ``"none"``, or a rate in kHz.
-    pile_up_khz
-        Rate in kHz of second pulses within a trace, with the columns ``n_piled``,
-        ``piled_kev`` and ``piled_ns``: their number, and energy and time (relative to the
-        trace's own pulse) of the largest.
+        Simulated pulses, or measured ones for the inverse.
     resume
         Leave an output as it is that was made of this source with this run and these options.
     device, force, monitor
@@ -285,9 +255,6 @@ def translate_file(
         If run, source or output cannot be used, options contradict each other, no pulse can be
         translated, the source changes meanwhile, or another process writes the same output.
     """
-    options = TranslateOptions(
-        inverse, noise, seed, table, append_column, realisations, adc, remains, pile_up_khz
-    )
     translation = FileTranslation(run, options, device)
     for note in translation.notes:
         monitor.note(note)

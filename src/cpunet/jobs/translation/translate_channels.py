@@ -9,13 +9,20 @@ from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, 
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.training.run_folder import INFO
 
-QUIET = Monitor()
+QUIET, DEFAULTS = Monitor(), TranslateOptions()
 
 
 def translate_channels(
-    runs: Path, source: InputFile, out: Path, *, monitor: Monitor = QUIET, **options: Any
+    runs: Path,
+    source: InputFile,
+    out: Path,
+    options: TranslateOptions = DEFAULTS,
+    *,
+    monitor: Monitor = QUIET,
+    **how: Any,
 ) -> Outcome[dict[str, Any]]:
     """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
@@ -27,7 +34,7 @@ def translate_channels(
         File whose table is ``"all"``.
     out
         Folder of the LH5 files.
-    monitor, options
+    options, how
         As for `cpunet.jobs.translation.translate.translate_file`.
 
     Returns
@@ -44,7 +51,7 @@ def translate_channels(
     def translate(name: str, pair: Pair, place: Path) -> dict[str, Any]:
         run = own_folder(runs, name, INFO)
         target = place.with_name(f"{name}.lh5")
-        return translate_file(run, pair[0], target, monitor=monitor, **options)
+        return translate_file(run, pair[0], target, options, monitor=monitor, **how)
 
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
     return one_by_one(channels, out, translate, monitor.note)

@@ -20,7 +20,31 @@ class Adc:
 
 @dataclass(frozen=True)
 class TranslateOptions:
-    """How to translate a file, see `translate_file`."""
+    """How to translate a file.
+
+    Parameters
+    ----------
+    inverse
+        Apply IREN (data → simulation-like) instead of REN.
+    noise, seed
+        Add noise, drawn with this seed, or none.
+    table
+        Where in the LH5 file to put the pulses; ``geds/ren`` or ``geds/iren`` if None.
+    append_column
+        Copy the file and add the pulses to the table that was read, as a column of this name.
+    realisations
+        Number of noise draws for each pulse: its row is repeated, and the column
+        ``realisation`` counts.
+    adc
+        Raw traces in ADC counts instead of normalised windows.
+    remains
+        Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
+        behind the data's quality cuts), ``"none"``, or a rate in kHz.
+    pile_up_khz
+        Rate in kHz of second pulses within a trace, with the columns ``n_piled``,
+        ``piled_kev`` and ``piled_ns``: their number, and energy and time (relative to the
+        trace's own pulse) of the largest.
+    """
 
     inverse: bool = False
     noise: bool = True

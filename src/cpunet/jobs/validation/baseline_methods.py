@@ -12,9 +12,9 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.measured_noise import noise_of_traces
+from cpunet.jobs.common.measured_remains import measured_remains
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import noise_of_traces
-from cpunet.jobs.common.remains import measured_remains
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
 

@@ -80,18 +80,36 @@ class Evaluation:
     metrics: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class ValidateOptions:
+    """How to validate a run.
+
+    Parameters
+    ----------
+    truth
+        ``.npz`` file with ``response``: the noise-free trace of each simulated pulse.
+    baselines
+        Whether to fit the baseline methods, which takes most of the time.
+    seed
+        Seed of noise and bootstraps.
+    ae_range_kev
+        Further energies to read on both sides for A/E against energy, such as 900 to 2350.
+    most
+        Largest number of pulses a side that are compared: of more, a random sample.
+    device
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    """
+
+    truth: Path | None = None
+    baselines: bool = True
+    seed: int = 0
+    ae_range_kev: Range | None = None
+    most: int = MOST_PULSES
+    device: str = "auto"
+
+
 def evaluate(
-    run: Path,
-    sim: InputFile,
-    data: InputFile,
-    *,
-    truth: Path | None,
-    rivals: bool,
-    seed: int,
-    device: str,
-    monitor: Monitor,
-    ae_range_kev: Range | None = None,
-    most: int = MOST_PULSES,
+    run: Path, sim: InputFile, data: InputFile, how: ValidateOptions, monitor: Monitor
 ) -> Evaluation:
     """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
@@ -100,14 +118,13 @@ def evaluate(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    info = read_info(run)
-    ren = REN.load(run, resolve_device(device))
-    iren = IREN.load(run, resolve_device(device))
+    info, device = read_info(run), resolve_device(how.device)
+    ren, iren = REN.load(run, device), IREN.load(run, device)
     recipe = ren.recipe
     names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
-    more = () if ae_range_kev is None else (ae_range_kev,)
-    sim_set, data_set = _load_both(ren, sim, data, names, more, most, monitor)
-    responses = None if truth is None else Responses(truth, sim_set)
+    more = () if how.ae_range_kev is None else (how.ae_range_kev,)
+    sim_set, data_set = _load_both(ren, sim, data, names, more, how.most, monitor)
+    responses = None if how.truth is None else Responses(how.truth, sim_set)
     others = fit_baseline_methods(
         sim_set,
         data_set,
@@ -115,16 +132,16 @@ def evaluate(
         parse_selection(str(info["peak"]), recipe.peaks),
         recipe,
         remains=ren.remains,
-        fitted=rivals,
+        fitted=how.baselines,
         monitor=monitor,
     )
-    made = translate_all(ren, others, sim_set, responses, seed, monitor)
+    made = translate_all(ren, others, sim_set, responses, how.seed, monitor)
     sets = [peak_sets(name, recipe, sim_set, data_set, made) for name in names]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}
     with monitor.stage("Scoring", len(sets)) as advance:
         for peak in sets:
-            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, seed)
+            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, how.seed)
             advance(1)
     if all("missing" in scores for scores in peaks.values()):
         raise CpunetError(
@@ -136,10 +153,10 @@ def evaluate(
         details = {}
         for peak in scored:
             details[peak.name] = peak_details(
-                peak, values[peak.name], recipe.scores.bootstraps, seed
+                peak, values[peak.name], recipe.scores.bootstraps, how.seed
             )
             advance(1)
-    kept = survivals(values, seed)
+    kept = survivals(values, how.seed)
     metrics = {
         "compared": _compared(run, info, sim_set, data_set),
         "peaks": peaks,
@@ -156,7 +173,9 @@ def evaluate(
         "ae_energy": ae_against_energy(sim_set, data_set, made, recipe),
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
-        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
+        "linearity": _linearity(
+            ren, max(scored, key=lambda peak: len(peak.sim_rows)), how.seed
+        ),
         "rivals": {
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,

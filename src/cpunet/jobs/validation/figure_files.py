@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from pathlib import Path
 
 from cpunet.analysis.html_pages import DPI
@@ -12,13 +11,13 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import evaluate
+from cpunet.jobs.validation.drawings import LOSSES, Drawing, drawings, figure_names, of_losses
+from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, read_drawings, write_drawings
-from cpunet.jobs.validation.figures import LOSSES, Drawing, drawings, figure_names, of_losses
 from cpunet.outputs import made_here, refuse_existing
 from cpunet.training.run_folder import read_info, read_losses, read_recipe
 
-QUIET = Monitor()
+QUIET, AS_USUAL = Monitor(), ValidateOptions()
 FORMATS = (".png", ".pdf", ".svg")
 
 
@@ -30,10 +29,7 @@ def draw_figures(
     out: Path,
     *,
     suffix: str = ".png",
-    truth: Path | None = None,
-    rivals: bool = True,
-    seed: int = 0,
-    device: str = "auto",
+    how: ValidateOptions = AS_USUAL,
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> list[Path]:
@@ -56,10 +52,8 @@ def draw_figures(
         Output folder, created if missing.
     suffix
         File format: ``.png``, ``.pdf`` or ``.svg``.
-    truth, rivals, seed, device, monitor
-        See `cpunet.jobs.validation.validate.validate_run`.
-    force
-        Whether to replace existing files.
+    how
+        How the pulses are scored.
 
     Returns
     -------
@@ -74,7 +68,7 @@ def draw_figures(
     """
     if suffix not in FORMATS:
         raise CpunetError(f"format {suffix!r} is not known; use {', '.join(FORMATS)}")
-    read = [folder, truth, *(file for side in (sim, data) if side for file in side.files)]
+    read = [folder, how.truth, *(file for side in (sim, data) if side for file in side.files)]
 
     def files_of(known: Collection[str]) -> dict[str, Path]:
         chosen = chosen_names(names, known)
@@ -90,8 +84,7 @@ def draw_figures(
         files_of(_possible(folder))  # before scoring, which takes a minute
         info = read_info(folder)
         sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
-        given = _Given(folder, sim, data, truth, rivals, seed)
-        found = given.drawings(device, monitor)
+        found = _scored(folder, sim, data, how, monitor)
     files = files_of(found)
     for name, file in files.items():
         with written_aside(file) as aside:
@@ -99,43 +92,23 @@ def draw_figures(
     return list(files.values())
 
 
-@dataclass(frozen=True)
-class _Given:
-    """A run and the inputs of its scores."""
-
-    run: Path
-    sim: InputFile
-    data: InputFile
-    truth: Path | None
-    rivals: bool
-    seed: int
-
-    def drawings(self, device: str, monitor: Monitor) -> dict[str, Drawing]:
-        """Load figures stored in the run folder if their inputs agree; else score and store."""
-        how = self.truth, self.rivals, self.seed
-        made = made_of(self.run, self.sim, self.data, *how)
-        store = self.run / STORE
-        if store.is_file():
-            found, of = read_drawings(store)
-            if of == made:
-                return found
-        scored = evaluate(
-            self.run,
-            self.sim,
-            self.data,
-            truth=self.truth,
-            rivals=self.rivals,
-            seed=self.seed,
-            device=device,
-            monitor=monitor,
-        )
-        found = drawings(scored)
-        try:
-            with written_aside(store) as aside:
-                write_drawings(aside, found, made)
-        except CpunetError as error:
-            monitor.note(f"warning: {error}; the next figure takes as long")
-        return found
+def _scored(
+    run: Path, sim: InputFile, data: InputFile, how: ValidateOptions, monitor: Monitor
+) -> dict[str, Drawing]:
+    """Load figures stored in the run folder if their inputs agree; else score and store."""
+    made = made_of(run, sim, data, how)
+    store = run / STORE
+    if store.is_file():
+        found, of = read_drawings(store)
+        if of == made:
+            return found
+    found = drawings(evaluate(run, sim, data, how, monitor))
+    try:
+        with written_aside(store) as aside:
+            write_drawings(aside, found, made)
+    except CpunetError as error:
+        monitor.note(f"warning: {error}; the next figure takes as long")
+    return found
 
 
 def chosen_names(names: list[str], known: Collection[str]) -> list[str]:

@@ -14,7 +14,8 @@ from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translation_record import run_print, source_print
-from cpunet.jobs.validation.figures import Drawing
+from cpunet.jobs.validation.drawings import Drawing
+from cpunet.jobs.validation.evaluation import ValidateOptions
 
 STORE = "figures.npz"
 _INDEX = "index"
@@ -23,22 +24,15 @@ _ARRAY = "array"  # in the index: placeholder for an array of the file
 Made = dict[str, Any]
 
 
-def made_of(
-    run: Path,
-    sim: InputFile,
-    data: InputFile,
-    truth: Path | None,
-    rivals: bool,
-    seed: int,
-) -> Made:
+def made_of(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -> Made:
     """Inputs of the figures, for `write_drawings`."""
     return {
         "run": run_print(run),
         "sim": source_print(sim),
         "data": source_print(data),
-        "truth": None if truth is None else source_print(InputFile(truth)),
-        "rivals": rivals,
-        "seed": seed,
+        "truth": None if how.truth is None else source_print(InputFile(how.truth)),
+        "rivals": how.baselines,
+        "seed": how.seed,
     }
 
 

@@ -13,14 +13,14 @@ from cpunet.analysis.report import REPORT, write_report
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import MOST_PULSES, Evaluation, evaluate
+from cpunet.jobs.validation.drawings import Drawing, drawings
+from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
-from cpunet.jobs.validation.figures import Drawing, drawings
-from cpunet.jobs.validation.views import report_views
+from cpunet.jobs.validation.report_charts import report_views
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.training.run_folder import read_info
 
-QUIET = Monitor()
+QUIET, AS_USUAL = Monitor(), ValidateOptions()
 
 
 def validate_run(
@@ -28,13 +28,8 @@ def validate_run(
     sim: InputFile,
     data: InputFile,
     out: Path,
+    how: ValidateOptions = AS_USUAL,
     *,
-    truth: Path | None = None,
-    rivals: bool = True,
-    seed: int = 0,
-    ae_range_kev: tuple[float, float] | None = None,
-    most: int = MOST_PULSES,
-    device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
@@ -52,18 +47,6 @@ def validate_run(
     out
         Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, from
         which `cpunet.jobs.validation.figure_files.draw_figures` redraws the figures.
-    truth
-        ``.npz`` file with ``response``: the noise-free trace of each simulated pulse.
-    rivals
-        Whether to fit the baseline methods, which takes most of the time.
-    seed
-        Seed of noise and bootstraps.
-    ae_range_kev
-        Further energies to read on both sides for A/E against energy, such as 900 to 2350.
-    most
-        Largest number of pulses a side that are compared: of more, a random sample.
-    device, force, monitor
-        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -75,11 +58,7 @@ def validate_run(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    found, _ = validated(
-        run, sim, data, out, truth=truth, rivals=rivals, seed=seed, ae_range_kev=ae_range_kev,
-        most=most, device=device, force=force, monitor=monitor,
-    )  # fmt: skip
-    return found.metrics
+    return validated(run, sim, data, out, how, force=force, monitor=monitor)[0].metrics
 
 
 def validated(
@@ -87,42 +66,24 @@ def validated(
     sim: InputFile,
     data: InputFile,
     out: Path | None,
+    how: ValidateOptions = AS_USUAL,
     *,
-    truth: Path | None = None,
-    rivals: bool = True,
-    seed: int = 0,
-    ae_range_kev: tuple[float, float] | None = None,
-    most: int = MOST_PULSES,
-    device: str = "auto",
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> tuple[Evaluation, dict[str, Drawing]]:
-    """As `validate_run`, with all that was found, and its figures by name.
-
-    Parameters
-    ----------
-    out
-        Report folder; None for none.
-    run, sim, data, truth, rivals, seed, ae_range_kev, most, device, force, monitor
-        As for `validate_run`.
-    """
+    """As `validate_run`, with all that was found, and its figures by name; out may be None."""
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
-    score = partial(
-        evaluate, run, sim, data, truth=truth, rivals=rivals, seed=seed, device=device,
-        monitor=monitor, ae_range_kev=ae_range_kev, most=most,
-    )  # fmt: skip
     if out is None:
-        found = score()
+        found = evaluate(run, sim, data, how, monitor)
         return found, drawings(found)
-    read = (run, *sim.files, *data.files, truth)
+    read = (run, *sim.files, *data.files, how.truth)
     with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
-        found = score()
+        found = evaluate(run, sim, data, how, monitor)
         to_draw = drawings(found)
-        made = made_of(run, sim, data, truth, rivals, seed)
-        write_drawings(folder / STORE, to_draw, made)
+        write_drawings(folder / STORE, to_draw, made_of(run, sim, data, how))
         with monitor.stage("Drawing", len(to_draw)) as advance:
-            notes = _notes(found.info, truth)
+            notes = _notes(found.info, how.truth)
             figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
     return found, to_draw

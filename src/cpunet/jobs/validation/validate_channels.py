@@ -8,12 +8,12 @@ from typing import Any
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import period_of
+from cpunet.jobs.validation.evaluation import ValidateOptions, period_of
 from cpunet.jobs.validation.summary_page import summarise_reports
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.training.run_folder import INFO
 
-QUIET = Monitor()
+QUIET, AS_USUAL = Monitor(), ValidateOptions()
 INDEX = "index.html"
 
 
@@ -22,10 +22,10 @@ def validate_channels(
     sim: InputFile,
     data: InputFile,
     out: Path,
+    how: ValidateOptions = AS_USUAL,
     *,
     force: bool = False,
     monitor: Monitor = QUIET,
-    **options: Any,
 ) -> Outcome[dict[str, Any]]:
     """Validate ``RUNS/CHANNEL`` for each channel of the data, in the folder ``OUT/CHANNEL``.
 
@@ -39,8 +39,6 @@ def validate_channels(
         Files; the table of the data is ``"all"``, that of the simulation may be.
     out
         Folder of the report folders.
-    force, monitor, options
-        As for `cpunet.jobs.validation.validate.validate_run`.
 
     Returns
     -------
@@ -55,7 +53,7 @@ def validate_channels(
 
     def validate(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
         run = own_folder(runs, name, INFO)
-        return validate_run(run, *pair, folder, force=force, monitor=monitor, **options)
+        return validate_run(run, *pair, folder, how, force=force, monitor=monitor)
 
     channels = paired(sim, data)
     outcome = one_by_one(channels, out, validate, monitor.note)

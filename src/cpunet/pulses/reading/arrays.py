@@ -33,17 +33,7 @@ class ArraySource(PulseSource):
             columns = _columns(options.path, headers)
         _require_plain(options.path, self._key, header)
         self._header = header
-        period_name = "dt_ns" if "dt_ns" in columns else "dt"
-        layout = Layout(
-            format="NumPy",
-            table=self._key,
-            n_pulses=header.shape[0],
-            length=header.shape[1],
-            columns=columns,
-            period_name=period_name,
-            period=columns.get(period_name),
-        )
-        super().__init__(options, layout)
+        super().__init__(options, Layout.of_array("NumPy", self._key, header.shape, columns))
 
     def _traces(self, size: int) -> Iterator[Traces]:
         row_bytes = self.length * self._header.dtype.itemsize

@@ -112,16 +112,7 @@ class Hdf5Source(PulseSource):
             dataset = file[chosen.path]
             require_stored(options.path, dataset)
             columns = columns_of(options.path, file[chosen.table or "/"])
-            period_name = "dt_ns" if "dt_ns" in columns else "dt"
-            layout = Layout(
-                format="HDF5",
-                table=chosen.path,
-                n_pulses=dataset.shape[0],
-                length=dataset.shape[1],
-                columns=columns,
-                period_name=period_name,
-                period=columns.get(period_name),
-            )
+            layout = Layout.of_array("HDF5", chosen.path, dataset.shape, columns)
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:

@@ -72,6 +72,15 @@ class Layout:
     period: Column | None = None
     period_hint: str = ""
 
+    @classmethod
+    def of_array(
+        cls, format: str, name: str, shape: tuple[int, ...], columns: Mapping[str, Column]
+    ) -> Layout:
+        """Layout of an array of shape ``(pulses, samples)`` and the columns beside it."""
+        period_name = "dt_ns" if "dt_ns" in columns else "dt"
+        period = columns.get(period_name)
+        return cls(format, name, shape[0], shape[1], columns, period_name, period)
+
 
 @dataclass(frozen=True)
 class Traces:

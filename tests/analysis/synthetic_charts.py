@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.analysis.comparisons import compare
-from cpunet.analysis.views import (
+from cpunet.analysis.chart_data import (
     distributions,
     method_looks,
     pulse_views,
     scatter_views,
     superpulse_views,
 )
+from cpunet.analysis.comparisons import compare
 from cpunet.recipes import load_recipe
 
 DT_NS = 16.0

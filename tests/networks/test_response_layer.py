@@ -8,9 +8,9 @@ import scipy.fft
 import torch
 
 from cpunet.electronics.chain import Electronics
+from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.presets import read_electronics
-from cpunet.electronics.response import linear_response
-from cpunet.networks.response import (
+from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
     ElectronicsResponse,

@@ -11,12 +11,12 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics
+from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.noise import coloured_noise
+from cpunet.electronics.noise_traces import coloured_noise
 from cpunet.electronics.presets import read_electronics
-from cpunet.electronics.response import linear_response
 from cpunet.errors import CpunetError
-from cpunet.networks.response import (
+from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
     ElectronicsResponse,
@@ -26,10 +26,10 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training import matching, translated
-from cpunet.training.half_maximum import at_half_maximum
-from cpunet.training.matching import Fit, fit_response
+from cpunet.training import response_fit, translated
+from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import Moments, Readings
+from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.translated import Noise, Translated
@@ -364,7 +364,7 @@ def test_energies_are_needed(problem: Problem) -> None:
 
 def test_steps_of_several_fits_are_one_count() -> None:
     told: list[tuple[int, float]] = []
-    counted = matching._counted(lambda *step: told.append(step))
+    counted = response_fit._counted(lambda *step: told.append(step))
     for step, chi_square in ((1, 9.0), (2, 5.0), (1, 8.0)):  # the last of another start
         counted(step, chi_square)
     assert told == [(1, 9.0), (2, 5.0), (3, 8.0)]

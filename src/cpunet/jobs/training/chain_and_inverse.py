@@ -10,20 +10,20 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.noise import measured_noise
-from cpunet.jobs.common.remains import FoundRemains, find_remains
 from cpunet.networks.hybrid import HybridGenerator
-from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.levenberg_marquardt import Listener
-from cpunet.training.matching import fit_response
 from cpunet.training.residual import fit_residual
+from cpunet.training.response_fit import fit_response
 from cpunet.training.run_folder import load_network, read_recipe
 
 

@@ -137,8 +137,6 @@ def pulse_views(
     measured: Mapping[str, FloatArray] | None = None,
     *,
     events: int = EVENTS,
-    n_before: int = BEFORE,
-    n_after: int = AFTER,
 ) -> View:
     """Single events by every method, with the nearest measured pulse.
 
@@ -154,16 +152,13 @@ def pulse_views(
         difference from its truth, or else from its REN translation, among `SEARCHED` pulses.
     events
         Number of selectable events, equally spaced over the rows.
-    n_before, n_after
-        Number of samples before the crossing of half the maximum, at which all pulses are
-        aligned, and from it on.
 
     Raises
     ------
     CpunetError
         If the methods of a peak have different numbers of pulses.
     """
-    window = (n_before, n_after)
+    window = (BEFORE, AFTER)
     peaks: View = {}
     for peak, methods in pulses.items():
         clean = {method.removesuffix(NO_NOISE): found for method, found in methods.items()}
@@ -182,7 +177,7 @@ def pulse_views(
             found |= _nearest(shown, measured[peak], window)
         found["methods"] = {method: packed(aligned) for method, aligned in shown.items()}
         peaks[peak] = found
-    return {"dt_ns": float(dt_ns), "before": n_before, "peaks": peaks}
+    return {"dt_ns": float(dt_ns), "before": BEFORE, "peaks": peaks}
 
 
 def spread(rows: npt.NDArray[np.int64], events: int = EVENTS) -> npt.NDArray[np.int64]:
@@ -194,9 +189,6 @@ def spread(rows: npt.NDArray[np.int64], events: int = EVENTS) -> npt.NDArray[np.
 def scatter_views(
     values: Mapping[str, Mapping[str, Mapping[str, Values]]],
     parameters_info: Mapping[str, Parameter] = PARAMETERS,
-    *,
-    axes: tuple[str, str] = SCATTER,
-    seed: int = 0,
 ) -> View:
     """Scatter plots of two parameters, with at most `POINTS` pulses per method.
 
@@ -206,18 +198,14 @@ def scatter_views(
         Values by peak, method and parameter.
     parameters_info
         Labels and units by parameter.
-    axes
-        Parameters of the horizontal and of the vertical axis.
-    seed
-        Seed of the choice of pulses.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     peaks: View = {}
     for peak, methods in values.items():
         pairs = {
-            method: np.array([found[axis] for axis in axes], dtype=float)
+            method: np.array([found[axis] for axis in SCATTER], dtype=float)
             for method, found in methods.items()
-            if all(axis in found for axis in axes)
+            if all(axis in found for axis in SCATTER)
         }
         if not pairs:
             peaks[peak] = {"missing": "no pulses with both parameters"}
@@ -237,7 +225,7 @@ def scatter_views(
         reference = pairs.get("data", next(iter(pairs.values())))
         found["home"] = [_home(row) for row in reference]
         peaks[peak] = found
-    return {"axes": [axis_info(name, parameters_info) for name in axes], "peaks": peaks}
+    return {"axes": [axis_info(name, parameters_info) for name in SCATTER], "peaks": peaks}
 
 
 def _peak_distributions(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpunet.recipes import load_recipe
-from cpunet.training.half_maximum import at_half_maximum, crossing
+from cpunet.training.half_maximum_alignment import at_half_maximum, crossing
 
 CONFIG = load_recipe("fast").matching.training
 TAIL_LEVEL = 0.8

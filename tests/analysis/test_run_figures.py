@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.special import ndtr
 
-from cpunet.analysis import figures
+from cpunet.analysis import run_figures
 from cpunet.analysis.comparisons import compare, data_axis
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
@@ -18,7 +18,7 @@ from cpunet.pulses.parameters import PARAMETERS
 from cpunet.recipes import load_recipe
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
-LOSSES = [name for panel in figures.LOSS_PANELS.values() for name in panel]
+LOSSES = [name for panel in run_figures.LOSS_PANELS.values() for name in panel]
 
 
 def render(figure: Figure) -> None:
@@ -38,7 +38,7 @@ def histogram_figure(values: dict[str, np.ndarray]) -> Figure:
     methods = {m: {"drift_time": v} for m, v in values.items() if m != "data"}
     comparison = compare(data, methods, SCORES, seed=1)["drift_time"]
     axis = data_axis(values["data"], SCORES.max_bins)
-    return figures.parameter_histograms(values, axis, "drift_time", "SEP", comparison)
+    return run_figures.parameter_histograms(values, axis, "drift_time", "SEP", comparison)
 
 
 def pulses(n: int, centre: float = 350.0) -> np.ndarray:
@@ -47,7 +47,7 @@ def pulses(n: int, centre: float = 350.0) -> np.ndarray:
 
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():
-    figure = figures.loss_curves(log(50), window=10)
+    figure = run_figures.loss_curves(log(50), window=10)
     render(figure)
     lines = [line for axes in figure.axes for line in axes.lines]
     assert len(lines) == 2 * len(LOSSES) == 16
@@ -58,23 +58,23 @@ def test_all_eight_losses_are_drawn_with_their_moving_average():
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_a_training_shorter_than_the_window_is_drawn(n):
-    render(figures.loss_curves(log(n)))
+    render(run_figures.loss_curves(log(n)))
 
 
 def test_a_loss_that_was_not_recorded_is_left_out():
-    figure = figures.loss_curves(log(20, ["cycle_forward"]))
+    figure = run_figures.loss_curves(log(20, ["cycle_forward"]))
     render(figure)
     assert [len(axes.lines) for axes in figure.axes] == [2, 0, 0]
 
 
 def test_an_empty_log_is_refused():
     with pytest.raises(CpunetError, match="log is empty"):
-        figures.loss_curves([])
+        run_figures.loss_curves([])
 
 
 def test_cycle_figure_draws_ten_pulses_in_each_panel():
     sets = pulses(15)
-    figure = figures.cycle_figure(sets, sets, sets, ("A", "B", "C"), 16.0)
+    figure = run_figures.cycle_figure(sets, sets, sets, ("A", "B", "C"), 16.0)
     render(figure)
     assert [len(axes.lines) for axes in figure.axes] == [10, 10, 10]
     assert [axes.get_title() for axes in figure.axes] == ["A", "B", "C"]
@@ -113,8 +113,8 @@ def test_histograms_of_one_event_and_of_none_are_drawn():
 def test_mean_pulse_differences_are_in_percent_of_the_charge():
     data = pulses(40)
     sets = {"data": data, "ren": 1.01 * data}
-    means = {method: figures.MeanPulse.of(windows) for method, windows in sets.items()}
-    figure = figures.mean_pulses(means, 16.0, "DEP")
+    means = {method: run_figures.MeanPulse.of(windows) for method, windows in sets.items()}
+    figure = run_figures.mean_pulses(means, 16.0, "DEP")
     render(figure)
     difference = figure.axes[1].lines[0].get_ydata()
     assert difference[-1] == pytest.approx(1.0, rel=1e-3)
@@ -122,14 +122,14 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
 
 
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
-    means = [figures.MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
-    render(figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP"))
+    means = [run_figures.MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
+    render(run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP"))
 
 
 def test_global_settings_neither_change_nor_matter():
     before = dict(mpl.rcParams)
     with mpl.rc_context({"font.size": 30.0, "axes.grid": False}):
-        figure = figures.loss_curves(log(5))
+        figure = run_figures.loss_curves(log(5))
         assert mpl.rcParams["font.size"] == 30.0
     assert dict(mpl.rcParams) == before
     assert figure.axes[0].xaxis.label.get_size() == 10.0

@@ -9,7 +9,7 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.noise import measured_noise, noise_of_traces
+from cpunet.jobs.common.measured_noise import measured_noise, noise_of_traces
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.pulses.writing import write_pulses

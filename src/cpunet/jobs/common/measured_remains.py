@@ -12,7 +12,7 @@ from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.networks.response import PADDING_BEFORE
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 

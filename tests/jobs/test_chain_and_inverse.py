@@ -17,10 +17,12 @@ from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.training.matching import Sides
+from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.network_start import network_start
 from cpunet.jobs.training.train import train_run
+from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
@@ -126,7 +128,9 @@ class Run(NamedTuple):
 @pytest.fixture(scope="module")
 def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder, monitor = tmp_path_factory.mktemp("runs") / "run", Listening()
-    info = train_run(*files, folder, RECIPE, seed=3, device="cpu", monitor=monitor)
+    info = train_run(
+        *files, folder, RECIPE, TrainOptions(seed=3, device="cpu"), monitor=monitor
+    )
     return Run(folder, info, monitor)
 
 
@@ -176,7 +180,9 @@ def test_files_are_translated_in_both_directions(
 ) -> None:
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
-    told = translate_file(run.folder, source, out, inverse=inverse, device="cpu")
+    told = translate_file(
+        run.folder, source, out, TranslateOptions(inverse=inverse), device="cpu"
+    )
     assert told == {"read": N, "translated": N, "rejections": {}}
     windows = open_pulses(out).read()
     assert windows.waveforms.shape == (N, 800)
@@ -194,8 +200,8 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
     told = translate_file(run.folder, InputFile(path), tmp_path / "a.lh5", device="cpu")
     assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
-    quiet = {"noise": False, "device": "cpu"}
-    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", **quiet)
+    quiet = TranslateOptions(noise=False)
+    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", quiet, device="cpu")
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 
@@ -209,7 +215,12 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
     monitor = Listening()
     info = train_run(
-        files.sim, data, tmp_path / "run", RECIPE, seed=3, device="cpu", monitor=monitor
+        files.sim,
+        data,
+        tmp_path / "run",
+        RECIPE,
+        TrainOptions(seed=3, device="cpu"),
+        monitor=monitor,
     )
     fit = info["fit"]
     assert fit["chi_square"] < 1.6 * fit["moments"]
@@ -251,7 +262,9 @@ def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> 
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
     monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, *SHORT])
-    info = train_run(other, files.data, tmp_path / "run", recipe, device="cpu", monitor=monitor)
+    info = train_run(
+        other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"), monitor=monitor
+    )
     fit = info["fit"]
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
     said = [note for note in monitor.warnings if "poor fit" in note]
@@ -265,9 +278,21 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
     more = Pulses.of(sampled(charge(N, seed=1)), dt_ns=DT_NS, energy_kev=energies)
     write_pulses(tmp_path / "sim.lh5", more)
     with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of 1000-1200 can be used, sim"):
-        train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,1000-1200", device="cpu")
+        train_run(
+            sim,
+            files.data,
+            tmp_path / "run",
+            RECIPE,
+            TrainOptions(peak="FEP,1000-1200", device="cpu"),
+        )
     with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
-        train_run(sim, files.data, tmp_path / "run", RECIPE, peak="FEP,300-400", device="cpu")
+        train_run(
+            sim,
+            files.data,
+            tmp_path / "run",
+            RECIPE,
+            TrainOptions(peak="FEP,300-400", device="cpu"),
+        )
     # a range that both sides have, but not all of it: what cannot be compared is counted
     monitor = Listening()
     info = train_run(
@@ -275,8 +300,7 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
         files.data,
         tmp_path / "r",
         load_recipe("fast", [*ONE_START, *SHORT]),
-        peak="1000-",
-        device="cpu",
+        TrainOptions(peak="1000-", device="cpu"),
         monitor=monitor,
     )
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
@@ -287,5 +311,5 @@ def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
     with pytest.raises(
         CpunetError, match=r"^40 simulated and \d+ measured pulses; 200 of each"
     ):
-        train_run(few, files.data, tmp_path / "run", RECIPE, device="cpu")
+        train_run(few, files.data, tmp_path / "run", RECIPE, TrainOptions(device="cpu"))
     assert [path.name for path in tmp_path.iterdir()] == ["few.lh5"]

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cpunet.analysis.comparisons import compare
-from cpunet.analysis.view_parts import packed, plain_label
-from cpunet.analysis.views import (
+from cpunet.analysis.chart_data import (
     POINTS,
     distributions,
     method_looks,
@@ -19,6 +17,8 @@ from cpunet.analysis.views import (
     scatter_views,
     superpulse_views,
 )
+from cpunet.analysis.comparisons import compare
+from cpunet.analysis.view_parts import packed, plain_label
 from cpunet.errors import CpunetError
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.recipes import load_recipe

@@ -19,7 +19,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.response import (
+from cpunet.jobs.inspection.chain_description import (
     describe_responses,
     learned_chain,
     stand_electronics,

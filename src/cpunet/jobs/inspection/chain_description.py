@@ -23,14 +23,14 @@ from cpunet.analysis.response_figure import (
 )
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.electronics.noise import noise_power
+from cpunet.electronics.noise_traces import noise_power
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.response_errors import propagated
 from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response import ElectronicsResponse
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig

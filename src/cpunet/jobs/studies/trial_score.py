@@ -18,7 +18,7 @@ from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.training.matching import Sides, match
+from cpunet.jobs.training.chain_and_inverse import Sides, match
 from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters

@@ -19,16 +19,16 @@ from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_fi
 from cpunet.analysis.baseline_spectra import spectrum_of_noise
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.drift_slices import Slices, Superpulse
-from cpunet.analysis.figures import (
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
+from cpunet.analysis.remains_figure import sizes_figure
+from cpunet.analysis.run_figures import (
     MeanPulse,
     cycle_figure,
     loss_curves,
     mean_pulses,
     parameter_histograms,
 )
-from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
-from cpunet.analysis.remains_figure import sizes_figure
 from cpunet.analysis.slice_figure import slice_figure
 from cpunet.jobs.validation.evaluation import Evaluation
 from cpunet.jobs.validation.peak_details import PeakDetails

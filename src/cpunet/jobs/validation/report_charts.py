@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.analysis.drift_slices import Slices
-from cpunet.analysis.style import NO_NOISE
-from cpunet.analysis.views import (
+from cpunet.analysis.chart_data import (
     distributions,
     method_looks,
     pulse_views,
@@ -18,6 +16,8 @@ from cpunet.analysis.views import (
     spread,
     superpulse_views,
 )
+from cpunet.analysis.drift_slices import Slices
+from cpunet.analysis.style import NO_NOISE
 from cpunet.jobs.validation.evaluation import Evaluation
 from cpunet.jobs.validation.peak_details import BEFORE
 from cpunet.jobs.validation.peak_sets import PeakSets
@@ -25,7 +25,7 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 
 def report_views(found: Evaluation) -> dict[str, Any]:
-    """Data of all charts, see `cpunet.analysis.views`."""
+    """Data of all charts, see `cpunet.analysis.chart_data`."""
     scored = [peak for peak in found.sets if found.values[peak.name]]
     # noise-free methods are shown with single pulses, where they are most informative
     values = {
