@@ -344,10 +344,10 @@ def test_the_installed_command(stand):
     if not executable.is_file():
         pytest.skip("cpunet is not installed beside this Python")
 
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
+    def run(program: list[object], *words: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [executable, *map(str, words)], capture_output=True, text=True, check=False
+            [*map(str, [*program, *words])], capture_output=True, text=True, check=False
         )
 
-    assert run("--help").returncode == 0
-    assert run("info", stand.sim).returncode == 0
+    assert "Usage" in run([sys.executable, "-m", "cpunet"], "--help").stdout
+    assert run([executable], "info", stand.sim).returncode == 0
