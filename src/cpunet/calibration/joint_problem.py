@@ -135,7 +135,7 @@ class JointProblem:
         self.held = held
         self.few = fewest(self.bands)
         self._translated: dict[int | None, tuple[Nearby, Values, list[Translated]]] = {}
-        self.clip = None
+        self._weigh(None)
 
     @property
     def clip(self) -> float | None:
@@ -144,6 +144,11 @@ class JointProblem:
 
     @clip.setter
     def clip(self, clip: float | None) -> None:
+        if clip != self._clip:
+            self._weigh(clip)
+
+    def _weigh(self, clip: float | None) -> None:
+        """Set the clip, and errors and correlations of the functions with it."""
         self._clip = clip
         self._wanted, self._sigma, self._whiten = [], [], []
         for band, functions in zip(self.bands, self.functions, strict=True):
@@ -298,6 +303,6 @@ class JointProblem:
         return translated
 
 
-def fewest(bands: Sequence[Band]) -> int:
+def fewest(bands: Sequence[Band], most: int = FOR_DERIVATIVES) -> int:
     """Number of first events sufficient for derivatives, with some of each band."""
-    return max(FOR_DERIVATIVES, *(int(band.rows[:OF_BAND][-1]) + 1 for band in bands))
+    return max(most, *(int(band.rows[:OF_BAND][-1]) + 1 for band in bands))
