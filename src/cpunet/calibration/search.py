@@ -237,10 +237,8 @@ class Search:
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
                 "that cannot be simulated; narrow a --prior, or --fix a parameter"
             )
-        reach = np.array([nuisance.reach for nuisance in nuisances])
-        far = (np.abs(there.centre - nearby.simulated_at) > reach)[list(free)]
-        short = any(len(there.slopes[i]) < len(there.base) for i in free)
-        return there.again(free) if far.any() or short else there
+        outdated = there.outdated(free, farthest / FARTHEST)
+        return there.again(outdated) if outdated else there
 
     def _ringing(self, problem: JointProblem) -> ElectronicsResponse | None:
         """A chain with ringing if it explains much of the remaining deviation."""
