@@ -163,3 +163,16 @@ def test_what_is_not_free_stays(sides):
     one.pulls(vector)
     assert parameters.coordinates[0] == 1.0
     assert parameters.coordinates[1] == pytest.approx(np.log(PHYSICS.nuisances[1].highest))
+
+
+def test_pulses_are_prepared_once_for_all_derivatives_of_the_chain(sides):
+    both = problem(*sides)
+    asked = []
+    prepared = both.prepared
+    both.prepared = lambda at, most=None: (asked.append(tuple(at)), prepared(at, most))[1]
+    vector = both.parameters.vector()
+    both.jacobian(vector, np.empty(0))
+    assert len(asked) == 3  # here, and for either parameter of the physics
+    here = both.pulls(vector)
+    both.nearby = Nearby(both.nearby.simulator, both.nearby.centre, sides[1], {}, None)
+    assert not np.allclose(both.pulls(vector), here)  # other pulses at the same place

@@ -60,6 +60,16 @@ def test_self_repulsion_is_never_negative(simulator):
     assert np.abs(nearby.slopes[2]).max() > 0
 
 
+def test_only_derivatives_from_afar_are_simulated_again():
+    base, far, reach = np.zeros((4, 2)), np.array([2.0, 0.1, 0.0]), np.ones(3)
+    near = np.array([1.5, 0.1, 0.0])
+    slopes = {0: base, 1: base, 2: base[:3]}
+    nearby = Nearby(None, far, base, slopes, {0: near, 1: np.zeros(3), 2: far})
+    assert nearby.outdated([0, 1, 2], reach) == [1, 2]  # the last of too few events
+    assert nearby.outdated([1], reach) == []  # what is not free does not count
+    assert Nearby(None, far, base, {}, {}).outdated([0], reach) == [0]
+
+
 @given(st.floats(1, 8), st.floats(-6, 6))
 def test_pulses_are_moved_where_they_are_told(width, samples):
     time = np.arange(200.0)

@@ -18,6 +18,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import Readings
 from cpunet.training.response_problem import Band, Parameters
+from cpunet.training.translated import Translated
 
 RIDGE = 0.05  # fraction of the identity in the correlation matrix of the functions
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
@@ -133,7 +134,8 @@ class JointProblem:
         self._energy_kev, self._recipe = energy_kev, recipe
         self.held = held
         self.few = fewest(self.bands)
-        self.clip = None
+        self._translated: dict[int | None, tuple[Nearby, Values, list[Translated]]] = {}
+        self._weigh(None)
 
     @property
     def clip(self) -> float | None:
@@ -142,6 +144,11 @@ class JointProblem:
 
     @clip.setter
     def clip(self, clip: float | None) -> None:
+        if clip != self._clip:
+            self._weigh(clip)
+
+    def _weigh(self, clip: float | None) -> None:
+        """Set the clip, and errors and correlations of the functions with it."""
         self._clip = clip
         self._wanted, self._sigma, self._whiten = [], [], []
         for band, functions in zip(self.bands, self.functions, strict=True):
@@ -258,14 +265,12 @@ class JointProblem:
         """Deviations of the functions of each band, from the first `most` events."""
         parameters = self.parameters
         parameters.set(vector)
-        waveforms = self.prepared(parameters.coordinates, most).waveforms
+        simulated = self._simulated(parameters.coordinates, most)
         draws = None if most is None else 1
         found = []
-        for i, (band, functions) in enumerate(zip(self.bands, self.functions, strict=True)):
-            n_rows = len(band.rows) if most is None else np.searchsorted(band.rows, most)
-            some = band.sim.first(int(n_rows))
-            rows = band.rows[: len(some)]
-            translated = replace(some, sim=waveforms[rows])
+        for i, (translated, functions) in enumerate(
+            zip(simulated, self.functions, strict=True)
+        ):
 
             def of(readings: Readings, functions: SlicedFunctions = functions) -> tuple[Values]:
                 return (readings.weights @ functions(readings, self._clip),)
@@ -277,7 +282,27 @@ class JointProblem:
             found.append((total / max(n, 1e-9) - self._wanted[i]) / self._sigma[i])
         return found
 
+    def _simulated(self, coordinates: Values, most: int | None) -> list[Translated]:
+        """Pulses of each band at some coordinates, from the first `most` events.
 
-def fewest(bands: Sequence[Band]) -> int:
+        The last ones are kept: derivatives of the chain all have the same pulses, whose
+        preparation and Fourier transform take longer than the chain.
+        """
+        kept = self._translated.get(most)
+        if kept is not None:
+            nearby, where, translated = kept
+            if nearby is self.nearby and np.array_equal(where, coordinates):
+                return translated
+        waveforms = self.prepared(coordinates, most).waveforms
+        translated = []
+        for band in self.bands:
+            n_rows = len(band.rows) if most is None else np.searchsorted(band.rows, most)
+            some = band.sim.first(int(n_rows))
+            translated.append(replace(some, sim=waveforms[band.rows[: len(some)]]))
+        self._translated[most] = self.nearby, coordinates.copy(), translated
+        return translated
+
+
+def fewest(bands: Sequence[Band], most: int = FOR_DERIVATIVES) -> int:
     """Number of first events sufficient for derivatives, with some of each band."""
-    return max(FOR_DERIVATIVES, *(int(band.rows[:OF_BAND][-1]) + 1 for band in bands))
+    return max(most, *(int(band.rows[:OF_BAND][-1]) + 1 for band in bands))

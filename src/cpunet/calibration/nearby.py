@@ -89,20 +89,21 @@ class Nearby:
     slopes
         Derivatives of the pulses by the position of the coordinate.
     simulated_at
-        Point of the derivatives, close to the centre.
+        Point at which each derivative was simulated, close to the centre.
     """
 
     simulator: Simulator
     centre: Values
     base: FloatArray
     slopes: Mapping[int, FloatArray]
-    simulated_at: Values
+    simulated_at: Mapping[int, Values]
 
     @classmethod
     def about(cls, simulator: Simulator, centre: Values, of: Sequence[int]) -> Nearby:
         """Simulate pulses at a point, and their derivatives in some coordinates."""
         base = simulator.exact(centre)
-        return cls(simulator, centre, base, _slopes(simulator, centre, of), centre)
+        slopes = _slopes(simulator, centre, of)
+        return cls(simulator, centre, base, slopes, dict.fromkeys(of, centre))
 
     def moved(self, centre: Values) -> Nearby:
         """Pulses at another point, with the same derivatives."""
@@ -111,10 +112,25 @@ class Nearby:
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
         """The same point, with some derivatives simulated anew for the first `most` events."""
         slopes = {**self.slopes, **_slopes(self.simulator, self.centre, of, most)}
-        renewed = set(self.slopes) <= set(of)
         return replace(
-            self, slopes=slopes, simulated_at=self.centre if renewed else self.simulated_at
+            self,
+            slopes=slopes,
+            simulated_at={**self.simulated_at, **dict.fromkeys(of, self.centre)},
         )
+
+    def outdated(self, of: Sequence[int], reach: Values) -> list[int]:
+        """Coordinates without derivatives for all events from within reach of the centre.
+
+        Only distances along the coordinates `of` count.
+        """
+        found = []
+        for i in of:
+            if i in self.slopes and len(self.slopes[i]) == len(self.base):
+                away = np.abs(self.centre - self.simulated_at[i])
+                if (away <= reach)[list(of)].all():
+                    continue
+            found.append(i)
+        return found
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Pulses of the first `most` events at some coordinates, shape (events, samples)."""

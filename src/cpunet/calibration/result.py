@@ -19,6 +19,11 @@ OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
 FAR, AT_BOUND = 3.0, 1e-6
 # Chi-square per moment beyond which the physics does not describe the data at all.
 HOPELESS = 50.0
+# Advice where a parameter is unexpected, besides the general one.
+ADVICE = {
+    "self_repulsion": "it acts within each hit, so hits merged within more (--cluster-mm 0.2) "
+    "need less of it"
+}
 # Minimum decrease of chi-square that is reported for a further parameter.
 WORTH_TELLING = 9.0
 
@@ -107,6 +112,7 @@ def notes(calibrated: Calibrated) -> list[str]:
             found.append(
                 f"{name} = {value:.4g} is {abs(off):.1f} errors of its prior from it: give a "
                 "wider --prior if that is possible, or free what else moves pulses so"
+                + (f"; {ADVICE[name]}" if name in ADVICE else "")
             )
     per = calibrated.chi_square / problem.moments
     asked = {k: v for k, v in calibrated.promised.items() if v > WORTH_TELLING}

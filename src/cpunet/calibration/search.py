@@ -37,6 +37,8 @@ FARTHEST, HALVINGS = 1.5, 4
 # Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
 # freed, and maximum number of such parameters.
 NEEDED, MAX_MORE = 25.0, 3
+# Events with which fixed parameters are looked at.
+LOOKED_AT_WITH = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,10 +237,8 @@ class Search:
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
                 "that cannot be simulated; narrow a --prior, or --fix a parameter"
             )
-        reach = np.array([nuisance.reach for nuisance in nuisances])
-        far = (np.abs(there.centre - nearby.simulated_at) > reach)[list(free)]
-        short = any(len(there.slopes[i]) < len(there.base) for i in free)
-        return there.again(free) if far.any() or short else there
+        outdated = there.outdated(free, farthest / FARTHEST)
+        return there.again(outdated) if outdated else there
 
     def _ringing(self, problem: JointProblem) -> ElectronicsResponse | None:
         """A chain with ringing if it explains much of the remaining deviation."""
@@ -272,9 +272,11 @@ class Search:
         """Expected decreases for fixed parameters, and the information on all."""
         parameters = problem.parameters
         missing = [i for i in self._looked_at if i not in problem.nearby.slopes]
+        few = fewest(self._bands, LOOKED_AT_WITH)
         if missing:
-            problem.nearby = problem.nearby.again(missing, problem.few)
+            problem.nearby = problem.nearby.again(missing, few)
         whole = self._problem(parameters.chain.response, problem.nearby, self._looked_at)
+        whole.few = few
         whole.parameters.coordinates = parameters.coordinates.copy()
         jacobian = _jacobian(whole)
         n, where = parameters.n_chain, whole.parameters.free
