@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: install install-locked lock install-dev demo test test-slow lint docs clean
+.PHONY: install install-locked lock install-dev demo test test-thorough test-slow lint docs clean
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
@@ -27,6 +27,10 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist 
 
 test: install-dev
 	$(PYTEST)
+
+# further variants of what `make test` proves: some minutes more
+test-thorough: install-dev
+	$(PYTEST) -m 'thorough and not slow'
 
 # with CPUNET_SLOW_MINUTES=15 none is begun after so long
 test-slow: install-dev

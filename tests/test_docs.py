@@ -40,7 +40,12 @@ KEV = 2614.511
 
 def blocks(*languages: str) -> list:
     return [
-        pytest.param(page, code, id=f"{page.relative_to(ROOT)}-{i}")
+        pytest.param(
+            page,
+            code,
+            id=f"{page.relative_to(ROOT)}-{i}",
+            marks=[pytest.mark.thorough] if page.name in TOO_LONG else [],
+        )
         for page in PAGES
         for i, (language, code) in enumerate(BLOCK.findall(page.read_text()))
         if language in languages
@@ -79,6 +84,7 @@ def test_the_commands(page, code):
                 assert (ROOT / word).exists(), f"{page.name}: {word}"
 
 
+@pytest.mark.thorough
 def test_the_commands_within_sentences():
     """What stands in a sentence may lack arguments, but its command and options are there."""
     for page in PAGES:

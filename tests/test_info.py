@@ -72,6 +72,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
         tracemalloc.stop()
 
 
+@pytest.mark.thorough
 def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
     flat = tmp_path / "flat.lh5"

@@ -55,6 +55,7 @@ def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
     assert told == ["20 0", "20 1", "30 0"]
 
 
+@pytest.mark.thorough
 def test_of_two_who_need_the_same_code_one_compiles(tmp_path: Path) -> None:
     package = tmp_path / "loops"
     package.mkdir()

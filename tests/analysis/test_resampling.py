@@ -61,6 +61,7 @@ def test_all_parameters_see_the_same_events():
     np.testing.assert_array_equal(draws.counts(bins, 3)[::-1], draws.counts(2 - bins, 3))
 
 
+@pytest.mark.thorough
 def test_errors_and_nulls_are_those_of_the_direct_bootstrap(either_way):
     """Values drawn with replacement and scored one by one; some values are missing."""
     rng = np.random.default_rng(3)

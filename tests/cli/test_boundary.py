@@ -140,6 +140,7 @@ def run(*words: object, **options: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.thorough
 def test_a_screen_without_our_signs(stand):
     told = run("info", stand.sim, env={"PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
     assert (told.returncode, told.stderr) == (0, "")
@@ -192,6 +193,7 @@ def test_an_output_is_in_place_even_if_nobody_can_be_told(monkeypatch):
     messages.fail("a log that is full stops nothing")
 
 
+@pytest.mark.thorough
 def test_names_that_are_no_text(tmp_path):
     name = os.fsencode(tmp_path) + b"/\xff\xfe.lh5"
     Path(os.fsdecode(name)).write_bytes(b"no pulses")

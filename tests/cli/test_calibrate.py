@@ -129,6 +129,7 @@ def test_it_is_a_run_like_any_other(calibrated, stand, command, tmp_path):
     assert done.code == 0, done.err
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "free",
     [

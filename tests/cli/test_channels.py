@@ -22,6 +22,7 @@ def raw(stand, tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.thorough
 def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, undrawn):
     files = ["--sim", stand.sim, "--data", raw, "--data-table", "all"]
     trained = command("train", *files, "--out", tmp_path / "runs", *tiny)

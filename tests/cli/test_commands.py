@@ -55,6 +55,7 @@ def test_the_run_folder(trained, stand):
     assert [record["iteration"] for record in records] == [0, 1, 2, 3]
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_weights(command, trained, stand, tiny, tmp_path):
     outcomes = [
         command("train", *stand.inputs, "--out", tmp_path / seed, "--seed", seed, *tiny)
@@ -338,6 +339,7 @@ def unscorable(monkeypatch):
     return lambda: monkeypatch.setattr("cpunet.jobs.validation.figure_files.evaluate", evaluate)
 
 
+@pytest.mark.thorough
 def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):
     out = tmp_path / "figures"
     words = ("figure", run, *stand.inputs, "--no-baselines", "--out", out, "--format")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 @pytest.mark.parametrize(
     "how",
@@ -59,6 +60,7 @@ def test_a_stopped_ensemble_leaves_no_process_and_goes_on(
     assert not list(folder.glob("*.unfinished"))
 
 
+@pytest.mark.thorough
 def test_a_table_and_a_figure(stand, tiny, command, tmp_path, no_pool):
     folder = tmp_path / "ens"
     words = [*stand.inputs, "--out", folder, "--seeds", 1, "--truth", stand.truth, *tiny]

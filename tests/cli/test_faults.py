@@ -57,8 +57,13 @@ SLOW_COMMANDS = {
     "explore": ("explore LEARNED --detector detector.yaml --points 4 --out", "out.html"),
     "export parameters": ("export LEARNED --to legend-pars --out", "out"),
 }
+# Those that draw or trace before they write.
+SECONDS = ("fields", "figure", "response", "export")
 ALL_COMMANDS = [
-    *COMMANDS,
+    *(
+        pytest.param(name, marks=[pytest.mark.thorough] if name in SECONDS else [])
+        for name in COMMANDS
+    ),
     *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_COMMANDS),
 ]
 SCORES = '{"peaks": {"FEP": {"parameters": {"drift_time": {"iou": {"ren": 80.0}}}}}}'
@@ -176,7 +181,7 @@ def test_a_fault_leaves_one_line_and_nothing_else(
     require_failed(outcome, before, home, status)
 
 
-@pytest.mark.parametrize("name", [name for name in ALL_COMMANDS if name != "train"])
+@pytest.mark.parametrize("name", [p for p in ALL_COMMANDS if p.values != ("train",)])
 def test_a_full_disk_leaves_one_line_and_nothing_else(command, home, tiny, name):
     words = ready_words(command, name, tiny)
     before = listing(home)
@@ -186,7 +191,10 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(command, home, tiny, name)
     assert "File too large" in outcome.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("name", ["simulate", "compare", "response", "stand"])
+@pytest.mark.parametrize(
+    "name",
+    ["simulate", "compare", pytest.param("response", marks=pytest.mark.thorough), "stand"],
+)
 def test_what_was_there_stays_if_its_replacement_fails(command, home, tiny, monkeypatch, name):
     words = words_of(name, tiny)
     assert command(*words).code == 0

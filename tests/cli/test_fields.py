@@ -59,6 +59,7 @@ def test_a_picture_of_each_detector(command, tmp_path: Path, name: str):
     assert 0.3 < height / width < 1
 
 
+@pytest.mark.thorough
 def test_a_picture_without_paths(command, tmp_path: Path):
     out = tmp_path / "fields.svg"
     assert command("fields", "ppc", *COARSE, "--no-paths", "--out", out).code == 0

@@ -73,6 +73,7 @@ def test_a_signal_stops_between_two_iterations(
     assert info["peak_memory_mb"]["host"] > 50
 
 
+@pytest.mark.thorough
 def test_a_second_signal_stops_at_once(command, words, trained, tmp_path, monkeypatch):
     def twice() -> None:
         signal.raise_signal(signal.SIGINT)
@@ -87,6 +88,7 @@ def test_a_second_signal_stops_at_once(command, words, trained, tmp_path, monkey
     assert result(tmp_path / "run") == result(trained)
 
 
+@pytest.mark.thorough
 def test_what_can_be_done_with_an_unfinished_training(
     command, words, stand, trained, tmp_path, monkeypatch
 ):
@@ -125,6 +127,7 @@ def test_what_can_be_done_with_an_unfinished_training(
     assert result(tmp_path / "run") == result(trained)
 
 
+@pytest.mark.thorough
 def test_force_begins_again(command, words, trained, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         at_record(patched, 2, lambda: signal.raise_signal(signal.SIGINT))

@@ -83,6 +83,7 @@ def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
 
 
+@pytest.mark.thorough
 def test_it_is_replaced_with_force_only(command, made: Path):
     words = ("stand", "--preset", "ornl", "--events", "DEP=5", "--out", made)
     assert "exists already" in command(*words).err

@@ -82,6 +82,7 @@ def test_the_rate_is_found_without_the_energies(found: Remains):
     assert found.describe()["percent_above"]["30_kev"]["law"] == pytest.approx(10.5, abs=1.5)
 
 
+@pytest.mark.thorough
 def test_recorded_energies_are_taken_if_they_do():
     found = Remains.of_traces([as_pulses(traces_of(0.5, broad=True))], PREPARATION)
     assert found.fit.recorded
@@ -136,11 +137,13 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
 
 
+@pytest.mark.thorough
 def test_traces_that_all_lie_on_remains_are_told():
     with pytest.raises(CpunetError, match="nearly all traces lie on remains"):
         Remains.of_traces([as_pulses(traces_of(3.0, "legend200"))], PREPARATION)
 
 
+@pytest.mark.thorough
 def test_slow_decays_are_told_by_their_levels():
     found = Remains.of_traces([as_pulses(traces_of(0.3, "legend200"))], PREPARATION)
     assert found.law is not None

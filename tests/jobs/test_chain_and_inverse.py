@@ -205,6 +205,7 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 
+@pytest.mark.thorough
 def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     files: Files, tmp_path: Path
 ) -> None:
@@ -258,6 +259,7 @@ def test_data_without_remains_are_given_none(run: Run) -> None:
     assert remains.law.rate_khz == 0
 
 
+@pytest.mark.thorough
 def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
@@ -272,6 +274,7 @@ def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> 
     assert f"chi-square is {fit['chi_square'] / fit['moments']:.1f} per moment" in said[0]
 
 
+@pytest.mark.thorough
 def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> None:
     energies = np.where(np.arange(N) < 50, 1100.0, KEV)
     sim = InputFile(tmp_path / "sim.lh5")
@@ -306,6 +309,7 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
 
 
+@pytest.mark.thorough
 def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
     few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1)))
     with pytest.raises(

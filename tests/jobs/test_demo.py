@@ -67,6 +67,7 @@ def interrupted(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> Path:
     )
 
 
+@pytest.mark.thorough
 def test_every_rival_and_the_truth_stand_beside_the_ren(
     whole: tuple[Path, dict[str, Any]],
 ) -> None:
@@ -84,6 +85,7 @@ def test_every_rival_and_the_truth_stand_beside_the_ren(
         assert max(edges[rival] for rival in BASELINE_METHODS) < edges["raw"] / 3
 
 
+@pytest.mark.thorough
 def test_finished_parts_are_kept_and_a_whole_one_is_refused(
     whole: tuple[Path, dict[str, Any]], interrupted: Path
 ) -> None:
@@ -172,6 +174,7 @@ def test_force_removes_nothing_but_what_a_demonstration_made(interrupted: Path) 
     assert contents(interrupted) == before
 
 
+@pytest.mark.thorough
 def test_force_makes_all_anew(interrupted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cpunet.jobs.demo.validate_run", lambda *_, **__: {})
     made = (interrupted / "stand" / "data.lh5").read_bytes()

@@ -109,6 +109,7 @@ def weights(run: Path) -> bytes:
     return (run / "weights.safetensors").read_bytes()
 
 
+@pytest.mark.thorough
 def test_a_seed_is_what_a_single_training_gives(files, made, tmp_path):
     train_run(*files, tmp_path / "1", RECIPE, TrainOptions(seed=1, device="cpu"))
     assert weights(made.folder / "seed_001") == weights(tmp_path / "1")
@@ -136,6 +137,7 @@ def test_the_ensemble_tells_of_its_seeds(made):
     assert row["worst"] == pytest.approx(np.quantile(scores, 0.05))
 
 
+@pytest.mark.thorough
 def test_going_on_keeps_what_is_finished_and_records_what_fails(files, made, tmp_path, no_pool):
     folder = Path(shutil.copytree(made.folder, tmp_path / "ens"))
     before = (folder / "seed_000" / "run.json").stat().st_mtime_ns

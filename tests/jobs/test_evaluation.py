@@ -152,6 +152,7 @@ def test_slices_and_axes_say_which_time_they_mean(whole) -> None:
     assert made["FEP drift_time"].draw().axes[0].get_xlabel() in labels
 
 
+@pytest.mark.thorough
 def test_every_figure_can_be_drawn(whole) -> None:
     made = drawings(whole)
     assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(made)
@@ -160,6 +161,7 @@ def test_every_figure_can_be_drawn(whole) -> None:
         assert drawing.draw().axes
 
 
+@pytest.mark.thorough
 def test_figures_are_the_same_when_they_were_stored(whole, tmp_path) -> None:
     # those of one peak, and of none: the others' are of the same kinds
     made = {n: d for n, d in drawings(whole).items() if not n.startswith(("SEP", "DEP"))}

@@ -219,6 +219,7 @@ def test_a_matched_run_of_another_sampling_makes_no_pairs(chain, tmp_path) -> No
         train_run(*sides, tmp_path / "d", TINY, TrainOptions(init=chain))
 
 
+@pytest.mark.thorough
 def test_behind_a_chain_a_run_tells_its_fit_and_may_be_a_start(files, chain, tmp_path) -> None:
     begun = train_run(
         files["sim"],

@@ -107,6 +107,7 @@ def test_the_sides_are_events_of_their_own(tmp_path: Path) -> None:
     assert np.median(nearest) > 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("kind", "temperatures"), [("matched", [85.0]), ("shifted", [85.0, 87.0])]
 )

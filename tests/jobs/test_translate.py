@@ -818,6 +818,7 @@ def _telling(link):
     return work
 
 
+@pytest.mark.thorough
 def test_a_process_that_is_killed_costs_its_task():
     options = {"threads": 1, "monitor": Monitor()}
     found = list(work_off(partial(_ends, 3), ["a"], jobs=1, **options))

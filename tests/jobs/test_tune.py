@@ -221,6 +221,7 @@ def test_a_damaged_journal_is_one_line(tmp_path, damage):
         open_study(tmp_path, tiny())
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_a_search_that_was_killed_goes_on(files, held, tmp_path, monkeypatch, capsys, no_pool):
     pytest.importorskip("optuna")

@@ -168,6 +168,7 @@ def test_what_is_whole_is_still_read(tmp_path, codec):
     assert pulses.event_number.tolist() == list(range(N))
 
 
+@pytest.mark.thorough
 def test_every_flipped_bit_of_encoded_waveforms_is_met_or_harmless(tmp_path):
     """The compiled decoders write where these bytes tell them to."""
     for codec in (VARLEN, RADWARE):

@@ -165,6 +165,7 @@ def test_empty_blocks_between_others_add_nothing(tmp_path):
     assert open_pulses(path).read().event_number.tolist() == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.thorough
 def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
     block = some(250, 500)  # 0.5 MB
     tracemalloc.start()

@@ -197,6 +197,7 @@ def test_impurities_are_scaled_to_the_measured_depletion(
     assert alone.depletion_V == pytest.approx(measured, abs=1)
 
 
+@pytest.mark.thorough
 def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
     detector = read_detector("ppc", COARSE)
     with pytest.raises(CpunetError, match=r"no measured_depletion_V .* give"):

@@ -87,6 +87,7 @@ def test_library_agrees_with_the_exact_drift(
     assert rise.max() < 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "changed",
     [
@@ -126,6 +127,7 @@ def test_a_pulse_of_the_library_is_that_of_its_place(
     np.testing.assert_allclose(pulse, late, atol=0.01)
 
 
+@pytest.mark.thorough
 def test_what_misses_the_tolerance_is_drifted(planar: Maps) -> None:
     hits = random_events((14, 14), 600)
     exact = simulate_events(planar, hits, SETTINGS)

@@ -144,6 +144,7 @@ def test_a_training_moves_the_networks_and_not_the_chain(sim, data, surroundings
     assert bool(model.iren.outlet.weight.any())
 
 
+@pytest.mark.thorough
 def test_a_training_that_goes_on_ends_with_the_same_bits(sim, data, surroundings):
     states = []
     hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)))
@@ -154,6 +155,7 @@ def test_a_training_that_goes_on_ends_with_the_same_bits(sim, data, surroundings
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
 
 
+@pytest.mark.thorough
 def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
     torch.manual_seed(0)
     recipe = RECIPE.model_copy(

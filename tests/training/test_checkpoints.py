@@ -90,15 +90,14 @@ STOPS = {
     "fast-step": 2,
     "convolutional-judge": 3,
 }
-SLOW = {"small", "rare-judges", "large-batches"}  # the fast step is that of `small`
+MARKS = dict.fromkeys(("paper", "convolutional-judge"), pytest.mark.thorough)
+# the fast step is that of `small`
+MARKS |= dict.fromkeys(("small", "rare-judges", "large-batches"), pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("variant", "stop"),
-    [
-        pytest.param(name, stop, marks=[pytest.mark.slow] if name in SLOW else [])
-        for name, stop in STOPS.items()
-    ],
+    [pytest.param(name, stop, marks=MARKS.get(name, ())) for name, stop in STOPS.items()],
 )
 def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, variant, stop):
     recipe = recipe_of(tiny, *VARIANTS[variant])

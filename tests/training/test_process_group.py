@@ -276,6 +276,7 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["pulses", "vectors"])
 def test_a_norm_of_a_group_is_that_of_all_its_pulses(job, found, name):
     alone = norm_found(ALONE, *job["norms"][name])

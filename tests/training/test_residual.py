@@ -82,6 +82,7 @@ def fitted(
     return fit_residual(chain, charge(N, 1), data, np.full(N, KEV), recipe, seed=0)
 
 
+@pytest.mark.thorough
 def test_nothing_is_kept_where_the_physics_agree(chain):
     residual, kept = fitted(chain, 1.0)
     assert not kept.kept

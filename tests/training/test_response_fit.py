@@ -223,6 +223,7 @@ def test_what_a_fit_tells(near: Told) -> None:
     assert pulls.max() < 5
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     short = ("training.steps=1", "training.search_pulses=250", "training.start_factors=[1]")
     short += ("training.ringing_mhz=[]",)

@@ -121,6 +121,7 @@ def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
     assert np.abs(drawn - mean).max() > 1e-5
 
 
+@pytest.mark.thorough
 def test_torchscript_and_torch_export(run, chain, tmp_path):
     hybrid = write_chain(tmp_path / "best", "best")
     for folder, kind in ((run, IREN), (chain, REN), (chain, IREN), (hybrid, REN)):

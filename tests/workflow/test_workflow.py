@@ -166,6 +166,7 @@ def with_steps(place: Place) -> None:
         (place.folder / "stp" / f"{name}.lh5").write_text("steps")
 
 
+@pytest.mark.thorough
 def test_a_dry_run_of_libraries_and_events(place):
     with_steps(place)
     place.configure(whole_chain())
@@ -189,6 +190,7 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert "'all results/V01/library/ideal.lh5' --currents --device cpu --out" in told
 
 
+@pytest.mark.thorough
 def test_a_dry_run_with_calibrations(place):
     with_steps(place)
     config = whole_chain()
@@ -332,6 +334,7 @@ def test_a_defect_of_the_configuration_is_one_line(place, defect):
     assert "Traceback" not in done.stdout
 
 
+@pytest.mark.thorough
 def test_a_calibration_takes_one_file(place):
     config = whole_chain() | {"calibrate": {}}
     with_steps(place)
@@ -345,6 +348,7 @@ def test_a_calibration_takes_one_file(place):
     assert "detectors.V01.simulate.hits: 2 files, and calibrate takes one" in line
 
 
+@pytest.mark.thorough
 def test_a_chain_of_dspeed_that_is_not_there(place):
     with_steps(place)
     config = whole_chain()
@@ -420,6 +424,7 @@ def test_files_are_merged_in_order(tmp_path):
     assert set(merged["waveform"].dt.nda) == {16.0}
 
 
+@pytest.mark.thorough
 def test_files_that_do_not_belong_together_are_one_line(tmp_path):
     write_raw(tmp_path / "a.lh5", 0, 3)
     (tmp_path / "b.lh5").write_text("no pulses")

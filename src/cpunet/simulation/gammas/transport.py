@@ -60,7 +60,8 @@ def follow_photons(
     vacuum, nothing happens and the photon continues (Woodcock's method), so any outline is
     possible. A photon that leaves the cylinder around the crystal does not return.
     """
-    n_hits = 0
+    # numba compiles a function anew for each constant that it is called with
+    n_hits, electron = np.int64(0), np.bool_(False)
     while n_stack > 0:
         n_stack -= 1
         x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
@@ -91,7 +92,7 @@ def follow_photons(
                 kinetic = energy - bound
                 away = forward(direction, kinetic, rng)
                 n_hits, n_stack = slow_down(
-                    shape, electrons, (x, y, z), away, kinetic, False,
+                    shape, electrons, (x, y, z), away, kinetic, electron,
                     hits, n_hits, stack, n_stack, rng,
                 )  # fmt: skip
                 break
@@ -101,7 +102,7 @@ def follow_photons(
                 scattered = turned(direction, cosine, 2.0 * math.pi * rng.random())
                 recoil = remainder(energy, direction, left_over, scattered)
                 n_hits, n_stack = slow_down(
-                    shape, electrons, (x, y, z), recoil, energy - left_over, False,
+                    shape, electrons, (x, y, z), recoil, energy - left_over, electron,
                     hits, n_hits, stack, n_stack, rng,
                 )  # fmt: skip
                 energy, direction = left_over, scattered
