@@ -30,14 +30,13 @@ settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
 
-# What other packages compile when it is imported, half a minute in all; half in each process.
+# What other packages compile when it is imported, a third of a minute in each of two processes;
 COMPILED = (
-    ["lh5.compression.radware", "dspeed.processors.moving_windows"],
-    [
-        "lh5.compression.varlen",
-        *(f"dspeed.processors.{n}" for n in ("min_max", "time_point_thresh", "upsampler")),
-    ],
+    ("lh5.compression.radware", "lh5.compression.varlen"),
+    ("dspeed.processors.min_max", "dspeed.processors.time_point_thresh"),
 )
+# and what thorough tests hold ours against besides.
+COMPILED_TOO = (("dspeed.processors.moving_windows", "dspeed.processors.upsampler"),)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -50,15 +49,17 @@ def pytest_configure(config: pytest.Config) -> None:
     # freed arrays stay with a process: to be given new pages each time takes a tenth longer
     os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(32 << 20))
     os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 30))
+    thorough = "not thorough" not in config.option.markexpr
+    compiled = COMPILED + COMPILED_TOO if thorough else COMPILED
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
         os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
-        share_code(own)
+        share_code(own, code_of_others(compiled))
     elif getattr(config.option, "dist", "no") != "no":
         folder = tempfile.mkdtemp(prefix="cpunet-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["NUMBA_CACHE_DIR"] = folder
-        code_of_others()
+        code_of_others(compiled)
 
 
 def pytest_collection_finish() -> None:
@@ -67,7 +68,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def code_of_others() -> Path:
+def code_of_others(compiled: tuple[tuple[str, ...], ...]) -> Path:
     """Folder of compiled code of other packages; made if there is none of these versions.
 
     Only copies of it are used: two processes that add code to one folder at once may each
@@ -76,7 +77,7 @@ def code_of_others() -> Path:
     from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
     packages = ("numba", "llvmlite", "numpy", "dspeed", "legend-lh5io", "legend-pydataobj")
-    depends_on = [sys.version, sys.prefix, *map(version, packages), *COMPILED]
+    depends_on = [sys.version, sys.prefix, *map(version, packages), *compiled]
     depends_on += [get_host_cpu_name(), get_host_cpu_features().flatten()]
     key = hashlib.sha256(repr(depends_on).encode()).hexdigest()[:16]
     made = platformdirs.user_cache_path("cpunet") / "tests" / key
@@ -90,7 +91,7 @@ def code_of_others() -> Path:
                     [sys.executable, "-c", f"import {', '.join(modules)}"],
                     env=os.environ | {"NUMBA_CACHE_DIR": str(aside)},
                 )
-                for modules in COMPILED
+                for modules in compiled
             ]
             ended = [process.wait() for process in compiling]
             if any(ended):
@@ -99,13 +100,13 @@ def code_of_others() -> Path:
     return made
 
 
-def share_code(own: Path) -> None:
+def share_code(own: Path, others: Path) -> None:
     """Fill a process's folder of compiled code: a copy of others', and links to our own."""
     from numba.core.caching import _CacheLocator
 
     import cpunet
 
-    shutil.copytree(code_of_others(), own)
+    shutil.copytree(others, own)
     for folder in {file.parent for file in Path(cpunet.__file__).parent.rglob("*.py")}:
         kept = folder / "__pycache__"
         kept.mkdir(exist_ok=True)

@@ -179,6 +179,7 @@ def test_remains_of_earlier_pulses(sides, check):
     assert "remains of earlier pulses" in done.out
 
 
+@pytest.mark.thorough
 def test_training_tells_of_findings(sides, stand, tiny, command):
     few = sides.write_data(traces=sides.traces[:50], kev=sides.kev[:50])
     words = ["train", "--sim", sides.write_sim(), "--data", few, *tiny]

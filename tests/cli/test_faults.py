@@ -217,7 +217,10 @@ def killed_at_the_move(held: ModuleType, words: list[str], told: Path) -> int:
     return int(job.exitcode)
 
 
-KILLED_COMMANDS = ["simulate", "translate", "compare", "library make"]
+KILLED_COMMANDS = ["translate", "compare"]
+MORE_KILLED_COMMANDS = sorted(
+    (COMMANDS | SLOW_COMMANDS).keys() - {*KILLED_COMMANDS, "simulate", "library make", "train"}
+)
 
 
 @pytest.mark.parametrize(
@@ -225,9 +228,10 @@ KILLED_COMMANDS = ["simulate", "translate", "compare", "library make"]
     [
         *KILLED_COMMANDS,
         *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in sorted((COMMANDS | SLOW_COMMANDS).keys() - {*KILLED_COMMANDS, "train"})
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in ("simulate", "library make")
         ),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in MORE_KILLED_COMMANDS),
     ],
 )
 def test_what_was_killed_has_left_no_output_and_can_be_done_again(

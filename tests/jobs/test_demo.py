@@ -101,6 +101,7 @@ def test_finished_parts_are_kept_and_a_whole_one_is_refused(
         demonstrate(**OPTIONS, out=interrupted)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
@@ -138,6 +139,7 @@ def test_parts_made_with_other_options_are_not_mixed(
     assert contents(interrupted) == before
 
 
+@pytest.mark.thorough
 def test_the_description_of_a_recipe_does_not_matter(
     interrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,11 +148,13 @@ def test_the_description_of_a_recipe_does_not_matter(
     assert demonstrate(**{**OPTIONS, "recipe": other}, out=interrupted) == {"kept": True}
 
 
+@pytest.mark.thorough
 def test_a_run_without_its_stand_is_not_taken(interrupted: Path) -> None:
     shutil.rmtree(interrupted / "stand")
     assert "run: its stand is gone" in refused(interrupted)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", [None, "{", "[1]", "{}"])
 def test_a_damaged_stand_is_told(interrupted: Path, text: str | None) -> None:
     path = interrupted / "stand" / "stand.json"
@@ -160,6 +164,7 @@ def test_a_damaged_stand_is_told(interrupted: Path, text: str | None) -> None:
     refused(interrupted)
 
 
+@pytest.mark.thorough
 def test_force_removes_nothing_but_what_a_demonstration_made(interrupted: Path) -> None:
     report = interrupted / "report"
     report.mkdir()

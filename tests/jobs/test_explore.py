@@ -187,8 +187,8 @@ def test_what_a_run_cannot_translate_is_a_reason(runs, tmp_path, monkeypatch):
     whole = explore_runs(runs[:1], DETECTOR, tmp_path / "whole.html", points=POINTS)
     translate = REN.apply_with_codes
 
-    def fails(self: REN, windows: Any, **words: Any) -> Any:
-        result, codes = translate(self, windows, **words)
+    def fails(self: REN, windows: Any, *more: Any) -> Any:
+        result, codes = translate(self, windows, *more)
         result[[3, 8]], codes[[3, 8]] = np.nan, Rejection.NAN
         return result, codes
 

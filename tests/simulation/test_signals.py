@@ -91,6 +91,7 @@ def test_reference_pulses(reference_data: Path, reference_maps: Maps) -> None:
     assert (worst < 1e-3).sum() >= 192
 
 
+@pytest.mark.thorough
 def test_pulses_in_own_fields_agree_with_the_reference(reference_data: Path) -> None:
     with np.load(
         reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"

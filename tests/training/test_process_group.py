@@ -311,6 +311,7 @@ def test_alone_all_norms_stay_as_they_are():
     assert type(network[0]) is nn.BatchNorm1d
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("penalty", PENALTIES)
 def test_steps_are_those_of_one_process(job, found, sides, penalty):
     name = f"penalty {penalty}"
@@ -329,6 +330,7 @@ def test_steps_are_those_of_one_process(job, found, sides, penalty):
     assert same(found[0][name]["weights"], found[1][name]["weights"])
 
 
+@pytest.mark.thorough
 def test_a_training_is_that_of_one_process(job, found, sides):
     alone = training_found(ALONE, job["training"], sides)
     first, second = (one["training"] for one in found)
@@ -339,6 +341,7 @@ def test_a_training_is_that_of_one_process(job, found, sides):
         torch.testing.assert_close(first["weights"][key], expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_resumed_group_ends_with_the_same_bits(found):
     first, second = (one["resumed"] for one in found)
     assert (first["kept"], second["kept"]) == (1, 0)
@@ -350,6 +353,7 @@ def test_a_resumed_group_ends_with_the_same_bits(found):
     assert not torch.equal(*noises)
 
 
+@pytest.mark.thorough
 def test_a_state_goes_on_in_a_group_of_another_size(found, job, sides):
     recipe = load_recipe("paper", job["resumed"])
     states: list[Any] = []
@@ -366,12 +370,14 @@ def test_a_state_goes_on_in_a_group_of_another_size(found, job, sides):
     assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
 
 
+@pytest.mark.thorough
 def test_what_is_told_and_asked(found):
     for one in found:
         assert one["any"] == [False, True, True]
         assert one["told"] == [0, b"of 0"]
 
 
+@pytest.mark.thorough
 def test_other_settings_in_one_process(found):
     assert [one["others"] for one in found] == 2 * [
         "process 1 has other settings or pulses than process 0; start all with the same "
@@ -379,6 +385,7 @@ def test_other_settings_in_one_process(found):
     ]
 
 
+@pytest.mark.thorough
 def test_an_error_of_all_is_told_once(found):
     kinds = {one["diverged"][0] for one in found}
     assert kinds == {CpunetError.__name__, ToldElsewhereError.__name__}

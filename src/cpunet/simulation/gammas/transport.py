@@ -61,7 +61,7 @@ def follow_photons(
     possible. A photon that leaves the cylinder around the crystal does not return.
     """
     # numba compiles a function anew for each constant that it is called with
-    n_hits, electron = np.int64(0), np.bool_(False)
+    n_hits, electron = int(np.int64(0)), bool(np.bool_(False))
     while n_stack > 0:
         n_stack -= 1
         x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
