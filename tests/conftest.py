@@ -30,13 +30,14 @@ settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
 
-# What other packages compile when it is imported, a third of a minute in each of two processes;
+# What other packages compile when it is imported, a minute in all; half in each process.
 COMPILED = (
-    ("lh5.compression.radware", "lh5.compression.varlen"),
-    ("dspeed.processors.min_max", "dspeed.processors.time_point_thresh"),
+    ("lh5.compression.radware", "dspeed.processors.moving_windows"),
+    (
+        "lh5.compression.varlen",
+        *(f"dspeed.processors.{n}" for n in ("min_max", "time_point_thresh", "upsampler")),
+    ),
 )
-# and what thorough tests hold ours against besides.
-COMPILED_TOO = (("dspeed.processors.moving_windows", "dspeed.processors.upsampler"),)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,17 +50,15 @@ def pytest_configure(config: pytest.Config) -> None:
     # freed arrays stay with a process: to be given new pages each time takes a tenth longer
     os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(32 << 20))
     os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 30))
-    thorough = "not thorough" not in config.option.markexpr
-    compiled = COMPILED + COMPILED_TOO if thorough else COMPILED
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
         os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
-        share_code(own, code_of_others(compiled))
+        share_code(own, code_of_others())
     elif getattr(config.option, "dist", "no") != "no":
         folder = tempfile.mkdtemp(prefix="cpunet-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["NUMBA_CACHE_DIR"] = folder
-        code_of_others(compiled)
+        code_of_others()
 
 
 def pytest_collection_finish() -> None:
@@ -68,7 +67,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def code_of_others(compiled: tuple[tuple[str, ...], ...]) -> Path:
+def code_of_others() -> Path:
     """Folder of compiled code of other packages; made if there is none of these versions.
 
     Only copies of it are used: two processes that add code to one folder at once may each
@@ -77,7 +76,7 @@ def code_of_others(compiled: tuple[tuple[str, ...], ...]) -> Path:
     from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
     packages = ("numba", "llvmlite", "numpy", "dspeed", "legend-lh5io", "legend-pydataobj")
-    depends_on = [sys.version, sys.prefix, *map(version, packages), *compiled]
+    depends_on = [sys.version, sys.prefix, *map(version, packages), *COMPILED]
     depends_on += [get_host_cpu_name(), get_host_cpu_features().flatten()]
     key = hashlib.sha256(repr(depends_on).encode()).hexdigest()[:16]
     made = platformdirs.user_cache_path("cpunet") / "tests" / key
@@ -91,7 +90,7 @@ def code_of_others(compiled: tuple[tuple[str, ...], ...]) -> Path:
                     [sys.executable, "-c", f"import {', '.join(modules)}"],
                     env=os.environ | {"NUMBA_CACHE_DIR": str(aside)},
                 )
-                for modules in compiled
+                for modules in COMPILED
             ]
             ended = [process.wait() for process in compiling]
             if any(ended):

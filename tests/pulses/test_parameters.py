@@ -84,7 +84,6 @@ def production_chain(waveforms: np.ndarray) -> np.ndarray:
     return out["a_max"].nda
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("noise", [0.0, 7.5e-4, 0.05])
 def test_current_amplitude_equals_the_production_chain(noise):
     waveforms = multi_site(400, noise, seed=1)
@@ -92,7 +91,6 @@ def test_current_amplitude_equals_the_production_chain(noise):
     assert np.abs(current_amplitude(waveforms) - expected).max() < 1e-6
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("length", [6, 50, 97, 98, 150])
 def test_current_amplitude_of_short_records_equals_the_production_chain(length):
     waveforms = multi_site(50, 0.01, seed=2)[:, 300 : 300 + length]
@@ -220,7 +218,6 @@ def test_axis_labels_name_the_unit():
     assert PARAMETERS["drift_time"].axis_label == "Drift time, 1 % to maximum [ns]"
 
 
-@pytest.mark.thorough
 def test_current_amplitude_of_measured_traces_equals_the_production_chain(reference_data):
     import h5py
 

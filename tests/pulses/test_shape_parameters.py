@@ -138,7 +138,6 @@ def test_times_and_effective_drift_time_of_noisy_pulses():
 # --- current ------------------------------------------------------------------------
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("noise", [0.0, 7.5e-4, 0.05])
 def test_current_amplitude_equals_dspeeds_own_chain(noise):
     from dspeed.processors import min_max
@@ -148,7 +147,6 @@ def test_current_amplitude_equals_dspeeds_own_chain(noise):
     assert np.abs(parameters_of(waveforms)["current_amplitude"] - expected).max() < 1e-6
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("noise", [0.0, 7.5e-4, 0.01])
 def test_current_width_is_that_of_dspeeds_own_chain(noise):
     waveforms = multi_site(100, noise, seed=3)

@@ -393,6 +393,7 @@ def test_an_error_of_all_is_told_once(found):
         assert one["diverged"][1].startswith("training diverged: ")
 
 
+@pytest.mark.thorough
 def test_a_process_that_dies_ends_the_other(folder):
     kind, text = json.loads((folder / "lost-0.json").read_text())
     assert kind == CpunetError.__name__
