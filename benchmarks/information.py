@@ -6,6 +6,8 @@ by the moments alone and by optimal weights, and the shift of the translated cur
 of the double-escape peak from the truth is given for each.  Beside them stands a bound: the
 Fisher information of the best function of a pulse that a small network finds (Charnock et al.,
 Phys. Rev. D 97 (2018) 083004), on pulses that it has not seen.
+
+``python benchmarks/information.py STAND --run RUN`` prints the shift of a run alone.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 from cpunet.training.translated import Noise, Translated
+from cpunet.translation.translator import REN
 
 RECIPE = load_recipe("fast")
 CONFIG, TRAINING = RECIPE.matching
@@ -53,8 +56,12 @@ def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray
     """Median relative error of the translated current amplitude in percent."""
     with torch.no_grad():
         records = response(torch.from_numpy(windows)).numpy()
-    found = finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns))
-    return 100 * float(np.nanmedian(np.log(current_amplitude(found) / wanted)))
+    return off(finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns)), wanted)
+
+
+def off(translated: np.ndarray, wanted: np.ndarray) -> float:
+    """Median relative error of current amplitudes in percent."""
+    return 100 * float(np.nanmedian(np.log(current_amplitude(translated) / wanted)))
 
 
 def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
@@ -137,20 +144,28 @@ def main() -> None:
     parser.add_argument("stand", type=Path)
     parser.add_argument("--pulses", type=int, default=3300)
     parser.add_argument("--sets", type=int, default=5)
+    parser.add_argument(
+        "--run", type=Path, help="folder of a run: its shift is printed, no more"
+    )
     arguments = parser.parse_args()
+    windows, wanted = judged(arguments.stand)
+    if arguments.run is not None:
+        translated = REN.load(arguments.run).apply(windows, noise=False)
+        print(f"{arguments.run}: {off(translated, wanted):+.3f} %")
+        return
     files = [InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
     sim = load_simulated(files[0], RECIPE, selection, Monitor()).prepared.pulses
     data = load_measured(files[1], RECIPE, selection, Monitor()).prepared.pulses
     noise, _ = measured_noise(files[1], data, RECIPE.preparation)
-    windows, wanted = judged(arguments.stand)
     start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
     state = {name: value.clone() for name, value in start.state_dict().items()}
     shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
     n = arguments.pulses
     for k in range(min(arguments.sets, len(sim) // n, len(data) // n)):
         rows = slice(k * n, (k + 1) * n)
-        response = ElectronicsResponse(CONFIG, sim.dt_ns)
+        # with a ringing, if one was found
+        response = ElectronicsResponse(start.config, sim.dt_ns)
         response.load_state_dict(state)
         band = band_of(sim[rows], data[rows], noise, np.random.default_rng(k))
         problem = ResponseProblem(response, [band])

@@ -50,6 +50,19 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert translated.out.startswith("ch1  ")
     assert len(lh5.read("geds/iren/energy", out / "ch2.lh5")) == len(stand.data_kev)
 
+    # every option reaches the channels
+    refused = command(
+        "translate",
+        tmp_path / "runs",
+        raw,
+        *words[:3],
+        "--pile-up-khz",
+        1,
+        "--out",
+        tmp_path / "piled",
+    )
+    assert "leave out --pile-up-khz" in refused.out + refused.err
+
     again = command("train", *files, "--out", tmp_path / "runs", *tiny, "--resume")
     assert again.code == 2
     assert "ch1: trained already" in again.err
