@@ -17,6 +17,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) -e '.[dev]'
+	@echo compiling the loops that tests share: a minute or two
+	$(BIN)/python tests/compiled.py
 	touch $@
 
 demo: install

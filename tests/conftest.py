@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
-import hashlib
 import importlib.util
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import platformdirs
 import pytest
 import torch
 from hypothesis import settings
@@ -30,14 +24,18 @@ settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
 
-# What other packages compile when it is imported, a minute in all; half in each process.
-COMPILED = (
-    ("lh5.compression.radware", "dspeed.processors.moving_windows"),
-    (
-        "lh5.compression.varlen",
-        *(f"dspeed.processors.{n}" for n in ("min_max", "time_point_thresh", "upsampler")),
-    ),
-)
+
+def beside(name: str) -> ModuleType:
+    """A module of this folder, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+compiled = beside("compiled")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -53,64 +51,18 @@ def pytest_configure(config: pytest.Config) -> None:
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
         os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
-        share_code(own, code_of_others())
+        compiled.share(own, compiled.of_others())
     elif getattr(config.option, "dist", "no") != "no":
         folder = tempfile.mkdtemp(prefix="cpunet-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["NUMBA_CACHE_DIR"] = folder
-        code_of_others()
+        compiled.of_others()
 
 
 def pytest_collection_finish() -> None:
     """Leave what all tests keep, imported modules and tests, to no search for garbage."""
     gc.collect()
     gc.freeze()
-
-
-def code_of_others() -> Path:
-    """Folder of compiled code of other packages; made if there is none of these versions.
-
-    Only copies of it are used: two processes that add code to one folder at once may each
-    be given the other's, and crash.
-    """
-    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
-
-    packages = ("numba", "llvmlite", "numpy", "dspeed", "legend-lh5io", "legend-pydataobj")
-    depends_on = [sys.version, sys.prefix, *map(version, packages), *COMPILED]
-    depends_on += [get_host_cpu_name(), get_host_cpu_features().flatten()]
-    key = hashlib.sha256(repr(depends_on).encode()).hexdigest()[:16]
-    made = platformdirs.user_cache_path("cpunet") / "tests" / key
-    made.parent.mkdir(parents=True, exist_ok=True)
-    with made.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not made.exists():
-            aside = Path(tempfile.mkdtemp(dir=made.parent))
-            compiling = [
-                subprocess.Popen(
-                    [sys.executable, "-c", f"import {', '.join(modules)}"],
-                    env=os.environ | {"NUMBA_CACHE_DIR": str(aside)},
-                )
-                for modules in COMPILED
-            ]
-            ended = [process.wait() for process in compiling]
-            if any(ended):
-                raise pytest.UsageError("what other packages compile cannot be imported")
-            aside.replace(made)
-    return made
-
-
-def share_code(own: Path, others: Path) -> None:
-    """Fill a process's folder of compiled code: a copy of others', and links to our own."""
-    from numba.core.caching import _CacheLocator
-
-    import cpunet
-
-    shutil.copytree(others, own)
-    for folder in {file.parent for file in Path(cpunet.__file__).parent.rglob("*.py")}:
-        kept = folder / "__pycache__"
-        kept.mkdir(exist_ok=True)
-        name = _CacheLocator.get_suitable_cache_subpath(str(folder / "any.py"))
-        (own / name).symlink_to(kept)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -123,12 +75,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture(scope="session")
 def held() -> ModuleType:
     """The program whose trainings wait for a signal, see there."""
-    spec = importlib.util.spec_from_file_location("held", Path(__file__).with_name("held.py"))
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return beside("held")
 
 
 def work_here(patch: pytest.MonkeyPatch) -> None:

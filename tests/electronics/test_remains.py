@@ -90,7 +90,9 @@ def test_recorded_energies_are_taken_if_they_do():
     assert found.law.rate_khz == pytest.approx(0.5, abs=3 * found.fit.rate_error_khz)
 
 
-@pytest.mark.parametrize("preset", ["ornl", "legend200"])
+@pytest.mark.parametrize(
+    "preset", [pytest.param("ornl", marks=pytest.mark.thorough), "legend200"]
+)
 def test_nothing_is_invented_where_there_is_nothing(preset: str):
     found = Remains.of_traces([as_pulses(traces_of(0.0, preset))], PREPARATION)
     assert found.law is None

@@ -75,7 +75,7 @@ def counted(height: float, n: int) -> GammaStatistics:
     )
 
 
-@pytest.mark.parametrize("height", [20, 100])
+@pytest.mark.parametrize("height", [20, pytest.param(100, marks=pytest.mark.thorough)])
 def test_lines_agree_with_geant4(height: int) -> None:
     seen = counted(height, 480_000)
 

@@ -41,7 +41,10 @@ def steps_of(tiny, dtype: torch.dtype) -> tuple[Step, Step]:
 
 @pytest.mark.parametrize(
     ("dtype", "apart", "tolerance"),
-    [(torch.float64, True, 1e-9), (torch.float32, False, 1e-5)],
+    [
+        (torch.float64, True, 1e-9),
+        pytest.param(torch.float32, False, 1e-5, marks=pytest.mark.thorough),
+    ],
 )
 @pytest.mark.parametrize("steps", [10, pytest.param(20, marks=pytest.mark.slow)])
 def test_steps_have_the_same_losses(tiny, sets, dtype, apart, tolerance, steps):

@@ -91,6 +91,7 @@ def test_nothing_is_kept_where_the_physics_agree(chain):
     assert not any(p.any() for p in residual.outlet.parameters())
 
 
+@pytest.mark.thorough
 def test_wider_edges_are_learned(chain, tmp_path):
     residual, kept = fitted(chain, 2.2)
     assert kept.kept

@@ -143,6 +143,7 @@ def test_libraries_at_any_depth_and_without_t0(chain, tmp_path):
         assert made["t0"].attrs["units"] == "ns"
 
 
+@pytest.mark.thorough
 def test_reboost_reads_the_translated_library(chain, tmp_path):
     utils = pytest.importorskip("reboost.hpge.utils")
     source = write(tmp_path / "psl.lh5", templates(1500, 2.0), 2.0)

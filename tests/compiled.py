@@ -1,0 +1,123 @@
+"""Compiled loops that the tests share: those of other packages, and the package's own.
+
+Both are kept for later runs.  An installation for development makes them (``make install-dev``
+runs this module), as a first run of the program does; whatever is missing is compiled by the
+test that needs it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+# What other packages compile when it is imported, a minute in all; half in each process.
+OTHERS = (
+    ("lh5.compression.radware", "dspeed.processors.moving_windows"),
+    (
+        "lh5.compression.varlen",
+        *(f"dspeed.processors.{n}" for n in ("min_max", "time_point_thresh", "upsampler")),
+    ),
+)
+# Commands, run in one folder, that need nearly all loops of our own; half in each process.
+OWN = (
+    "stand --preset legend200 --events FEP=400 --out stand"
+    "; train --sim stand/sim.lh5 --data stand/data.lh5 --out run"
+    "; explore run --detector icpc --points 20 --out places.html",
+    "simulate --detector ppc --hits hits.npz --library --out library.lh5"
+    "; fields ppc --out fields.png",
+)
+RUN = """
+import sys
+from cpunet.cli.main import app
+for command in sys.argv[1:]:
+    app(command.split(), standalone_mode=False)
+"""
+
+
+def of_others() -> Path:
+    """Folder of compiled code of other packages; made if there is none of these versions.
+
+    Only copies of it are used: two processes that add code to one folder at once may each
+    be given the other's, and crash.
+    """
+    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
+    packages = ("numba", "llvmlite", "numpy", "dspeed", "legend-lh5io", "legend-pydataobj")
+    depends_on = [sys.version, sys.prefix, *map(version, packages), *OTHERS]
+    depends_on += [get_host_cpu_name(), get_host_cpu_features().flatten()]
+    key = hashlib.sha256(repr(depends_on).encode()).hexdigest()[:16]
+    made = platformdirs.user_cache_path("cpunet") / "tests" / key
+    made.parent.mkdir(parents=True, exist_ok=True)
+    with made.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            aside = Path(tempfile.mkdtemp(dir=made.parent))
+            compiling = [
+                subprocess.Popen(
+                    [sys.executable, "-c", f"import {', '.join(modules)}"],
+                    env=os.environ | {"NUMBA_CACHE_DIR": str(aside)},
+                )
+                for modules in OTHERS
+            ]
+            ended = [process.wait() for process in compiling]
+            if any(ended):
+                raise RuntimeError("what other packages compile cannot be imported")
+            aside.replace(made)
+    return made
+
+
+def share(own: Path, others: Path) -> None:
+    """Fill a process's folder of compiled code: a copy of others', and links to our own."""
+    from numba.core.caching import _CacheLocator
+
+    import cpunet
+
+    shutil.copytree(others, own)
+    for folder in {file.parent for file in Path(cpunet.__file__).parent.rglob("*.py")}:
+        kept = folder / "__pycache__"
+        kept.mkdir(exist_ok=True)
+        name = _CacheLocator.get_suitable_cache_subpath(str(folder / "any.py"))
+        (own / name).symlink_to(kept)
+
+
+def make_own() -> None:
+    """Run commands that need the package's own loops, in folders that are removed."""
+    with tempfile.TemporaryDirectory(prefix="cpunet-compiled-") as name:
+        folder = Path(name)
+        share(folder / "code", of_others())
+        np.savez(
+            folder / "hits.npz",
+            **{"x_mm": [10.0, 12.0], "y_mm": [5.0, 5.0], "z_mm": [20.0, 21.0]},
+            edep_keV=[900.0, 300.0],
+            offsets=[0, 2],
+        )
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "code")}
+        running = [
+            subprocess.Popen(
+                [sys.executable, "-c", RUN, *commands.split("; ")],
+                cwd=folder,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for commands in OWN
+        ]
+        for process in running:
+            _, told = process.communicate()
+            if process.returncode:
+                raise RuntimeError(told)
+
+
+if __name__ == "__main__":
+    make_own()
