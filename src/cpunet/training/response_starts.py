@@ -48,16 +48,28 @@ def from_known(
     decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum] | None:
-    """Fit from a response that is known, first as if the data were near; None if it is poor."""
+    """Fit from a response that is known, first as if the data were near; None if it is poor.
+
+    Its main decay is kept or is that of the data, whichever is nearer to them: tails of a
+    response with several decays do not fall with the main one.
+    """
     start = copy.deepcopy(known)
     set_decay(start, first.slope, decay)
-    problem, steps = first.of(start), 0
+    starts = [first.of(start)]
+    if decay is None:
+        starts.append(first.of(copy.deepcopy(known)))
+    problem, steps = min(starts, key=_distance), 0
     for coarse in (False, True):
         found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
         steps += found.steps
         if not is_poor(problem, found):
             return problem, found._replace(steps=steps)
     return None
+
+
+def _distance(problem: ResponseProblem) -> float:
+    residuals = problem.residuals(problem.parameters.vector())
+    return float(residuals @ residuals)
 
 
 def best_start(

@@ -1,0 +1,98 @@
+"""Where fits start, which searches a poor one goes through, and what ends it early."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.recipes import load_recipe
+from cpunet.training import response_fit, response_starts
+
+SEARCHES = ["_checked", "free_decay_if_better", "ringing_if_better"]
+PHYSICS = "_with_wrong_physics"
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "onset_is_off", "expected"),
+    [
+        (1.01, True, [PHYSICS]),
+        (1.01, False, [*SEARCHES, "_refined"]),
+        (0.99, True, [*SEARCHES, PHYSICS]),
+    ],
+)
+def test_nothing_else_is_tried_for_another_detector(
+    monkeypatch, chi_square, onset_is_off, expected
+):
+    """If the onset is off, too; `chi_square` is in units of `response_fit.ANOTHER_DETECTOR`."""
+    called: list[str] = []
+    problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None))
+    found = SimpleNamespace(cost=20 * chi_square * response_fit.ANOTHER_DETECTOR)
+
+    def replace(name: str, result: Any) -> None:
+        monkeypatch.setattr(response_fit, name, lambda *_, **__: called.append(name) or result)
+
+    for name in SEARCHES:
+        replace(name, (problem, found))
+    for name in (PHYSICS, "_refined"):
+        replace(name, name)
+    asked = {
+        "PulseSets": SimpleNamespace(bands=lambda _most=None: []),
+        "ElectronicsResponse": None,
+        "ResponseProblem": None,
+        "best_start": (problem, found),
+        "is_poor": True,
+        "_onset_is_off": onset_is_off,
+    }
+    for name, answer in asked.items():
+        monkeypatch.setattr(response_fit, name, lambda *_, answer=answer, **__: answer)
+    noise = SimpleNamespace(dt_ns=16.0)
+    _, fit = response_fit.fit_response(None, None, noise, load_recipe("fast"), seed=0)
+    assert called == expected
+    assert fit == expected[-1]
+
+
+@pytest.mark.parametrize(
+    ("true_us", "remains", "expected"),
+    [
+        (300.0, None, 300.0),  # its own decay fits, although tails fall with 100 us
+        (101.0, None, 100.0),  # that of the tails does: it is from other data
+        (300.0, KnownDecay(50.0, 0.01), 50.0),  # what baselines tell is taken in any case
+    ],
+)
+def test_a_known_response_starts_with_the_main_decay_that_fits(
+    monkeypatch, true_us, remains, expected
+):
+    class Problem:
+        """A chi-square that knows the main decay."""
+
+        slope = -16e-3 / 100.0  # of the tails, per sample
+
+        def __init__(self, response: ElectronicsResponse) -> None:
+            self.response = response
+            self.parameters = SimpleNamespace(vector=lambda: None)
+
+        def of(self, response: ElectronicsResponse) -> Problem:
+            return Problem(response)
+
+        def residuals(self, _vector: Any) -> np.ndarray:
+            return np.atleast_1d(self.response.log_decay_us.item() - math.log(true_us))
+
+    recipe = load_recipe("fast")
+    known = ElectronicsResponse(recipe.matching[0], 16.0)
+    known.log_decay_us.data.fill_(math.log(300.0))
+    monkeypatch.setattr(
+        response_starts,
+        "levenberg_marquardt",
+        lambda problem, *_, **__: response_starts.Minimum(0.0, 1, np.eye(1)),
+    )
+    monkeypatch.setattr(response_starts, "is_poor", lambda *_: False)
+    found = response_starts.from_known(Problem(known), known, recipe.matching[1], remains, None)
+    assert found is not None
+    assert math.exp(found[0].response.log_decay_us.item()) == pytest.approx(expected)
+    assert math.exp(known.log_decay_us.item()) == pytest.approx(300.0)  # it is left alone
