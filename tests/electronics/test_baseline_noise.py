@@ -225,11 +225,13 @@ def test_a_line_is_a_sine_of_its_height() -> None:
     assert heights.std() < 0.15 * heights.mean()
 
 
-def test_baselines_of_different_kinds_are_drawn_as_such() -> None:
+@pytest.mark.parametrize("n", [300, 1000])
+def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
+    """Also if they are few: small kinds are not drawn with what all have in common."""
     rng = np.random.default_rng(11)
-    heights = np.exp(rng.normal(0, 0.3, 1500))
+    heights = np.exp(rng.normal(0, 0.3, n))
     noise = BaselineNoise.from_traces(
-        on_baselines(heights[:, np.newaxis] * rng.normal(size=(1500, 1200))), CONFIG
+        on_baselines(heights[:, np.newaxis] * rng.normal(size=(n, 1200))), CONFIG
     )
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(12)) / TO_PREPARED
     width = np.log(drawn.std(axis=1))

@@ -8,6 +8,7 @@ frequencies, which determine the scatter of drift time and tail slope.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -116,11 +117,7 @@ class BaselineNoise:
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
         which = _kinds(flat, mean)
         counts = np.bincount(which)
-        # kinds with few baselines take the common spectrum
-        spectra = [
-            spectrum(flat[which == kind]) if counts[kind] >= MIN_N else (continuum, lines)
-            for kind in range(len(counts))
-        ]
+        spectra = [spectrum(flat[which == kind]) for kind in range(len(counts))]
         kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
         return replace(
             mean,
@@ -263,7 +260,8 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     spread exceeds that of baselines drawn from the mean spectrum.
     """
     one = np.zeros(len(flat), np.intp)
-    if len(flat) < KINDS * MIN_N:
+    kinds = min(KINDS, len(flat) // MIN_N)
+    if kinds < 2:
         return one
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
@@ -275,8 +273,14 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     if not len(axes):
         return one
     points = np.clip(own @ axes.T, -OUTLIER, OUTLIER)
-    _, which = scipy.cluster.vq.kmeans2(points, KINDS, minit="++", rng=rng, iter=50)
-    return np.asarray(which, np.intp)
+    # for an empty kind, the warning of which is no error: it is left out below
+    with warnings.catch_warnings(action="ignore"):
+        centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
+    # baselines of kinds with few go to the nearest with enough
+    enough = np.bincount(which, minlength=kinds) >= MIN_N
+    if not enough.any():
+        return one
+    return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
 
 
 def _band_powers(baselines: Values) -> Values:
