@@ -647,13 +647,15 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
         ({"pile_up_khz": 1e6}, "give a lower rate"),
         ({"pile_up_khz": 1.0, "noise": False}, "leave out --no-noise"),
         ({"pile_up_khz": 1.0, "inverse": True}, "leave out --pile-up-khz"),
+        ({"table": ""}, "--out-table is empty"),
+        ({"table": "/"}, "--out-table is empty"),
         ({"remains": "many"}, "--remains many: expected learned, none, or a rate in kHz"),
         ({"remains": "-1"}, "expected learned, none, or a rate"),
         ({"remains": "learned", "noise": False}, "leave out --no-noise"),
         ({"remains": "learned", "inverse": True}, "leave out --remains"),
     ],
 )
-def test_remains_that_cannot_be(busy, tmp_path, options, said):
+def test_options_that_cannot_be(busy, tmp_path, options, said):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
         translate_file(

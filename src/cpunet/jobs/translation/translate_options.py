@@ -61,6 +61,8 @@ class TranslateOptions:
             raise CpunetError(f"--realisations is {self.realisations}; expected 1 or more")
         if (self.realisations or 1) > 1 and not self.noise:
             raise CpunetError("realisations without noise are all the same; give one of both")
+        if self.table is not None and not self.table.strip("/ "):
+            raise CpunetError("--out-table is empty; leave it out, or give a name as geds/ren")
         if self.append_column is not None and self.realisations is not None:
             raise CpunetError(
                 "realisations repeat rows, so they cannot be a further column; "
