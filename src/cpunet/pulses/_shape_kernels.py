@@ -255,7 +255,7 @@ def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Value
     `stops`, with straight lines between samples.
     """
     areas = np.empty(len(waveforms))
-    _missing_areas(waveforms, starts, stops, areas)
+    _missing_areas(waveforms, np.ascontiguousarray(starts), stops, areas)
     return areas
 
 
