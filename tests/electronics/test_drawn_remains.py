@@ -57,7 +57,7 @@ def test_they_are_told_and_read_again():
 def test_noise_of_several_methods_is_drawn_once_and_is_what_each_would_draw():
     noise = TraceNoise(BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50), DRAWN)
     energies = np.linspace(500.0, 2000.0, 20)
-    # the second as the first, the others after another draw, for other pulses, for other records
+    # the second as the first; then after another draw, for other pulses, for other records
     asked = [
         (1, 0, energies, 600),
         (1, 0, energies, 600),
