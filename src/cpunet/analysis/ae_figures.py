@@ -132,10 +132,12 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
     figure = Figure(figsize=(0.9 + 3.1 * columns, 0.6 + 2.9 * rows))
     # beside the panels, in the same grid: a narrow column for the colours
     places = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [BAR])
-    grid = np.empty((rows, columns), object)
+    panels: list[Axes] = []
     for i, j in np.ndindex(rows, columns):
-        grid[i, j] = figure.add_subplot(places[i, j], sharex=grid[0, 0], sharey=grid[0, 0])
-        grid[i, j].label_outer()
+        first = panels[0] if panels else None
+        panels.append(figure.add_subplot(places[i, j], sharex=first, sharey=first))
+        panels[-1].label_outer()
+    grid = np.array(panels, object).reshape(rows, columns)
     top = shares["data"].max()
     for axes, (method, share) in zip(grid.flat, shares.items(), strict=False):
         drawn = axes.pcolormesh(

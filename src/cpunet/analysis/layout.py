@@ -42,7 +42,7 @@ class MeasuredLayout(ConstrainedLayoutEngine):
             super().execute(fig)
             return
         pads = self.get()
-        renderer = RendererAgg(*fig.bbox.size, fig.dpi)
+        renderer = RendererAgg(*fig.bbox.size, fig.dpi)  # type: ignore[no-untyped-call]
         rooms = [_room(axes, renderer) for axes in panels]
         top, bottom = _beyond_panels(fig, renderer, fig.dpi * pads["h_pad"])
         x = _columns(fig, specs, rooms, fig.dpi * pads["w_pad"])
@@ -134,12 +134,13 @@ def _rows(
 
 
 def _shared_out(
-    size: float, ratios: Sequence[float], before: Pixels, after: Pixels
+    size: float, ratios: npt.ArrayLike, before: Pixels, after: Pixels
 ) -> tuple[Pixels, Pixels] | None:
     """Where panels of given ratios begin and end along a side; None if nothing is left."""
     left = size - before.sum() - after.sum()
     if left <= 0:
         return None
-    inner = left * np.asarray(ratios, float) / np.sum(ratios)
+    shares = np.asarray(ratios, float)
+    inner = left * shares / shares.sum()
     ends = np.cumsum(before + inner + after) - after
     return ends - inner, ends

@@ -76,11 +76,11 @@ def validated(
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     if out is None:
         found = evaluate(run, sim, data, how, monitor)
-        return found, _drawings(found)
+        return found, drawings(found)
     read = (run, *sim.files, *data.files, how.truth)
     with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
         found = evaluate(run, sim, data, how, monitor)
-        to_draw = _drawings(found)
+        to_draw = drawings(found)
         found.forget_noisy()
         from cpunet.analysis.report import write_report
         from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
@@ -94,11 +94,12 @@ def validated(
     return found, to_draw
 
 
-def _drawings(found: Evaluation) -> dict[str, Drawing]:
+def drawings(found: Evaluation) -> dict[str, Drawing]:
+    """All figures of a validation by name."""
     # matplotlib is not needed while the pulses take most memory
-    from cpunet.jobs.validation.drawings import drawings
+    from cpunet.jobs.validation import drawings as figures
 
-    return drawings(found)
+    return figures.drawings(found)
 
 
 def _of_remains(info: Mapping[str, Any]) -> list[str]:
