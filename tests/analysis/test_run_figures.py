@@ -12,6 +12,7 @@ from scipy.special import ndtr
 
 from cpunet.analysis import run_figures
 from cpunet.analysis.comparisons import compare, data_axis
+from cpunet.analysis.mean_pulse import MeanPulse
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
@@ -113,7 +114,7 @@ def test_histograms_of_one_event_and_of_none_are_drawn():
 def test_mean_pulse_differences_are_in_percent_of_the_charge():
     data = pulses(40)
     sets = {"data": data, "ren": 1.01 * data}
-    means = {method: run_figures.MeanPulse.of(windows) for method, windows in sets.items()}
+    means = {method: MeanPulse.of(windows) for method, windows in sets.items()}
     figure = run_figures.mean_pulses(means, 16.0, "DEP")
     render(figure)
     difference = figure.axes[1].lines[0].get_ydata()
@@ -122,7 +123,7 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
 
 
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
-    means = [run_figures.MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
+    means = [MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
     render(run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP"))
 
 

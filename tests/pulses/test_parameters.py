@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import parameters
+from cpunet.pulses import _current_kernels, parameters
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import (
     PARAMETERS,
@@ -95,6 +95,33 @@ def test_current_amplitude_equals_the_production_chain(noise):
 def test_current_amplitude_of_short_records_equals_the_production_chain(length):
     waveforms = multi_site(50, 0.01, seed=2)[:, 300 : 300 + length]
     assert current_amplitude(waveforms) == pytest.approx(production_chain(waveforms), abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 40])
+def test_averages_of_several_pulses_are_those_of_dspeed_to_the_last_bit(n):
+    from dspeed.processors import avg_current, moving_window_multi, upsampler
+
+    waveforms = multi_site(n, 0.01, seed=4)
+    waveforms[0, 120] = np.nan
+    expected = np.empty((n, waveforms.shape[1] - 1), np.float32)
+    avg_current(waveforms, 1, expected)
+    fine = np.empty((n, (expected.shape[1] - 1) * 16), np.float32)
+    upsampler(expected, 16, fine)
+    smooth = np.empty_like(fine)
+    moving_window_multi(fine, 48, 3, 0, smooth)
+    current, steepest = _current_kernels.currents(waveforms)
+    np.testing.assert_array_equal(current, expected)
+    np.testing.assert_array_equal(steepest[1:], expected.argmax(axis=1)[1:])
+    found = _current_kernels.averaged_maxima(
+        current,
+        np.zeros(n, np.int64),
+        current.shape[1],
+        upsampling=16,
+        steps=48,
+        averages=3,
+        ends=5,
+    )
+    np.testing.assert_array_equal(found, smooth[:, 5:-5].max(axis=1))
 
 
 def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():

@@ -17,6 +17,7 @@ AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
 COLUMNS = 3  # panels per row
+BAR = 0.09  # width of the colours beside them, in panels
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 
@@ -129,7 +130,14 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
     columns = min(COLUMNS, len(shares))
     rows = -(-len(shares) // columns)
     figure = Figure(figsize=(0.9 + 3.1 * columns, 0.6 + 2.9 * rows))
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    # beside the panels, in the same grid: a narrow column for the colours
+    places = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [BAR])
+    panels: list[Axes] = []
+    for i, j in np.ndindex(rows, columns):
+        first = panels[0] if panels else None
+        panels.append(figure.add_subplot(places[i, j], sharex=first, sharey=first))
+        panels[-1].label_outer()
+    grid = np.array(panels, object).reshape(rows, columns)
     top = shares["data"].max()
     for axes, (method, share) in zip(grid.flat, shares.items(), strict=False):
         drawn = axes.pcolormesh(
@@ -151,7 +159,8 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
     for axes in grid.flat[len(shares) :]:
         axes.set_axis_off()
     _label_outer(grid.tolist(), len(shares))
-    figure.colorbar(drawn, ax=grid, label="Events per cell [%]", extend="max")
+    beside = figure.add_subplot(places[:, columns])
+    figure.colorbar(drawn, cax=beside, label="Events per cell [%]", extend="max")
     figure.suptitle(f"{peak}: A/E and drift time", x=0.02, ha="left", fontsize=10)
     return figure
 

@@ -12,17 +12,19 @@ well before the start of nine out of ten measured pulses, and the others are lef
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
 from cpunet.analysis.style import colours, label, styled
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Values = npt.NDArray[np.float64]
 
@@ -112,6 +114,8 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     peak
         Name of the gamma line, for the title.
     """
+    from matplotlib.figure import Figure
+
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     palette = colours(methods)
     frequency = np.asarray(found["frequency_mhz"])

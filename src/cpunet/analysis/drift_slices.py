@@ -140,15 +140,21 @@ def superpulses(
             f"{len(windows)} pulses beside rise times of shape {rise_time.shape}; "
             "give one for each"
         )
+    aligned = align_half_maximum(windows, before, after)
+    return sliced(aligned, rise_time, edges, before)
+
+
+def sliced(aligned: FloatArray, rise_time: Values, edges: Values, before: int) -> Slices:
+    """As `superpulses`, of pulses as `align_half_maximum` returns them."""
     timed = np.isfinite(rise_time)
     inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
     place = np.searchsorted(edges[1:-1], rise_time, side="right")
     found, unaligned = [], 0
     for i in range(len(edges) - 1):
-        aligned = align_half_maximum(windows[inside & (place == i)], before, after)
-        usable = np.isfinite(aligned).any(axis=1)
+        of_slice = aligned[inside & (place == i)]
+        usable = np.isfinite(of_slice).any(axis=1)
         unaligned += int((~usable).sum())
-        found.append(_mean(aligned[usable]))
+        found.append(_mean(of_slice[usable]))
     left_out = {
         "no_time": int((~timed).sum()),
         "outside": int((timed & ~inside).sum()),

@@ -20,6 +20,7 @@ from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.analysis.ae_energy_figure import ae_energy_html
 from cpunet.analysis.html_pages import asset, figure_html, figure_png, rendered
 from cpunet.analysis.nested_tables import nested_html, number
+from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.report_tables import (
     folded,
     gap,
@@ -28,17 +29,7 @@ from cpunet.analysis.report_tables import (
     survival_html,
     verdicts_html,
 )
-from cpunet.outputs import FolderKind
 
-METRICS = "metrics.json"
-REPORT = FolderKind(
-    name="report",
-    command="cpunet validate",
-    known_by=METRICS,
-    own=r"metrics\.json|report\.html|figures\.npz",
-    older=r"(spectrum|losses|.*_(forward_cycle|backward_cycle|mean_pulse|single_pulse|superpulses"
-    r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
-)
 FIRST = 2  # figures of mean pulses at the top of the page
 MANY = 4  # number of figures from which they are collapsed
 

@@ -7,7 +7,7 @@ made in worker processes and notebooks alike.  The caller saves them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import hist
 import numpy as np
@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import Comparison, histogram
-from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.mean_pulse import MeanPulse
 from cpunet.analysis.style import COLOURS, DATA_FILL, colours, label, styled
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -192,19 +192,6 @@ def parameter_histograms(
     return figure
 
 
-class MeanPulse(NamedTuple):
-    """Mean of `n` pulses, aligned at half maximum, which is at sample `before`."""
-
-    n: int
-    mean: Values
-    before: int = 100
-
-    @classmethod
-    def of(cls, waveforms: FloatArray, before: int = 100, after: int = 150) -> Self:
-        """Average pulses of shape ``(n, length)``."""
-        return cls(len(waveforms), _mean_aligned(waveforms, before, after), before)
-
-
 @styled
 def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figure:
     """Mean pulses aligned at half maximum, and their differences from the data.
@@ -304,11 +291,3 @@ def _mark_flow(
                 color=palette[method],
                 fontsize=8.5,
             )
-
-
-def _mean_aligned(waveforms: FloatArray, before: int, after: int) -> Values:
-    aligned = align_half_maximum(waveforms, before, after)
-    known = np.isfinite(aligned)
-    count = known.sum(axis=0)
-    total = np.where(known, aligned, 0).sum(axis=0, dtype=float)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

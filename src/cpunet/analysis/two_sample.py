@@ -209,7 +209,7 @@ def _extras(
 
 
 def _expanded(windows: Values, extra: Values) -> Values:
-    """Features of all pulses, independent of their side.
+    """Features of all pulses, independent of their side; the windows are overwritten.
 
     All blocks have about the same total variance, so that the many products do not
     outweigh the shape itself.
@@ -236,10 +236,14 @@ def _expanded(windows: Values, extra: Values) -> Values:
 
 
 def _components(windows: Values) -> tuple[Values, Values]:
-    """Leading principal components, and log RMS of the remainder and of its differences."""
+    """Leading principal components, and log RMS of the remainder and of its differences.
+
+    The windows are overwritten.
+    """
     from scipy.linalg import eigh
 
-    centred = windows - np.median(windows, axis=0)
+    centred = windows
+    centred -= np.median(windows, axis=0)  # in place: they are the caller's own, and many
     norms = np.linalg.norm(centred, axis=1, keepdims=True)
     # a few corrupted pulses must not determine the principal components
     limit = 3 * np.median(norms)

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import data_axis
-from cpunet.analysis.report import METRICS
+from cpunet.analysis.report_folder import METRICS
 from cpunet.calls import html
 from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown

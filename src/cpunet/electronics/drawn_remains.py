@@ -159,6 +159,40 @@ class TraceNoise:
         return drawn
 
 
+class SameNoise:
+    """Noise that several methods in turn add to the same records, drawn only once.
+
+    Parameters
+    ----------
+    noise
+        Noise of the records.
+    """
+
+    def __init__(self, noise: BaselineNoise | TraceNoise) -> None:
+        self._noise = noise
+        self._asked: tuple[Any, bytes, int] | None = None  # what was last drawn for
+        self._drawn: tuple[FloatArray, Any] | None = None  # and the generator's state after it
+
+    @property
+    def dt_ns(self) -> float:
+        """Sampling period of the noise in ns."""
+        return self._noise.dt_ns
+
+    def draw(
+        self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw as the noise itself would: the same again for a generator in the same state."""
+        asked = (rng.bit_generator.state, energy_kev.tobytes(), length)
+        if self._drawn is None or asked != self._asked:
+            self._asked = asked
+            self._drawn = (
+                self._noise.draw(energy_kev, length, rng),
+                rng.bit_generator.state,
+            )
+        drawn, rng.bit_generator.state = self._drawn
+        return drawn.copy()
+
+
 def passing(
     remains: Remains, traces: Iterable[Pulses], config: PreparationConfig, cuts: CutWindows
 ) -> tuple[float, ...] | None:

@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.drawn_remains import SameNoise, TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
+
+Noise = BaselineNoise | TraceNoise | SameNoise
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -27,7 +29,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise | None = None,
+    noise: Noise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
 ) -> FloatArray:
@@ -77,7 +79,7 @@ def finish_with_codes(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise | None = None,
+    noise: Noise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
@@ -95,7 +97,7 @@ def finish_both(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise,
+    noise: Noise,
     energy_kev: npt.NDArray[np.float64],
     seed: int | np.random.Generator = 0,
 ) -> tuple[FloatArray, FloatArray]:
@@ -108,7 +110,7 @@ def _finished(
     records: FloatArray,
     config: PreparationConfig,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise | None,
+    noise: Noise | None,
     energy_kev: npt.NDArray[np.float64] | None,
     seed: int | np.random.Generator,
     added: npt.NDArray[np.float64] | None = None,
@@ -146,7 +148,7 @@ def _finished(
 
 
 def _check_noise(
-    noise: BaselineNoise | TraceNoise,
+    noise: Noise,
     dt_ns: float,
     energy_kev: npt.NDArray[np.float64] | None,
     n: int,

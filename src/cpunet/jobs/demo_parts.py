@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from cpunet.analysis.report import METRICS, REPORT
+from cpunet.analysis.report_folder import METRICS, REPORT
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation.stand import MARKER, STAND
 from cpunet.jobs.simulation.stand_plan import StandPlan

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.pulses import _half_maximum_kernels as kernels
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -33,14 +34,7 @@ class Splines:
 
     def crossing(self, before: npt.NDArray[np.intp], level: Values) -> Values:
         """Time, in samples, at which each pulse reaches `level` after sample `before`."""
-        columns = before[:, np.newaxis] + PAD + np.arange(-1, 3)
-        local = np.take_along_axis(self.coefficients, columns, axis=1)
-        low, high = np.zeros(len(level)), np.ones(len(level))
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            under = (_weights(middle) * local).sum(axis=1) < level
-            low, high = np.where(under, middle, low), np.where(under, high, middle)
-        return before + 0.5 * (low + high)
+        return kernels.crossings(self.coefficients, before, PAD, level, BISECTIONS)
 
     def shifted(self, times: Values, n_before: int, n_after: int) -> Values:
         """Pulses from `n_before` samples before a time of each until `n_after` after it.
@@ -50,18 +44,7 @@ class Splines:
         numpy.ndarray
             Shape ``(n, n_before + n_after)``; NaN outside the record.
         """
-        start = np.floor(times).astype(int)
-        end = self.coefficients.shape[1] - 2 * PAD - (times > start)
-        moved = np.full((len(times), n_before + n_after), np.nan)
-        # row by row: fancy indexing of every sample would take ten times as long
-        for row, curve, at, known, weights in zip(
-            moved, self.coefficients, start, end, _weights(times - start), strict=True
-        ):
-            first, stop = max(at - n_before, 0), min(at + n_after, known)
-            if first < stop:
-                near = curve[first + PAD - 1 : stop + PAD + 2]
-                row[first - at + n_before : stop - at + n_before] = np.correlate(near, weights)
-        return moved
+        return kernels.shifted(self.coefficients, times, PAD, n_before, n_after)
 
 
 def last_below_half(
@@ -87,9 +70,3 @@ def last_below_half(
     below &= np.arange(length) < top[:, np.newaxis]
     last = length - 1 - below[:, ::-1].argmax(axis=1)
     return finite & (height > 0) & below.any(axis=1), last
-
-
-def _weights(fraction: Values) -> Values:
-    """Weights ``(n, 4)`` of the coefficients at -1, 0, 1, 2 for a time in 0 … 1."""
-    t, s = fraction, 1 - fraction
-    return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=1) / 6

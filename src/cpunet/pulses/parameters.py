@@ -1,8 +1,8 @@
 """Pulse-shape parameters of prepared pulses: current amplitude, drift time, tail slope.
 
 These are the three parameters by which the paper evaluates a translation (section 4.3).
-Current amplitude and drift time use dspeed's processors, so they equal the values of
-the experiments' production analysis.
+Current amplitude and drift time are those of dspeed's processors, so they equal the values
+of the experiments' production analysis.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.pulses import _current_kernels
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
@@ -59,8 +60,9 @@ def current_amplitude(waveforms: FloatArray) -> Values:
     .. math:: I_{\max} = \max_t \, (h * h * h * i)(t), \qquad i_k = x_{k+1} - x_k
 
     with the moving average :math:`h` over 48 steps of 1/16 sample, as defined by Majorana
-    (arXiv:1901.05388).  It is computed with dspeed's processors ``avg_current(1)`` →
-    ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``.
+    (arXiv:1901.05388).  It is the result of dspeed's processors
+    ``avg_current(1)`` → ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``,
+    whose arithmetic is repeated here for several pulses at once.
 
     Each value of that chain is a positively weighted mean of the current at most `REACH`
     samples away.  The chain is therefore first run only around the steepest point of a
@@ -280,30 +282,37 @@ def _by_blocks(
 
 
 def _current_amplitude(waveforms: FloatArray) -> Values:
-    from dspeed.processors import avg_current
-
     n, length = waveforms.shape
-    current = np.empty((n, length - 1), np.float32)
-    avg_current(waveforms, 1, current)
+    current, steepest = _current_kernels.currents(waveforms)
+    start = np.zeros(n, np.int64)
     if length - 1 <= NEIGHBOURHOOD:
-        values: Values = _averaged(current).max(axis=1).astype(float)
-        return values
-
-    first = current.argmax(axis=1) - NEIGHBOURHOOD // 2
-    first = np.clip(first, 0, length - 1 - NEIGHBOURHOOD)[:, np.newaxis]
-    near = np.take_along_axis(current, first + np.arange(NEIGHBOURHOOD), axis=1)
+        return _maximum(current, start, length - 1, 0)
+    first = np.clip(steepest - NEIGHBOURHOOD // 2, 0, length - 1 - NEIGHBOURHOOD)
     # near the ends of the neighbourhood the averages differ from those of the whole pulse
-    inner = slice(REACH * UPSAMPLING, (NEIGHBOURHOOD - REACH) * UPSAMPLING)
-    values = _averaged(near)[:, inner].max(axis=1).astype(float)
-
-    # samples that averages outside `inner` do not reach
-    sample = np.arange(length - 1)
-    inside = (sample >= first + 2 * REACH) & (sample < first + NEIGHBOURHOOD - 2 * REACH)
-    elsewhere = np.where(inside, -np.inf, current).max(axis=1)
-    unsure = ~(elsewhere <= values)
-    if unsure.any():
-        values[unsure] = _averaged(current[unsure]).max(axis=1)
+    values = _maximum(current, first, NEIGHBOURHOOD, REACH)
+    # samples that those averages do not reach
+    elsewhere = _current_kernels.maxima_elsewhere(
+        current, first + 2 * REACH, NEIGHBOURHOOD - 4 * REACH
+    )
+    unsure = np.flatnonzero(~(elsewhere <= values))
+    if len(unsure):
+        values[unsure] = _maximum(current[unsure], start, length - 1, 0)
     return values
+
+
+def _maximum(
+    current: FloatArray, first: npt.NDArray[np.int64], samples: int, ends: int
+) -> Values:
+    """Maximum of the averaged current, but for `ends` samples at either end."""
+    return _current_kernels.averaged_maxima(
+        current,
+        first,
+        samples,
+        upsampling=UPSAMPLING,
+        steps=AVERAGE_STEPS,
+        averages=AVERAGES,
+        ends=ends * UPSAMPLING,
+    )
 
 
 def _averaged(current: FloatArray) -> FloatArray:

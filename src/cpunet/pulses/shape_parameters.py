@@ -154,7 +154,11 @@ SHAPE_PARAMETERS: dict[str, ShapeParameter] = {
 
 
 def all_parameters(
-    pulses: Pulses, preparation: PreparationConfig, scores: ScoreConfig
+    pulses: Pulses,
+    preparation: PreparationConfig,
+    scores: ScoreConfig,
+    *,
+    amplitudes: Values | None = None,
 ) -> dict[str, Values]:
     """All parameters of `SHAPE_PARAMETERS`, each an array with one value per pulse.
 
@@ -166,6 +170,8 @@ def all_parameters(
         Preparation settings, with the alignment and the samples of baseline and tail.
     scores
         Score settings, with the fraction of the maximum at which the drift time begins.
+    amplitudes
+        Current amplitudes of the pulses, if they are known; else they are computed.
 
     Returns
     -------
@@ -197,17 +203,23 @@ def all_parameters(
     for first in range(0, len(pulses), BLOCK):
         rows = slice(first, first + BLOCK)
         block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
-        block[~np.isfinite(block).all(axis=1)] = np.nan  # treat infinities as NaN
+        damaged = ~np.isfinite(block).all(axis=1)
+        block[damaged] = np.nan  # treat infinities as NaN
+        known = None if amplitudes is None else np.where(damaged, np.nan, amplitudes[rows])
         # overflows become NaN below
         with np.errstate(all="ignore"):
-            found = _of_block(block, pulses.dt_ns, preparation, scores)
+            found = _of_block(block, pulses.dt_ns, preparation, scores, known)
         for name, column in found.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
     return values
 
 
 def _of_block(
-    block: FloatArray, dt_ns: float, preparation: PreparationConfig, scores: ScoreConfig
+    block: FloatArray,
+    dt_ns: float,
+    preparation: PreparationConfig,
+    scores: ScoreConfig,
+    amplitudes: Values | None,
 ) -> dict[str, Values]:
     fitted = preparation.decay_fit_samples
     slopes = tail_slope(block, dt_ns, fitted)
@@ -216,7 +228,7 @@ def _of_block(
         block, -slopes * dt_ns * 1e-6, fitted, LATE_FRACTION
     )
     return {
-        "current_amplitude": current_amplitude(block),
+        "current_amplitude": current_amplitude(block) if amplitudes is None else amplitudes,
         "current_width": kernels.current_widths(block, weights) * dt_ns,
         "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
         **_times(block, dt_ns, preparation.samples_before),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cpunet.analysis.report import METRICS
+from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.side_by_side import SideBySide, side_by_side
 from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError

@@ -19,11 +19,11 @@ from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_fi
 from cpunet.analysis.baseline_spectra import spectrum_of_noise
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.drift_slices import Slices, Superpulse
+from cpunet.analysis.mean_pulse import MeanPulse
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
 from cpunet.analysis.remains_figure import sizes_figure
 from cpunet.analysis.run_figures import (
-    MeanPulse,
     cycle_figure,
     loss_curves,
     mean_pulses,
@@ -129,7 +129,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         for parameter in scores["parameters"]
         if np.isfinite(found.values[name]["data"][parameter]).any()
     }
-    made["mean pulse"] = _mean_pulse(peak)
+    made["mean pulse"] = _mean_pulse(details, peak)
     row = _drawable(peak)
     if row is not None:
         made["single pulse"] = _single_pulse(peak, row, found)
@@ -162,11 +162,8 @@ def _histograms(
     )
 
 
-def _mean_pulse(peak: PeakSets) -> Drawing:
-    pulses = peak.by_method()
-    # one dataset at a time
-    sets = ((method, pulses[method].waveforms) for method in pulses if method in DRAWN)
-    means = {method: MeanPulse.of(one)._asdict() for method, one in sets if len(one)}
+def _mean_pulse(details: PeakDetails, peak: PeakSets) -> Drawing:
+    means = {m: mean._asdict() for m, mean in details.means.items() if m in DRAWN}
     return Drawing("mean pulse", {"sets": means, "dt_ns": peak.dt_ns, "peak": peak.name})
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from cpunet.analysis.ae_energy import against_energy
 from cpunet.analysis.range_survival import survival_by_range
 from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.validation.translations import Translations
-from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.parameters import Values
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
 
@@ -35,7 +34,7 @@ def validation_selection(
 def range_survivals(
     sim: InputSet,
     data: InputSet,
-    made: Translations,
+    amplitudes: Mapping[str, Values],
     ae_survival: Mapping[str, Any],
     recipe: Recipe,
 ) -> dict[str, Any]:
@@ -45,8 +44,8 @@ def range_survivals(
     ----------
     sim, data
         Prepared pulses of all energies of `validation_selection`.
-    made
-        Translations of the simulated pulses by all methods.
+    amplitudes
+        Current amplitudes of these pulses by method, and of the ``"data"``.
     ae_survival
         Cuts by method, see `cpunet.jobs.validation.pulse_tests.survivals`.
     recipe
@@ -61,14 +60,11 @@ def range_survivals(
     if not cuts:
         reason = ae_survival.get("missing", f"there are no events of the {CUT_PEAK}")
         return {"missing": f"there is no A/E cut: {reason}"}
-    windows = {"raw": sim.prepared.pulses.waveforms, **made.noisy}
-    windows["data"] = data.prepared.pulses.waveforms
-    methods = [method for method in windows if method in cuts]
-    amplitudes: dict[str, Values] = {m: current_amplitude(windows[m]) for m in methods}
+    methods = [method for method in amplitudes if method in cuts]
     sim_kev, data_kev = (side.prepared.pulses.energy_kev for side in (sim, data))
     return dict(
         survival_by_range(
-            amplitudes,
+            {method: amplitudes[method] for method in methods},
             {method: data_kev if method == "data" else sim_kev for method in methods},
             {m: np.nan if cuts[m] is None else cuts[m] for m in methods},
             {name: line for name, line in _lines(recipe).items() if name != CUT_PEAK},
@@ -78,15 +74,14 @@ def range_survivals(
 
 
 def ae_against_energy(
-    sim: InputSet, data: InputSet, made: Translations, recipe: Recipe
+    sim: InputSet, data: InputSet, amplitudes: Mapping[str, Values], recipe: Recipe
 ) -> dict[str, Any]:
     """Place and width of A/E's single-site peak against energy, of data and translation.
 
     All energies that were read take part, see `cpunet.analysis.ae_energy.against_energy`.
     """
-    windows = {"data": data.prepared.pulses.waveforms, "ren": made.noisy["ren"]}
     return against_energy(
-        {method: current_amplitude(of_method) for method, of_method in windows.items()},
+        {method: amplitudes[method] for method in ("data", "ren")},
         {"data": data.prepared.pulses.energy_kev, "ren": sim.prepared.pulses.energy_kev},
         {name: span for name, (span, _) in _lines(recipe).items()},
     )

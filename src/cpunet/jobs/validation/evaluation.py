@@ -32,7 +32,7 @@ from cpunet.jobs.validation.energy_ranges import (
     validation_selection,
 )
 from cpunet.jobs.validation.peak_details import PeakDetails, peak_details
-from cpunet.jobs.validation.peak_sets import PeakSets, peak_sets
+from cpunet.jobs.validation.peak_sets import PeakSets, current_amplitudes, peak_sets
 from cpunet.jobs.validation.pulse_tests import survivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
@@ -78,6 +78,11 @@ class Evaluation:
     values: Mapping[str, ByMethod]
     details: Mapping[str, PeakDetails]
     metrics: dict[str, Any]
+
+    def forget_noisy(self) -> None:
+        """Free the translated windows with noise: half of the memory, and only for scores."""
+        for peak in self.sets:
+            peak.made.noisy.clear()
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,8 @@ def evaluate(
         monitor=monitor,
     )
     made = translate_all(ren, others, sim_set, responses, how.seed, monitor)
-    sets = [peak_sets(name, recipe, sim_set, data_set, made) for name in names]
+    amplitudes = current_amplitudes(sim_set, data_set, made)
+    sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}
     with monitor.stage("Scoring", len(sets)) as advance:
@@ -162,7 +168,9 @@ def evaluate(
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
-            "survival by energy range": range_survivals(sim_set, data_set, made, kept, recipe),
+            "survival by energy range": range_survivals(
+                sim_set, data_set, amplitudes, kept, recipe
+            ),
             "A/E and drift time together": {
                 name: of_peak.plane_scores() for name, of_peak in details.items()
             },
@@ -170,7 +178,7 @@ def evaluate(
                 name: of_peak.ae_against_time for name, of_peak in details.items()
             },
         },
-        "ae_energy": ae_against_energy(sim_set, data_set, made, recipe),
+        "ae_energy": ae_against_energy(sim_set, data_set, amplitudes, recipe),
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
         "linearity": _linearity(

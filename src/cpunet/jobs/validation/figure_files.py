@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from cpunet.analysis.html_pages import DPI
-from cpunet.analysis.report import REPORT
+from cpunet.analysis.report_folder import REPORT
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile

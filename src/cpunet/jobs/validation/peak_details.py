@@ -11,12 +11,15 @@ from cpunet.analysis.drift_slices import (
     Slices,
     slice_edges,
     slice_table,
-    superpulses,
+    sliced,
 )
+from cpunet.analysis.mean_pulse import MeanPulse
+from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import NO_NOISE
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.jobs.validation.scoring import ByMethod
+from cpunet.pulses.parameters import Values
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150
@@ -30,6 +33,8 @@ class PeakDetails:
 
     Parameters
     ----------
+    means
+        Mean pulses by method, of methods with pulses.
     slices
         Superpulses by method; empty if they cannot be made.
     slice_table, ae_against_time, plane
@@ -37,6 +42,7 @@ class PeakDetails:
         ``missing`` with the reason.
     """
 
+    means: Mapping[str, MeanPulse] = field(default_factory=dict)
     slices: Mapping[str, Slices] = field(default_factory=dict)
     slice_table: Mapping[str, Any] = field(default_factory=dict)
     ae_against_time: Mapping[str, Any] = field(default_factory=dict)
@@ -63,8 +69,9 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     noisy = {m: v for m, v in values.items() if not m.endswith(NO_NOISE)}
     amplitude = {m: v["current_amplitude"] for m, v in noisy.items()}
     time = {m: v["drift_time"] for m, v in noisy.items()}
-    slices, table = _slices(peak, noisy)
+    means, slices, table = _aligned(peak, {m: v["rise_01_90"] for m, v in noisy.items()})
     return PeakDetails(
+        means=means,
         slices=slices,
         slice_table=table,
         ae_against_time=ae_against_drift_time(amplitude, time),
@@ -72,15 +79,22 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     )
 
 
-def _slices(peak: PeakSets, values: ByMethod) -> tuple[dict[str, Slices], dict[str, Any]]:
-    windows = peak.by_method()
-    times = {method: of_method["rise_01_90"] for method, of_method in values.items()}
+def _aligned(
+    peak: PeakSets, times: Mapping[str, Values]
+) -> tuple[dict[str, MeanPulse], dict[str, Slices], dict[str, Any]]:
+    """Mean pulses and superpulses by method, and a table of the latter.
+
+    Pulses are aligned once for both, one method at a time.
+    """
+    windows, means, slices = peak.by_method(), {}, {}
     try:
         edges = slice_edges(times["data"])
     except CpunetError as error:
-        return {}, {"missing": str(error)}
-    slices = {
-        method: superpulses(windows[method].waveforms, time, edges, BEFORE, AFTER)
-        for method, time in times.items()
-    }
-    return slices, slice_table(slices, peak.dt_ns)
+        edges, table = None, {"missing": str(error)}
+    for method, time in times.items():
+        aligned = align_half_maximum(windows[method].waveforms, BEFORE, AFTER)
+        if len(aligned):
+            means[method] = MeanPulse.of_aligned(aligned, BEFORE)
+        if edges is not None:
+            slices[method] = sliced(aligned, time, edges, BEFORE)
+    return means, slices, slice_table(slices, peak.dt_ns) if slices else table

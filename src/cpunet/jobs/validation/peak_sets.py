@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.validation.translations import Translations
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import Values
+from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 
@@ -38,6 +38,8 @@ class PeakSets:
         Rows of the pulses of the peak.
     made
         Translations of the simulated pulses by all methods.
+    amplitudes
+        Current amplitudes of all pulses with noise, see `current_amplitudes`.
     """
 
     name: str
@@ -46,6 +48,7 @@ class PeakSets:
     sim_rows: Rows
     data_rows: Rows
     made: Translations
+    amplitudes: Mapping[str, Values]
 
     @property
     def raw(self) -> Pulses:
@@ -76,6 +79,12 @@ class PeakSets:
             if len(rows) >= MIN_N or name == "ren":
                 makers[name] = partial(self._noisy, name, rows)
         return WhenAsked(makers)
+
+    def amplitudes_of(self, method: str) -> Values:
+        """Current amplitudes of the pulses with noise of one method, see `by_method`."""
+        rows = {"data": self.data_rows, "raw": self.sim_rows}
+        chosen = rows[method] if method in rows else self._whole(self.made.whole[method])
+        return self.amplitudes[method][chosen]
 
     def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
         """Parameters of the noise-free pulses of the baseline methods and of the truth."""
@@ -127,8 +136,25 @@ class PeakSets:
         return Pulses.of(self.made.noisy[name][rows], dt_ns=self.dt_ns)
 
 
+def current_amplitudes(
+    sim_set: InputSet, data_set: InputSet, made: Translations
+) -> dict[str, Values]:
+    """Current amplitudes of all pulses of the data, of the simulation, and with noise."""
+    windows = {
+        "raw": sim_set.prepared.pulses.waveforms,
+        **made.noisy,
+        "data": data_set.prepared.pulses.waveforms,
+    }
+    return {method: current_amplitude(of_method) for method, of_method in windows.items()}
+
+
 def peak_sets(
-    name: str, recipe: Recipe, sim_set: InputSet, data_set: InputSet, made: Translations
+    name: str,
+    recipe: Recipe,
+    sim_set: InputSet,
+    data_set: InputSet,
+    made: Translations,
+    amplitudes: Mapping[str, Values],
 ) -> PeakSets:
     """Select the pulses of one peak, or of a range of energies, from both datasets.
 
@@ -142,8 +168,10 @@ def peak_sets(
         Prepared pulses of both sides.
     made
         Translations of the simulated pulses by all methods.
+    amplitudes
+        Result of `current_amplitudes`.
     """
     selection = parse_selection(name, recipe.peaks)
     sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
     rows = [np.flatnonzero(selection.select(side.energy_kev)) for side in (sim, data)]
-    return PeakSets(name, sim, data, rows[0], rows[1], made)
+    return PeakSets(name, sim, data, rows[0], rows[1], made, amplitudes)

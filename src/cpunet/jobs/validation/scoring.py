@@ -47,7 +47,12 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         return {}, scores | {"parameters": {}, "missing": missing}
     pulses = peak.by_method()
     values = {
-        method: all_parameters(of_method, recipe.preparation, recipe.scores)
+        method: all_parameters(
+            of_method,
+            recipe.preparation,
+            recipe.scores,
+            amplitudes=peak.amplitudes_of(method),
+        )
         for method, of_method in pulses.items()
     } | peak.noise_free_parameters()
     chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}

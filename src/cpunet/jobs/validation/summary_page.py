@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from cpunet.analysis.report import METRICS
+from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.summary_page import Entry, summary_page
 from cpunet.analysis.verdicts import part
 from cpunet.errors import CpunetError

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from cpunet.analysis.paired import pair_squares
 from cpunet.electronics.baseline_methods.translating import translate_like_data
+from cpunet.electronics.drawn_remains import SameNoise
 from cpunet.electronics.finishing import blocks, finish, finish_both
 from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.common.monitor import Monitor
@@ -120,6 +121,8 @@ def translate_all(
     generator = ren.seeded(seed)
     # like the data with which they are compared
     remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+    # the generators of all methods are alike
+    noise = None if rivals.noise is None else SameNoise(rivals.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
     with monitor.stage("Translating", len(pulses)) as advance:
@@ -132,7 +135,7 @@ def translate_all(
                     if name == "truth"
                     else rivals.methods[name].translate(block.waveforms)
                 )
-                clean[name], drawn = _finished(records, block, rivals, recipe, rngs[name])
+                clean[name], drawn = _finished(records, block, noise, recipe, rngs[name])
                 if drawn is not None:
                     noisy[name][rows] = drawn
             clean["ren"] = ren.apply(block.waveforms, noise=False)
@@ -155,18 +158,18 @@ def translate_all(
 def _finished(
     records: FloatArray,
     pulses: Pulses,
-    rivals: FittedBaselineMethods,
+    noise: SameNoise | None,
     recipe: Recipe,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Windows without noise, and with noise if it is known."""
-    if rivals.noise is None:
+    if noise is None:
         return finish(records, recipe.preparation, dt_ns=pulses.dt_ns), None
     return finish_both(
         records,
         recipe.preparation,
         dt_ns=pulses.dt_ns,
-        noise=rivals.noise,
+        noise=noise,
         energy_kev=pulses.energy_kev,
         seed=rng,
     )

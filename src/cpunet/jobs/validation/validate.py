@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from matplotlib.figure import Figure
-
-from cpunet.analysis.report import REPORT, write_report
+from cpunet.analysis.report_folder import REPORT
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.drawings import Drawing, drawings
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
-from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
-from cpunet.jobs.validation.report_charts import report_views
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.training.run_folder import read_info
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from cpunet.jobs.validation.drawings import Drawing
 
 QUIET, AS_USUAL = Monitor(), ValidateOptions()
 
@@ -81,12 +81,25 @@ def validated(
     with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
         found = evaluate(run, sim, data, how, monitor)
         to_draw = drawings(found)
+        found.forget_noisy()
+        from cpunet.analysis.report import write_report
+        from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
+        from cpunet.jobs.validation.report_charts import report_views
+
         write_drawings(folder / STORE, to_draw, made_of(run, sim, data, how))
         with monitor.stage("Drawing", len(to_draw)) as advance:
             notes = _notes(found.info, how.truth)
             figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
     return found, to_draw
+
+
+def drawings(found: Evaluation) -> dict[str, Drawing]:
+    """All figures of a validation by name."""
+    # matplotlib is not needed while the pulses take most memory
+    from cpunet.jobs.validation import drawings as figures
+
+    return figures.drawings(found)
 
 
 def _of_remains(info: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,35 @@
+"""The mean pulse of a set, aligned at half maximum."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.analysis.paired import align_half_maximum
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+
+
+class MeanPulse(NamedTuple):
+    """Mean of `n` pulses, aligned at half maximum, which is at sample `before`."""
+
+    n: int
+    mean: Values
+    before: int = 100
+
+    @classmethod
+    def of(cls, waveforms: FloatArray, before: int = 100, after: int = 150) -> Self:
+        """Average pulses of shape ``(n, length)``."""
+        return cls.of_aligned(align_half_maximum(waveforms, before, after), before)
+
+    @classmethod
+    def of_aligned(cls, aligned: FloatArray, before: int) -> Self:
+        """Average pulses as `align_half_maximum` returns them."""
+        known = np.isfinite(aligned)
+        count = known.sum(axis=0)
+        total = np.where(known, aligned, 0).sum(axis=0, dtype=float)
+        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        return cls(len(aligned), mean, before)

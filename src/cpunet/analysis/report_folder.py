@@ -1,0 +1,15 @@
+"""The folder of a report: how it is known, and what in it is the program's own."""
+
+from __future__ import annotations
+
+from cpunet.outputs import FolderKind
+
+METRICS = "metrics.json"
+REPORT = FolderKind(
+    name="report",
+    command="cpunet validate",
+    known_by=METRICS,
+    own=r"metrics\.json|report\.html|figures\.npz",
+    older=r"(spectrum|losses|.*_(forward_cycle|backward_cycle|mean_pulse|single_pulse|superpulses"
+    r"|A_over_E|A_over_E_and_drift_time|noise|current_amplitude|drift_time|tail_slope))\.png",
+)
