@@ -12,6 +12,9 @@ with the covariance C of the functions: the efficient weights of the generalised
 moments (Hansen, Econometrica 50 (1982) 1029), and Fisher's linear discriminant between one
 response and the next.  J and C come from translated simulation, at a response that a fit has
 found; the parameters are those at which the means of t agree.
+
+With so many functions weights from the same pulses as the means make a bias, which is taken
+off, see `cpunet.training.weighted_means`.
 """
 
 from __future__ import annotations
@@ -20,21 +23,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.smooth_parameters import SmoothParameters
+from cpunet.training.translated import Translated
+from cpunet.training.weighted_means import Parts, Sums, jackknife_bias
 
 # Bins of the current amplitude are no narrower than twice its noise.
 MIN_BIN = 0.006
-RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
+PARTS = 10  # of the pulses, each left out once to see the bias
 # Passes over all pulses at most, the fall of the sum of squares with which they end, and the
 # first damping and its factor.
 PASSES, CONVERGED, FIRST_DAMPING, DAMPING_UP = 8, 0.1, 100.0, 10.0
+AT_BOUND = 1e-9  # a coordinate no further above its bound is at it
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +107,7 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
         Covariance of the parameters.
     """
     smooth = SmoothParameters(near.parameters)
+    place = smooth.get()
     weighted = [_Weighted(band, smooth, near.response, bins) for band in bands]
     slopes = np.concatenate([w.slopes for w in weighted])
 
@@ -111,10 +117,26 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
         return np.concatenate([*found, (place - smooth.centre) / smooth.widths])
 
     columns = np.concatenate([slopes, np.diag(1 / smooth.widths)])
-    smooth.set(_descend(residuals, smooth, columns))
+    end = _descend(residuals, smooth, columns)
+    smooth.set(np.maximum(end - _bias(weighted, smooth, place, end), smooth.lowest))
     vector, widths = near.parameters.vector(), near.parameters.widths
     slopes = smooth.by_parameters(slopes, vector)
     return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(widths**-2.0)))
+
+
+def _bias(
+    weighted: Sequence[_Weighted], smooth: SmoothParameters, place: Values, end: Values
+) -> Values:
+    """By how much the end of steps with the weights of a place is off.
+
+    What has ended at its bound is held there: jumps to and from it are no bias.
+    """
+    held = np.where(end > smooth.lowest + AT_BOUND, np.nan, end - place)
+    prior = (place - smooth.centre) / smooth.widths
+    bias = jackknife_bias([w.parts for w in weighted], prior, smooth.widths, held)
+    # the weights of many pulses come from some, which are a part of what is compared
+    pairs = sum(w.pairs for w in weighted), sum(w.band.pairs for w in weighted)
+    return np.asarray(min(1.0, pairs[0] / pairs[1]) * bias)
 
 
 def _descend(
@@ -156,21 +178,19 @@ class _Weighted:
         self, band: Band, smooth: SmoothParameters, response: ElectronicsResponse, bins: int
     ) -> None:
         self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
-        mean, covariance = _mean_and_covariance(band, self.functions, response)
-        slopes = _slopes(band, self.functions, smooth, response, mean)
-        sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
-        correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
-        correlation += RIDGE * np.eye(len(sigma))
-        self.weights = np.linalg.solve(correlation, slopes / sigma[:, np.newaxis])
-        self.weights /= sigma[:, np.newaxis]
         data = band.moments.data
+        some = data[slice(0, FOR_WEIGHTS)]
+        measured = [
+            Sums.of(self.functions(some[slice(part, None, PARTS)])) for part in range(PARTS)
+        ]
+        sim = band.sim.first(FOR_WEIGHTS)
+        simulated = _simulated(sim, self.functions, smooth, response)
+        self.pairs = 1 / (1 / len(some) + 1 / sum(part.n for part in simulated))
+        self.parts = Parts(simulated, measured, band.pairs)
+        self.weights, self.whiten = self.parts.whole.weights, self.parts.whole.whiten
+        self.slopes = self.parts.whole.slopes
         total = sum(self.functions.sum(data[rows]) for rows in _blocks(len(data)))
         self.wanted = total / len(data) @ self.weights
-        some = data[slice(0, FOR_WEIGHTS)]
-        of_data = self.functions(some) @ self.weights
-        spread = np.cov(of_data.T).reshape(len(self.wanted), -1) / band.pairs
-        self.whiten = scipy.linalg.cholesky(np.linalg.inv(spread))
-        self.slopes = self.whiten @ self.weights.T @ slopes
 
     def deviations(self, response: ElectronicsResponse) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
@@ -184,36 +204,38 @@ def _blocks(n: int) -> list[slice]:
     return [slice(first, first + BLOCK) for first in range(0, n, BLOCK)]
 
 
-def _slopes(
-    band: Band,
+def _simulated(
+    sim: Translated,
     functions: ConditionalFunctions,
     smooth: SmoothParameters,
     response: ElectronicsResponse,
-    mean: Values,
-) -> Values:
-    """Derivatives of the functions' means with the coordinates, (functions, coordinates)."""
-    sim, place, columns = band.sim.first(FOR_WEIGHTS), smooth.get(), []
-    for i, step in enumerate(smooth.steps):
-        moved = place.copy()
-        moved[i] += step
-        smooth.set(moved)
-        (total,), n = sim.sums(response, lambda r: (functions.sum(r),), draws=1)
-        columns.append((total / n - mean) / step)
-    smooth.set(place)
-    return np.stack(columns, axis=1)
-
-
-def _mean_and_covariance(
-    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
-) -> tuple[Values, Values]:
-    """Means of the functions over simulated pulses, and their covariance over both sides."""
+) -> list[Sums]:
+    """Sums over each part of simulated pulses, with those of derivatives."""
 
     def of(readings: Readings) -> tuple[Values, ...]:
         values = functions(readings)
         return readings.weights @ values, (readings.weights * values.T) @ values
 
-    (total, squares), n = band.sim.first(FOR_WEIGHTS).sums(response, of, draws=1)
-    mean = total / n
-    simulated = squares / n - np.outer(mean, mean)
-    measured = functions(band.moments.data[slice(0, FOR_WEIGHTS)])
-    return mean, np.asarray(0.5 * (simulated + np.cov(measured.T)))
+    def of_moved(readings: Readings) -> tuple[Values, ...]:
+        return (functions.sum(readings),)
+
+    size = -(-len(sim) // PARTS)
+    here = sim.sums_of_blocks(response, of, size=size, draws=1)
+    place, slopes = smooth.get(), []
+    for i, step in enumerate(smooth.steps):
+        moved = place.copy()
+        moved[i] += step
+        smooth.set(moved)
+        there = sim.sums_of_blocks(response, of_moved, size=size, draws=1)
+        slopes.append(
+            [
+                (after / max(count, 1e-9) - before / max(n, 1e-9)) * n / step
+                for ((after,), count), ((before, _), n) in zip(there, here, strict=True)
+            ]
+        )
+    smooth.set(place)
+    columns = np.moveaxis(np.array(slopes), 0, -1)  # (parts, functions, coordinates)
+    return [
+        Sums(n, total, products, column)
+        for ((total, products), n), column in zip(here, columns, strict=True)
+    ]

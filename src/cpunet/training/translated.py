@@ -187,25 +187,39 @@ class Translated:
         tuple
             The sums, and the weight of the pulses in them.
         """
+        parts = self.sums_of_blocks(response, of, cut=cut, draws=draws)
+        sums = zip(*(found for found, _ in parts), strict=True)
+        return tuple(np.sum(np.stack(one), axis=0) for one in sums), sum(n for _, n in parts)
+
+    def sums_of_blocks(
+        self,
+        response: ElectronicsResponse,
+        of: Callable[[Readings], tuple[Values, ...]],
+        *,
+        size: int = BLOCK,
+        cut: bool = True,
+        draws: int | None = None,
+    ) -> list[tuple[tuple[Values, ...], float]]:
+        """What `sums` gives, of each block of `size` pulses in their order."""
         transfer = self._transfer(response)
         threads = torch.get_num_threads()
 
-        def one(first: int) -> list[tuple[tuple[Values, ...], float]]:
-            return [
+        def one(first: int) -> tuple[tuple[Values, ...], float]:
+            found = [
                 (of(readings), float(readings.weights.sum()))
-                for readings in self._block(transfer, first, cut=cut, draws=draws)
+                for readings in self._block(transfer, first, size, cut=cut, draws=draws)
             ]
+            sums = zip(*(totals for totals, _ in found), strict=True)
+            return tuple(np.sum(np.stack(each), axis=0) for each in sums), sum(
+                n for _, n in found
+            )
 
-        starts = range(0, len(self), BLOCK)
+        starts = range(0, len(self), size)
         if threads == 1 or len(starts) == 1:
-            parts = [part for first in starts for part in one(first)]
-        else:
-            with ThreadPoolExecutor(min(threads, len(starts))) as pool:
-                parts = [part for found in pool.map(one, starts) for part in found]
-        # in the order of the pulses, whichever thread was first
-        sums = zip(*(found for found, _ in parts), strict=True)
-        totals = tuple(np.sum(np.stack(one), axis=0) for one in sums)
-        return totals, sum(n for _, n in parts)
+            return [one(first) for first in starts]
+        with ThreadPoolExecutor(min(threads, len(starts))) as pool:
+            # in the order of the pulses, whichever thread was first
+            return list(pool.map(one, starts))
 
     def _transfer(self, response: ElectronicsResponse) -> npt.NDArray[np.complex64]:
         with torch.no_grad():
@@ -216,13 +230,14 @@ class Translated:
         self,
         transfer: npt.NDArray[np.complex64],
         first: int,
+        size: int,
         *,
         cut: bool,
         draws: int | None,
     ) -> Iterator[Readings]:
         """Readings of one block of pulses, draw by draw."""
         preparation = self.moments.preparation
-        spectrum = self._spectrum(first) * transfer
+        spectrum = self._spectrum(first, size) * transfer
         padded = padded_length(self.length)
         records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
         plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(
@@ -232,12 +247,12 @@ class Translated:
         last = PADDING_BEFORE + preparation.samples_before + DELAY
         for draw in range(len(self.noise.factor))[:draws]:
             noisy = self.noise.add(records, draw, first)
-            weights = self.weights[first : first + BLOCK]
+            weights = self.weights[first : first + size]
             yield self.moments.read(noisy, last, cut=cut, weights=weights)
 
-    def _spectrum(self, first: int) -> npt.NDArray[np.complex64]:
+    def _spectrum(self, first: int, size: int) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, kept as far as there is room."""
-        sim = self.sim[first : first + BLOCK]
+        sim = self.sim[first : first + size]
         if (kept := self._spectra.get((first, len(sim)))) is not None:
             return kept
         current = np.zeros((len(sim), self.length), np.float32)
