@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
+from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.style import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
@@ -20,27 +22,12 @@ def html_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     words: frozenset[int] | set[int] = frozenset(),
-) -> str:
+) -> Markup:
     """Return a table; the columns `words` are aligned as text, all others as numbers."""
-
-    def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
-        # the style sheet already aligns the first column as text
-        return "".join(
-            f"<{tag}{attribute}"
-            + (' style="text-align: left"' if i in words and i else "")
-            + f">{escape(cell)}</{tag}>"
-            for i, cell in enumerate(row)
-        )
-
-    top = cells("th", head, ' scope="col"')
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody>\n</table></div>"
-    )
+    return part("table", head, rows, words)
 
 
-def nested_html(value: Any, level: int = 4) -> str:
+def nested_html(value: Any, level: int = 4) -> Markup:
     """Return nested mappings, lists and values as tables under headings.
 
     An error, of the same name with ``_std``, is shown with its value.  ``missing`` with a
@@ -56,12 +43,12 @@ def nested_html(value: Any, level: int = 4) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(item, Mapping) for item in value):
             return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
-        return f"<p>{escape(_cell(value))}</p>"
+        return part("p", _cell(value))
     if not isinstance(value, Mapping):
-        return f"<p>{escape(_cell(value))}</p>"
+        return part("p", _cell(value))
     parts = []
     if isinstance(value.get("missing"), str):
-        parts.append(f"<p>Missing: {escape(value['missing'])}.</p>")
+        parts.append(part("p", f"Missing: {value['missing']}."))
         value = {name: item for name, item in value.items() if name != "missing"}
     value = _with_errors(value)
     plain = {name: item for name, item in value.items() if not _nests(item)}
@@ -74,9 +61,9 @@ def nested_html(value: Any, level: int = 4) -> str:
         parts.append(_matrix(flat, "Quantity"))
         deeper = {name: item for name, item in deeper.items() if name not in flat}
     for name, item in deeper.items():
-        parts.append(f"<h{level}>{escape(words_of(name))}</h{level}>")
+        parts.append(part("heading", level, words_of(name)))
         parts.append(nested_html(item, min(level + 1, 6)))
-    return "\n".join(parts)
+    return joined(parts)
 
 
 def number(value: Any) -> str:
@@ -102,7 +89,7 @@ def with_std(value: Any, error: Any) -> str:
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
-def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> str:
+def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
     """Return mappings of values as one table: one row each, or one column each if shorter."""
     rows = {name: _with_errors(row) for name, row in rows.items()}
     names = list(dict.fromkeys(column for row in rows.values() for column in row))

@@ -15,7 +15,7 @@ from cpunet.analysis.calibration_figures import (
     profiles_figure,
     pulls_figure,
 )
-from cpunet.calls import html
+from cpunet.analysis.html_pages import part
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
@@ -102,9 +102,8 @@ class CalibratedRun(Run):
             for name, one in self.physics.items()
         ]
         head = ["physics", "calibrated", "as simulated"]
-        return (
-            html.table(head, rows) + html.lines(self.content["notes"]) + super()._repr_html_()
-        )
+        shown = part("object", "", head=head, rows=rows, lines=self.content["notes"])
+        return shown + super()._repr_html_()
 
 
 def calibrate(
