@@ -75,7 +75,7 @@ def figure_html(caption: str, figure: Figure, png: bytes | None = None) -> Marku
     """Return a figure with its caption; `png` is the drawn figure if there is one."""
     width, height = figure.get_size_inches()
     data = _base64(figure_png(figure) if png is None else png)
-    return part("figure", caption, data, width >= WIDE * height)
+    return part("figure", caption, data, width, width >= WIDE * height)
 
 
 def notebook_picture(figure: Figure) -> Markup:
