@@ -14,7 +14,7 @@ from cpunet.analysis.style import COLOURS
 
 WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: panel, names, right margin
 LINE, TOP, BOTTOM = 14, 6, 24
-LONGEST = 27  # maximum characters of a name
+LONGEST = 23  # maximum characters of a name
 
 
 def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> Markup:

@@ -12,7 +12,9 @@ from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.style import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
-STD = "_std"  # suffix of the name of an error
+ERRORS = ("_std", "_error")  # suffixes of the name of an error
+UNITS = {"ns": "ns", "kev": "keV", "percent": "%", "mm": "mm"}  # at the end of a key
+SPELT = {"auc": "AUC", "iou": "IoU", "rms": "RMS", "wasserstein": "W₁"}
 MAX_DIGITS = 9  # after the decimal point
 LONG = 12  # lists of this length or more are summarised
 BROAD = 6  # tables of this many columns or more are transposed if they have fewer rows
@@ -30,7 +32,7 @@ def html_table(
 def nested_html(value: Any, level: int = 4) -> Markup:
     """Return nested mappings, lists and values as tables under headings.
 
-    An error, of the same name with ``_std``, is shown with its value.  ``missing`` with a
+    An error, of the same name with ``_std`` or ``_error``, is shown with its value.  ``missing`` with a
     text becomes a sentence.  Long lists are summarised; `metrics.json` has them in full.
 
     Parameters
@@ -109,9 +111,9 @@ def _with_errors(values: Mapping[str, Any]) -> dict[str, Any]:
     """Join each value with the error of the same name, also where both are mappings."""
     joined: dict[str, Any] = {}
     for name, value in values.items():
-        if name.endswith(STD) and name.removesuffix(STD) in values:
+        if any(name.removesuffix(end) in values for end in ERRORS if name.endswith(end)):
             continue
-        error = values.get(name + STD)
+        error = next((values[name + end] for end in ERRORS if name + end in values), None)
         if isinstance(error, Mapping) and _is_row(value):
             joined[name] = {k: _join(v, error.get(k)) for k, v in value.items()}
         else:
@@ -147,7 +149,16 @@ def _cell(value: Any) -> str:
 
 
 def words_of(name: str) -> str:
-    """Return a key of the metrics as the page writes it."""
+    """Return a key of the metrics as the page writes it.
+
+    Examples
+    --------
+    >>> words_of("time_ns"), words_of("drift_time_wasserstein")
+    ('time [ns]', 'drift time W₁')
+    """
     if name.removesuffix(NO_NOISE) in LABELS:
         return label(name)
-    return name.replace("_", " ")
+    words = [SPELT.get(word, word) for word in name.split("_")]
+    if len(words) > 1 and words[-1] in UNITS:
+        words[-1] = f"[{UNITS[words[-1]]}]"
+    return " ".join(words)

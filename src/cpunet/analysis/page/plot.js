@@ -95,7 +95,10 @@ class Plot {
     const shares = panels.reduce((sum, p) => sum + (p.share || 1), 0);
     const xt = ticks([low, high], small ? 5 : 8);
     let top = this.box.y0;
-    let out = `<text class="title" x="${x0}" y="15">${escapeHtml(this.spec.title)}</text>`;
+    // a long title begins further left, and is squeezed where that does not suffice
+    const long = 7.6 * this.spec.title.length, start = Math.max(4, Math.min(x0, width - long));
+    const squeezed = long > width ? ` textLength="${width - 8}" lengthAdjust="spacingAndGlyphs"` : "";
+    let out = `<text class="title" x="${start}" y="15"${squeezed}>${escapeHtml(this.spec.title)}</text>`;
     panels.forEach((panel, i) => {
       const bottom = top + (room * (panel.share || 1)) / shares;
       out += this.drawPanel(panel, i, top, bottom, xt, small);
