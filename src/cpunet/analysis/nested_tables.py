@@ -32,8 +32,9 @@ def html_table(
 def nested_html(value: Any, level: int = 4) -> Markup:
     """Return nested mappings, lists and values as tables under headings.
 
-    An error, of the same name with ``_std`` or ``_error``, is shown with its value.  ``missing`` with a
-    text becomes a sentence.  Long lists are summarised; `metrics.json` has them in full.
+    An error, of the same name with ``_std`` or ``_error``, is shown with its value.
+    ``missing`` with a text becomes a sentence.  Long lists are summarised; `metrics.json` has
+    them in full.
 
     Parameters
     ----------
