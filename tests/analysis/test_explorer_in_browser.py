@@ -45,7 +45,7 @@ const click = (i) => {
 };
 const key = (name) => find("#crystal").dispatchEvent(
   new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
-const axis = (id, anchor) => [...document.querySelectorAll(`#${id} text`)]
+const axis = (within, anchor) => [...document.querySelectorAll(`${within} text`)]
   .filter((t) => t.getAttribute("text-anchor") === anchor && !t.getAttribute("transform")
     && /^[\\u22120-9.]+$/.test(t.textContent))
   .map((t) => [Number(t.textContent.replace("\\u2212", "-")),
@@ -54,15 +54,18 @@ const axis = (id, anchor) => [...document.querySelectorAll(`#${id} text`)]
 const look = () => ({ where: find("#where").textContent, raw: line("raw"), ren: line("ren"),
   data: document.querySelectorAll("#charge path.data").length, band: line("band"),
   current: line("ren", "current"),
-  time: axis("charge", "middle"), height: axis("charge", "end"),
-  rows: [...find("#numbers").rows].map((row) => [...row.cells].map((c) => c.textContent)) });
+  time: axis("svg.plot", "middle"), height: axis("#charge", "end"),
+  rows: [...find("table.legend tbody").rows]
+    .map((row) => [...row.cells].map((c) => c.textContent)) });
 const drag = (x1, x2, y1, y2) => {
-  const box = find("#charge svg").getBoundingClientRect(), what = find("#charge");
-  const at = (fx, fy) => [box.x + 56 + fx * (box.width - 66), box.y + fy * box.height];
+  const box = find("#charge .frame").getBoundingClientRect(), what = find("svg.plot");
+  const at = (fx, fy) => [box.x + fx * box.width, box.y + fy * box.height];
   pointer(what, "pointerdown", ...at(x1, y1));
   pointer(what, "pointermove", ...at(x2, y2));
   pointer(what, "pointerup", ...at(x2, y2));
 };
+const press = (name) => [...document.querySelectorAll(".controls button")]
+  .find((one) => one.textContent === name).click();
 const fills = () => [...document.querySelectorAll("#crystal .cell")]
   .map((c) => c.getAttribute("fill"));
 addEventListener("load", () => {
@@ -85,11 +88,11 @@ key("ArrowRight"); told.moved = look(); key("ArrowLeft");
 click(GREY); told.grey = look();
 click(PLACE);
 drag(0.4, 0.6, 0.5, 0.5); told.zoomed = look();
-find("#edge").click(); told.edge = look();
+press("Edge"); told.edge = look();
 drag(0.4, 0.6, 0.2, 0.6); told.boxed = look();
-find("#charge").dispatchEvent(new MouseEvent("dblclick", { bubbles: true }));
+find("svg.plot").dispatchEvent(new MouseEvent("dblclick", { bubbles: true }));
 told.back = look();
-find("#all").click(); told.all = look(); find("#edge").click();
+press("All"); told.all = look(); press("Edge");
 drag(0.5, 0.502, 0.5, 0.5); told.nothing = look();
 find("#quantity").value = "rms"; find("#quantity").dispatchEvent(new Event("change"));
 told.recoloured = fills();
@@ -201,7 +204,7 @@ def test_nothing_fails_and_nothing_is_requested(told, shown):
     assert told["requests"] == []
     page = explorer_page(shown)
     assert "default-src 'none'" in page
-    assert re.findall(r"https?://[^\"]*", page) == ["http://www.w3.org/2000/svg"]
+    assert not re.search(r"https?://", page)
 
 
 def test_a_click_shows_the_pulses_of_that_place(told, shown):

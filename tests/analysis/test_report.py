@@ -130,7 +130,7 @@ def test_page_shows_scores_counts_and_provenance(report):
 
 def test_names_of_methods_are_aligned_as_words(report):
     html = (report / "report.html").read_text()
-    left = re.findall(r'<t[hd][^>]*style="text-align: left">([^<]*)</t[hd]>', html)
+    left = re.findall(r'<t[hd][^>]*class="text">([^<]*)</t[hd]>', html)
     assert left == ["Method", "Simulation", "REN translation", "Ceiling"]
 
 

@@ -93,7 +93,9 @@ def require_temperature(run: Path) -> dict[str, Any]:
     names = told["covariance"]["names"]
     assert np.shape(told["covariance"]["matrix"]) == (len(names), len(names))
     assert len(told["profiles"]["temperature_K"]["chi_square"]) == 5
-    assert "temperature_K" in (run / "calibration.html").read_text()
+    page = (run / "calibration.html").read_text()
+    assert "<td>temperature [K]</td>" in page
+    assert "temperature_K" not in page
     return told
 
 
@@ -142,7 +144,7 @@ def test_a_plan_is_told_before_any_fit(stand, command, free, tmp_path):
     words = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--plan", "--out", out)
     done = command("calibrate", *words, "--free", free)
     assert done.code == 0, done.err
-    assert "temperature_K" in done.out
+    assert "temperature [K]" in done.out
     assert "in units of the prior" in done.out
     told = json.loads((out / "plan.json").read_text())
     of_temperature = told["errors"]["temperature_K"]
@@ -211,5 +213,5 @@ def test_it_can_be_looked_at_in_python(calibrated):
     assert run.sim.is_file()
     assert {"pulls", "profiles", "directions"} == set(run.figures)
     html = run._repr_html_()
-    assert "temperature_K" in html
+    assert "temperature [K]" in html
     assert "cpunet run" in html

@@ -114,7 +114,9 @@ def direct_pulses(r: npt.ArrayLike, z: npt.ArrayLike) -> npt.NDArray[np.float32]
 
 def content(page: Path) -> dict[str, Any]:
     text = page.read_text(encoding="utf-8")
-    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text)
+    (found,) = re.findall(
+        r'<script type="application/json" id="view-data">(.*?)</script>', text
+    )
     return json.loads(found)
 
 
@@ -338,7 +340,7 @@ def test_an_existing_page_is_kept_and_a_failure_leaves_nothing(runs, tmp_path, m
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     assert out.read_text() == "mine"
     explore_runs(runs[:1], DETECTOR, out, points=20, force=True)
-    assert out.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert out.read_text(encoding="utf-8").startswith("<!doctype html>")
 
 
 def test_text_in_the_data_cannot_end_its_element(runs, tmp_path):

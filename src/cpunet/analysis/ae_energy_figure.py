@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cpunet.analysis.ae_energy import REFERENCE_KEV
+from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.nested_tables import html_table, with_std
 from cpunet.analysis.style import colours, label, styled
 
@@ -50,12 +51,12 @@ def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def ae_energy_html(found: Mapping[str, Any], figure: str) -> str:
+def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
     """Return the section's content: a sentence, a table of the lines, and the figure."""
     if not found:
-        return ""
+        return Markup()
     if "missing" in found:
-        return f'<p class="gap">None recorded: {escape(str(found["missing"]))}.</p>'
+        return part("gap", found["missing"])
     rows = []
     for method, one in found["methods"].items():
         line, law = one["mean"], one["resolution"]
@@ -88,4 +89,4 @@ def ae_energy_html(found: Mapping[str, Any], figure: str) -> str:
             "than a guess of that of single sites. With `--ae-range 900,2350` the continuum is "
             "read, if the files have it."
         )
-    return f"<p>{escape(about)}</p>\n{html_table(head, rows, words={0})}\n{figure}"
+    return joined([part("p", about), html_table(head, rows, words={0}), figure])

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.analysis.style import COLOURS, styled
+from cpunet.calibration.titles import titled
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
 # Columns of panels.
@@ -42,7 +43,7 @@ def profiles_figure(content: Mapping[str, Any]) -> Figure:
         panel.plot(values, cost - cost.min(), "o", color=AFTER, label="profile")
         if values.min() <= told["simulated"] <= values.max():
             panel.axvline(told["simulated"], color=BEFORE, ls="--", label="as simulated")
-        panel.set_xlabel(name)
+        panel.set_xlabel(titled(name))
         panel.set_ylim(-0.5, 12)
         panel.set_ylabel("Δχ²")
     panels[0].legend()
@@ -101,7 +102,8 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
         1, 2, sharey=True, gridspec_kw={"width_ratios": [len(names), 5]}
     )
     left.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    left.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8)
+    titles = [titled(name, units=False) for name in names]
+    left.set_xticks(range(len(names)), titles, rotation=60, ha="right", fontsize=8)
     left.set_yticks(range(len(errors)), [str(i + 1) for i in range(len(errors))])
     left.set_ylabel("direction, best known first")
     left.grid(visible=False)

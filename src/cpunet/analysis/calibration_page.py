@@ -12,6 +12,7 @@ from cpunet.analysis.calibration_figures import (
 )
 from cpunet.analysis.html_pages import figure_html, rendered
 from cpunet.analysis.nested_tables import with_std
+from cpunet.calibration.titles import titled
 
 _PROFILES = (
     "Chi-square along the valley of each parameter, everything else following; grey: the "
@@ -38,6 +39,7 @@ def calibration_page(content: Mapping[str, Any]) -> str:
         "calibration.html",
         title=f"Detector and readout of {content['detector']}, calibrated together",
         with_std=with_std,
+        titled=titled,
         chi=content["chi_square"],
         profiles=figure_html(_PROFILES, profiles_figure(content)) if free else "",
         pulls=figure_html(_PULLS, pulls_figure(content)),

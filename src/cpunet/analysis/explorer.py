@@ -5,21 +5,19 @@ The page is self-contained: pulses are embedded as 16-bit integers, and it makes
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
-from importlib.resources import files
-from string import Template
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.analysis.chart_data import method_looks
+from cpunet.analysis.html_pages import rendered, script
 from cpunet.analysis.nearest import Nearest
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.style import COLOURS, LABELS
+from cpunet.analysis.style import COLOURS
+from cpunet.analysis.view_parts import packed
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude_kernel
 from cpunet.pulses.shape_parameters import all_parameters
@@ -35,9 +33,7 @@ NUMBERS = {
     "current_amplitude": ("Current amplitude", "1/sample", 5),
     "rise_10_90": ("Rise time 10–90 %", "ns", 1),
 }
-SCRIPTS = ("data", "drawing", "hands")  # parts of the page's program, in order
-_MISSING = -32768
-_FULL = 32000
+SCRIPTS = ("marks", "plot", "legend", "crystal", "explorer")  # in order
 _OUTLINE_POINTS = 500  # along the longer side of the crystal
 _MAP_COLOURS = 64
 
@@ -95,15 +91,12 @@ def explorer_page(shown: Exploration) -> str:
     shown
         Content of the page.
     """
-    folder = files("cpunet.analysis")
-    scripts = [(folder / f"explorer_{part}.js").read_text("utf-8") for part in SCRIPTS]
-    # escaped, so that no text in the data can close its script element
-    data = json.dumps(_content(shown), separators=(",", ":"), allow_nan=False)
-    return Template((folder / "explorer.html").read_text("utf-8")).substitute(
-        title=escape(f"Pulses of {shown.detector.name or 'a detector'} by place"),
-        style=(folder / "explorer.css").read_text("utf-8"),
-        script="\n".join(scripts),
-        data=data.replace("<", "\\u003c"),
+    content = _content(shown)
+    return rendered(
+        "explorer.html",
+        title=f"Pulses of {shown.detector.name or 'a detector'} by place",
+        page=content,
+        script=script(content, SCRIPTS),
     )
 
 
@@ -127,8 +120,8 @@ def _content(shown: Exploration) -> dict[str, Any]:
         "edge_samples": shown.recipe.scores.edge_samples,
         "kernel": _rounded(_smoothing(), 7),
         "names": {name: [label, unit] for name, (label, unit, _) in NUMBERS.items()},
-        "colours": {name: COLOURS[name] for name in ("raw", "ren", "data", "truth")},
-        "labels": LABELS,
+        "methods": _methods(shown),
+        "contact": COLOURS["truth"],
         "map": _colour_map(),
         "outline": _outlines(shown.detector),
         "notes": shown.notes,
@@ -139,6 +132,15 @@ def _content(shown: Exploration) -> dict[str, Any]:
         "ren": _of_runs(shown, samples),
         "measured": _measured(shown, samples),
     }
+
+
+def _methods(shown: Exploration) -> list[dict[str, Any]]:
+    """Rows of the legend: both sides, and as many measured pulses as there are neighbours."""
+    ranks = range(shown.nearest.index.shape[1] if shown.nearest else 0)
+    data = method_looks(["data"])[0]
+    return method_looks(["raw", "ren"]) + [
+        data | {"name": f"data {n + 1}", "label": f"{data['label']} {n + 1}"} for n in ranks
+    ]
 
 
 def _samples(recipe: Recipe) -> Indices:
@@ -220,14 +222,7 @@ def _current(waves: FloatArray) -> FloatArray:
 
 
 def _packed(values: FloatArray) -> dict[str, Any]:
-    """Samples as base64-encoded 16-bit integers; `_MISSING` represents NaN."""
-    top = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
-    numbers = np.where(np.isnan(values), _MISSING, np.round(values / top * _FULL))
-    return {
-        "shape": values.shape,
-        "scale": top / _FULL,
-        "data": base64.b64encode(numbers.astype("<i2").tobytes()).decode("ascii"),
-    }
+    return packed(values, about_zero=True)
 
 
 def _rounded(values: npt.NDArray[Any], digits: int) -> list[float | None]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from html import escape
+from typing import Any
 
+from markupsafe import Markup
+
+from cpunet.analysis.html_pages import part
 from cpunet.analysis.side_by_side import Cell, Row
 from cpunet.analysis.style import COLOURS
 
 WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: panel, names, right margin
 LINE, TOP, BOTTOM = 14, 6, 24
-LONGEST = 27  # maximum characters of a name
+LONGEST = 23  # maximum characters of a name
 
 
-def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> str:
+def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> Markup:
     """Draw a forest plot of a score with errors, and its expectation by chance in grey.
 
     Parameters
@@ -28,7 +31,7 @@ def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> s
 
     Returns
     -------
-    str
+    Markup
         An HTML ``figure``.
     """
     low, high = span(row.cells)
@@ -36,52 +39,40 @@ def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> s
     bottom = TOP + LINE * len(names)
 
     def at(value: float) -> float:
-        return NAMES + scale * (value - low)
+        return round(NAMES + scale * (value - low), 1)
 
-    drawn = [f'<path d="M{NAMES} {bottom}H{WIDTH - RIGHT}" stroke="#888"/>']
-    drawn += [
-        f'<path d="M4 {TOP + LINE * start}H{WIDTH - RIGHT}" stroke="#ddd"/>' for start in starts
-    ]
-    drawn += [
-        f'<path d="M{at(value):.1f} {bottom}v4" stroke="#888"/><text x="{at(value):.1f}" '
-        f'y="{bottom + 16}" text-anchor="middle" fill="#555">{value:g}</text>'
-        for value in ticks(low, high)
-    ]
-    for i, (name, cell) in enumerate(zip(names, row.cells, strict=True)):
-        y = TOP + LINE * (i + 0.5)
-        short = name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}"
-        marks = "".join(_marks(cell, y, at)) or (
-            f'<text x="{NAMES + 4}" y="{y + 4}" style="fill:#777">no score</text>'
-        )
-        drawn.append(
-            f"<g><title>{escape(f'{name}: {cell.text}')}</title>"
-            f'<text x="{NAMES - 8}" y="{y + 4}" text-anchor="end">{escape(short)}</text>'
-            f"{marks}</g>"
-        )
-    title = escape(f"{row.peak}, {row.score}")
-    return (
-        f'<figure><svg viewBox="0 0 {WIDTH} {bottom + BOTTOM}" role="img" '
-        f'aria-label="{title}">{"".join(drawn)}</svg><figcaption>{title}</figcaption></figure>'
+    box = {
+        "left": NAMES, "right": WIDTH - RIGHT, "bottom": bottom, "width": WIDTH,
+        "height": bottom + BOTTOM, "colour": COLOURS["ren"],
+    }  # fmt: skip
+    return part(
+        "forest",
+        f"{row.peak}, {row.score}",
+        [
+            {"title": f"{name}: {cell.text}", "name": _short(name), "y": TOP + LINE * (i + 0.5)}
+            | _marks(cell, at)
+            for i, (name, cell) in enumerate(zip(names, row.cells, strict=True))
+        ],
+        [TOP + LINE * start for start in starts],
+        [(at(value), f"{value:g}") for value in ticks(low, high)],
+        box,
     )
 
 
-def _marks(cell: Cell, y: float, at: Callable[[float], float]) -> list[str]:
-    """The expectation by chance in grey, the error bar and the dot of a score."""
-    marks: list[str] = []
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}"
+
+
+def _marks(cell: Cell, at: Callable[[float], float]) -> dict[str, Any]:
+    """Pixels of the dot of a score, of its error, and of the expectation by chance."""
     if cell.value is None:
-        return marks
-    if cell.expected is not None:
-        x, spread = at(cell.expected), cell.expected_std or 0.0
-        width = at(cell.expected + spread) - at(cell.expected - spread)
-        marks.append(
-            f'<rect x="{x - width / 2:.1f}" y="{y - 6}" width="{width:.1f}" height="12" '
-            f'fill="#ddd"/><path d="M{x:.1f} {y - 6}v12" stroke="#777"/>'
-        )
-    colour = COLOURS["ren"]
+        return {"dot": None}
+    marks: dict[str, Any] = {"dot": at(cell.value), "error": None, "chance": None}
     if cell.error is not None:
-        left, right = at(cell.value - cell.error), at(cell.value + cell.error)
-        marks.append(f'<path d="M{left:.1f} {y}H{right:.1f}" stroke="{colour}"/>')
-    marks.append(f'<circle cx="{at(cell.value):.1f}" cy="{y}" r="3" fill="{colour}"/>')
+        marks["error"] = at(cell.value - cell.error), at(cell.value + cell.error)
+    if cell.expected is not None:
+        x, spread = cell.expected, cell.expected_std or 0.0
+        marks["chance"] = at(x - spread), at(x), round(at(x + spread) - at(x - spread), 1)
     return marks
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
+from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.style import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
-STD = "_std"  # suffix of the name of an error
+ERRORS = ("_std", "_error")  # suffixes of the name of an error
+UNITS = {"ns": "ns", "kev": "keV", "percent": "%", "mm": "mm"}  # at the end of a key
+SPELT = {"auc": "AUC", "iou": "IoU", "rms": "RMS", "wasserstein": "W₁"}
 MAX_DIGITS = 9  # after the decimal point
 LONG = 12  # lists of this length or more are summarised
 BROAD = 6  # tables of this many columns or more are transposed if they have fewer rows
@@ -20,31 +24,17 @@ def html_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     words: frozenset[int] | set[int] = frozenset(),
-) -> str:
+) -> Markup:
     """Return a table; the columns `words` are aligned as text, all others as numbers."""
-
-    def cells(tag: str, row: Sequence[str], attribute: str = "") -> str:
-        # the style sheet already aligns the first column as text
-        return "".join(
-            f"<{tag}{attribute}"
-            + (' style="text-align: left"' if i in words and i else "")
-            + f">{escape(cell)}</{tag}>"
-            for i, cell in enumerate(row)
-        )
-
-    top = cells("th", head, ' scope="col"')
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table>\n<thead><tr>{top}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody>\n</table></div>"
-    )
+    return part("table", head, rows, words)
 
 
-def nested_html(value: Any, level: int = 4) -> str:
+def nested_html(value: Any, level: int = 4) -> Markup:
     """Return nested mappings, lists and values as tables under headings.
 
-    An error, of the same name with ``_std``, is shown with its value.  ``missing`` with a
-    text becomes a sentence.  Long lists are summarised; `metrics.json` has them in full.
+    An error, of the same name with ``_std`` or ``_error``, is shown with its value.
+    ``missing`` with a text becomes a sentence.  Long lists are summarised; `metrics.json` has
+    them in full.
 
     Parameters
     ----------
@@ -56,12 +46,12 @@ def nested_html(value: Any, level: int = 4) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(item, Mapping) for item in value):
             return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
-        return f"<p>{escape(_cell(value))}</p>"
+        return part("p", _cell(value))
     if not isinstance(value, Mapping):
-        return f"<p>{escape(_cell(value))}</p>"
+        return part("p", _cell(value))
     parts = []
     if isinstance(value.get("missing"), str):
-        parts.append(f"<p>Missing: {escape(value['missing'])}.</p>")
+        parts.append(part("p", f"Missing: {value['missing']}."))
         value = {name: item for name, item in value.items() if name != "missing"}
     value = _with_errors(value)
     plain = {name: item for name, item in value.items() if not _nests(item)}
@@ -74,9 +64,9 @@ def nested_html(value: Any, level: int = 4) -> str:
         parts.append(_matrix(flat, "Quantity"))
         deeper = {name: item for name, item in deeper.items() if name not in flat}
     for name, item in deeper.items():
-        parts.append(f"<h{level}>{escape(words_of(name))}</h{level}>")
+        parts.append(part("heading", level, words_of(name)))
         parts.append(nested_html(item, min(level + 1, 6)))
-    return "\n".join(parts)
+    return joined(parts)
 
 
 def number(value: Any) -> str:
@@ -102,7 +92,7 @@ def with_std(value: Any, error: Any) -> str:
     return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
-def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> str:
+def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
     """Return mappings of values as one table: one row each, or one column each if shorter."""
     rows = {name: _with_errors(row) for name, row in rows.items()}
     names = list(dict.fromkeys(column for row in rows.values() for column in row))
@@ -122,9 +112,9 @@ def _with_errors(values: Mapping[str, Any]) -> dict[str, Any]:
     """Join each value with the error of the same name, also where both are mappings."""
     joined: dict[str, Any] = {}
     for name, value in values.items():
-        if name.endswith(STD) and name.removesuffix(STD) in values:
+        if any(name.removesuffix(end) in values for end in ERRORS if name.endswith(end)):
             continue
-        error = values.get(name + STD)
+        error = next((values[name + end] for end in ERRORS if name + end in values), None)
         if isinstance(error, Mapping) and _is_row(value):
             joined[name] = {k: _join(v, error.get(k)) for k, v in value.items()}
         else:
@@ -160,7 +150,16 @@ def _cell(value: Any) -> str:
 
 
 def words_of(name: str) -> str:
-    """Return a key of the metrics as the page writes it."""
+    """Return a key of the metrics as the page writes it.
+
+    Examples
+    --------
+    >>> words_of("time_ns"), words_of("drift_time_wasserstein")
+    ('time [ns]', 'drift time W₁')
+    """
     if name.removesuffix(NO_NOISE) in LABELS:
         return label(name)
-    return name.replace("_", " ")
+    words = [SPELT.get(word, word) for word in name.split("_")]
+    if len(words) > 1 and words[-1] in UNITS:
+        words[-1] = f"[{UNITS[words[-1]]}]"
+    return " ".join(words)

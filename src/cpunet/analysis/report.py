@@ -14,16 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.analysis.ae_energy_figure import ae_energy_html
-from cpunet.analysis.html_pages import asset, figure_html, figure_png, rendered
+from cpunet.analysis.html_pages import (
+    figure_html,
+    figure_png,
+    joined,
+    part,
+    rendered,
+    script,
+)
 from cpunet.analysis.nested_tables import nested_html, number
 from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.report_tables import (
-    folded,
-    gap,
     pairs_table,
     peak_html,
     survival_html,
@@ -111,7 +117,7 @@ def write_report(
         png = figure_png(figure)
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
         drawn[name] = figure_html(name.replace("_", " "), figure, png)
-    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, ""))
+    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     first, of_noise, of_ae, others = _shared_out(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
@@ -122,11 +128,11 @@ def write_report(
         first=_gallery(first),
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts")),
-        scores="\n".join(
+        scores=joined(
             peak_html(name, scores, judged.get(name))
             for name, scores in metrics.get("peaks", {}).items()
         )
-        or gap("no peak was scored"),
+        or part("gap", "no peak was scored"),
         shapes=_views_html(views, ("distributions", "slices")),
         pulses=_views_html(views, ("pulses", "scatter")),
         survival=survival_html(metrics.get("ae_survival", {})),
@@ -134,17 +140,17 @@ def write_report(
         ae_energy=ae_energy,
         noise=_gallery(of_noise),
         details=_details_html(metrics),
-        figures=_gallery(others) or gap("no figures were drawn"),
+        figures=_gallery(others) or part("gap", "no figures were drawn"),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
-        script=_script(views),
+        script=script(views, SCRIPTS) if _drawn(views) else "",
     )
     (folder / "report.html").write_text(html, encoding="utf-8")
 
 
 def _shared_out(
-    drawn: Mapping[str, str], trained_on: str | None
-) -> tuple[list[str], list[str], list[str], list[str]]:
+    drawn: Mapping[str, Markup], trained_on: str | None
+) -> tuple[list[Markup], list[Markup], list[Markup], list[Markup]]:
     """Figures at the top of the page, those of noise, those of A/E cuts, and all others.
 
     Mean pulses come first, preferably of peaks that were not used in the training.
@@ -161,51 +167,31 @@ def _shared_out(
     return first, noise, cuts, others
 
 
-def _views_html(views: Mapping[str, Any], names: Sequence[str]) -> str:
+def _drawn(views: Mapping[str, Any]) -> bool:
+    return any(views.get(name) for name in VIEWS)
+
+
+def _views_html(views: Mapping[str, Any], names: Sequence[str]) -> Markup:
     """Elements in which the script draws, or the reason why it does not."""
-    if not any(views.get(name) for name in VIEWS):
-        return gap("this report was written without the data of the interactive views")
-    parts = ["<noscript><p>The views need JavaScript; the figures do not.</p></noscript>"]
-    for name in names:
-        title, about = VIEWS[name]
-        parts.append(f"<h3>{title}</h3>")
-        if views.get(name):
-            parts.append(f'<p class="about">{about}</p>\n<div id="view-{name}"></div>')
-        else:
-            parts.append(gap("this report has no data of this view"))
-    return "\n".join(parts)
+    if not _drawn(views):
+        return part("gap", "this report was written without the data of the interactive views")
+    return joined(part("view", name, *VIEWS[name], bool(views.get(name))) for name in names)
 
 
-def _script(views: Mapping[str, Any]) -> str:
-    """Return the data and the script that draws them; nothing without data."""
-    if not any(views.get(name) for name in VIEWS):
-        return ""
-    data = json.dumps(views, allow_nan=False, separators=(",", ":"))
-    # in a script element any "<" of the JSON could start the closing tag
-    data = data.replace("<", "\\u003c")
-    code = "\n".join(asset(f"{name}.js") for name in SCRIPTS)
-    return (
-        f'<script type="application/json" id="view-data">{data}</script>\n'
-        f'<script>\n(() => {{\n"use strict";\n{code}}})();\n</script>'
-    )
-
-
-def _details_html(metrics: Mapping[str, Any]) -> str:
+def _details_html(metrics: Mapping[str, Any]) -> Markup:
     """Return those parts of the metrics that are shown as nested tables, if any."""
-    return "\n".join(
-        folded(title, nested_html(metrics[name]))
+    return joined(
+        part("folded", title, nested_html(metrics[name]))
         for name, title in DETAILS.items()
         if metrics.get(name)
     )
 
 
-def _gallery(drawn: Sequence[str]) -> str:
-    if not drawn:
-        return ""
-    gallery = '<div class="figures">\n' + "\n".join(drawn) + "\n</div>"
+def _gallery(drawn: Sequence[Markup]) -> Markup:
+    gallery = part("grid", "figures", drawn)
     if len(drawn) <= MANY:
         return gallery
-    return folded(f"{len(drawn)} figures, also as PNG beside this page", gallery)
+    return part("folded", f"{len(drawn)} figures, also as PNG beside this page", gallery)
 
 
 def _file_stem(name: str) -> str:

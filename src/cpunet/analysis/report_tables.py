@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
+from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.nested_tables import NO_VALUE, html_table, number, with_std, words_of
 from cpunet.analysis.score_panels import score_panels
 from cpunet.analysis.style import NO_NOISE, label
@@ -13,26 +15,15 @@ from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 
-def gap(reason: str) -> str:
-    """Return a sentence that gives the reason why something is missing."""
-    return f'<p class="gap">None recorded: {escape(reason)}.</p>'
-
-
-def folded(title: str, html: str) -> str:
-    """Return a collapsed section, which opens on request and when printed."""
-    return f"<details><summary>{title}</summary>\n{html}\n</details>"
-
-
-def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
+def verdicts_html(verdicts: Mapping[str, Any] | None) -> Markup:
     """Return the verdicts in plain words; nothing without verdicts."""
     if not verdicts:
-        return ""
+        return Markup()
     parts = []
     if verdicts.get("summary"):
-        points = "\n".join(f"<li>{escape(text)}</li>" for text in _texts(verdicts["summary"]))
-        parts.append(f'<ul class="verdicts">\n{points}\n</ul>')
+        parts.append(part("points", _texts(verdicts["summary"])))
     if "missing" in verdicts:
-        parts.append(gap(str(verdicts["missing"])))
+        parts.append(part("gap", verdicts["missing"]))
     rows = []
     for peak, methods in verdicts.get("table", {}).items():
         for method, quantities in methods.items():
@@ -44,13 +35,13 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> str:
     if rows:
         head = ["Peak", "Method", "Quantity", "σ", "In words"]
         table = html_table(head, rows, words={0, 1, 2, 4})
-        parts.append(folded("Each verdict", table))
-    return "\n".join(parts)
+        parts.append(part("folded", "Each verdict", table))
+    return joined(parts)
 
 
 def peak_html(
     peak: str, scores: Mapping[str, Any], verdicts: Mapping[str, Any] | None = None
-) -> str:
+) -> Markup:
     """Return the section of one peak: numbers of events and tables.
 
     `verdicts` are those of the peak by method and parameter, see `verdicts.verdict_table`.
@@ -59,41 +50,41 @@ def peak_html(
     chief = {name: found for name, found in parameters.items() if name in PARAMETERS}
     others = {name: found for name, found in parameters.items() if name not in PARAMETERS}
     others |= scores.get("further", {})
+    n_sim, n_data = (number(scores.get(name)) for name in ("n_sim", "n_data"))
     parts = [
-        f"<h3>{escape(peak)}: {number(scores.get('n_sim'))} simulated, "
-        f"{number(scores.get('n_data'))} measured pulses</h3>",
-        f"<p>Not scored: {escape(scores['missing'])}.</p>"
+        part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses"),
+        part("p", f"Not scored: {scores['missing']}.")
         if "missing" in scores
         else score_panels(peak, scores),
     ]
     if chief:
-        parts.append(folded("Scores as a table", _parameter_table(chief, _noisy, verdicts)))
+        parts.append(
+            part("folded", "Scores as a table", _parameter_table(chief, _noisy, verdicts))
+        )
     if others:
         title = f"Further parameters: {len(others)}"
-        parts.append(folded(title, _parameter_table(others, _noisy, verdicts)))
+        parts.append(part("folded", title, _parameter_table(others, _noisy, verdicts)))
     if any(not _noisy(m) for found in chief.values() for m in found["wasserstein"]):
         without = _parameter_table(chief, lambda m: not _noisy(m))
-        parts.append(folded("Scores without noise", without))
+        parts.append(part("folded", "Scores without noise", without))
     if scores.get("not_prepared"):
         counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
-        parts.append(
-            "<p>Simulated pulses left out because they cannot be prepared as data are once "
-            f"they are translated: {escape('; '.join(counts))}.</p>"
-        )
+        text = "Simulated pulses left out because they cannot be prepared as data are once "
+        parts.append(part("p", f"{text}they are translated: {'; '.join(counts)}."))
     if scores.get("two_sample"):
         title = "The classifier as a table"
-        parts.append(folded(title, _two_sample_table(scores["two_sample"])))
+        parts.append(part("folded", title, _two_sample_table(scores["two_sample"])))
     if scores.get("paired"):
         parts.append(_paired_table(scores["paired"]))
-    return "\n".join(parts)
+    return joined(parts)
 
 
-def survival_html(survival: Mapping[str, Any]) -> str:
+def survival_html(survival: Mapping[str, Any]) -> Markup:
     """Return the survival of A/E cuts by peak and method."""
     if not survival:
-        return "<p>None recorded.</p>"
+        return part("p", "None recorded.")
     if "missing" in survival:
-        return f"<p>Not scored: {escape(survival['missing'])}.</p>"
+        return part("p", f"Not scored: {survival['missing']}.")
     rows = []
     for peak, found in survival.items():
         title = peak
@@ -116,10 +107,10 @@ def survival_html(survival: Mapping[str, Any]) -> str:
     return html_table(head, rows, words={0, 1})
 
 
-def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> str:
+def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
     """Return a table of names and values; nested names are joined: ``data: saturated``."""
     rows = [[name, number(value)] for name, value in _flat(values)]
-    return html_table(list(head), rows) if rows else "<p>None recorded.</p>"
+    return html_table(list(head), rows) if rows else part("p", "None recorded.")
 
 
 def _noisy(method: str) -> bool:
@@ -130,7 +121,7 @@ def _parameter_table(
     parameters: Mapping[str, Any],
     shown: Callable[[str], bool],
     verdicts: Mapping[str, Any] | None = None,
-) -> str:
+) -> Markup:
     """One row per parameter and shown method, and one with the ceiling."""
     rows = []
     for name, values in parameters.items():
@@ -160,7 +151,7 @@ def _parameter_table(
     return html_table(head, rows, words={0, 1, 5})
 
 
-def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
+def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> Markup:
     head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
     rows = []
     for method, found in tested.items():
@@ -172,7 +163,7 @@ def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> str:
     return html_table(head, rows)
 
 
-def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> str:
+def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> Markup:
     head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
     rows = [
         [label(method), *(_thousandths(scores.get(key)) for key in ("rmse", "edge_rmse"))]

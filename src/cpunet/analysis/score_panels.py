@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from markupsafe import Markup
+
 from cpunet.analysis.forest_plot import forest_plot
+from cpunet.analysis.html_pages import part
 from cpunet.analysis.side_by_side import Cell, Row
 from cpunet.analysis.style import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
@@ -13,7 +16,7 @@ from cpunet.pulses.parameters import PARAMETERS
 LAST = "ren"  # drawn last; the other methods are in the order of the tables
 
 
-def score_panels(peak: str, scores: Mapping[str, Any]) -> str:
+def score_panels(peak: str, scores: Mapping[str, Any]) -> Markup:
     """Return a forest plot for the IoU of each parameter, and one for the classifier.
 
     Parameters
@@ -25,11 +28,10 @@ def score_panels(peak: str, scores: Mapping[str, Any]) -> str:
 
     Returns
     -------
-    str
-        HTML; empty if the peak is not scored.
+    Markup
+        Empty if the peak is not scored.
     """
-    panels = [forest_plot(row, names) for row, names in _rows(peak, scores)]
-    return '<div class="panels">\n' + "\n".join(panels) + "\n</div>" if panels else ""
+    return part("grid", "panels", [forest_plot(*row) for row in _rows(peak, scores)])
 
 
 def _rows(peak: str, scores: Mapping[str, Any]) -> Iterator[tuple[Row, list[str]]]:

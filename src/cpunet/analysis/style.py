@@ -16,8 +16,12 @@ COLOURS = {
     "ren": "#0072B2",
     "iren": "#CC79A7",
     "truth": "#009E73",
+    # the same on a whole page, although some of its figures leave one of them out
+    "rc": "#E69F00",
+    "gauss_exp": "#56B4E9",
+    "superpulse": "#7F7F7F",
 }
-SPARE_COLOURS = ("#E69F00", "#56B4E9", "#7F7F7F", "#8C6D1F", "#5B3A8C")
+SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
 DATA_FILL = "0.80"
 
 # suffix of the name of a method without noise
@@ -77,7 +81,7 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
     Examples
     --------
     >>> colours(["data", "rival"])
-    {'data': 'black', 'rival': '#E69F00'}
+    {'data': 'black', 'rival': '#8C6D1F'}
     """
     methods = list(methods)
     others = [method for method in methods if method not in COLOURS]

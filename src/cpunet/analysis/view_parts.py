@@ -42,7 +42,9 @@ def plain_label(text: str) -> str:
     return re.sub(r"\$([^$]*)\$", plain, text)
 
 
-def packed(values: npt.ArrayLike, bits: int = 16) -> dict[str, Any]:
+def packed(
+    values: npt.ArrayLike, bits: int = 16, *, about_zero: bool = False
+) -> dict[str, Any]:
     """Return an array as base64 of little-endian integers.
 
     ``value = offset + scale * integer``; the most negative integer represents NaN.
@@ -53,6 +55,8 @@ def packed(values: npt.ArrayLike, bits: int = 16) -> dict[str, Any]:
         Array of any shape; non-finite values become NaN.
     bits
         Size of the integers, 16 or 32.
+    about_zero
+        Whether the offset is 0, so that it does not depend on the least of the values.
 
     Examples
     --------
@@ -62,6 +66,9 @@ def packed(values: npt.ArrayLike, bits: int = 16) -> dict[str, Any]:
     array = np.asarray(values, dtype=float)
     known = np.isfinite(array)
     low, high = (array[known].min(), array[known].max()) if known.any() else (0.0, 0.0)
+    if about_zero:
+        high = max(high, -low)
+        low = -high
     top = 2 ** (bits - 1) - 1
     offset, scale = (low + high) / 2, (high - low) / 2 / top or 1.0
     integers = np.rint((np.where(known, array, offset) - offset) / scale)

@@ -15,7 +15,8 @@ from cpunet.analysis.calibration_figures import (
     profiles_figure,
     pulls_figure,
 )
-from cpunet.calls import html
+from cpunet.analysis.html_pages import part
+from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
@@ -98,13 +99,18 @@ class CalibratedRun(Run):
 
     def _repr_html_(self) -> str:
         rows = [
-            [name, f"{one['value']:.5g} ± {one['error']:.2g}", f"{one['simulated']:.5g}"]
+            [
+                titled(name),
+                f"{one['value']:.5g} ± {one['error']:.2g}",
+                f"{one['simulated']:.5g}",
+            ]
             for name, one in self.physics.items()
         ]
         head = ["physics", "calibrated", "as simulated"]
-        return (
-            html.table(head, rows) + html.lines(self.content["notes"]) + super()._repr_html_()
+        shown = part(
+            "object", "", head=head, rows=rows, lines=map(titled, self.content["notes"])
         )
+        return shown + super()._repr_html_()
 
 
 def calibrate(

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 from rich.console import Console
@@ -21,6 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from cpunet.analysis.html_pages import part
 from cpunet.jobs.common.monitor import Advance, Monitor
 
 LOGGER = logging.getLogger("cpunet")
@@ -77,10 +77,8 @@ class Bar:
 
     def _repr_html_(self) -> str:
         total = 1 if self.ended else self.total
-        known = "" if total is None else f' max="{total}" value="{min(self.done, total)}"'
-        if self.ended:
-            known = ' max="1" value="1"'
-        return f"<div><progress{known}></progress> <small>{escape(repr(self))}</small></div>"
+        done = total if self.ended or total is None else min(self.done, total)
+        return part("progress", total, done, repr(self))
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class Line:
         return self.text
 
     def _repr_html_(self) -> str:
-        return f"<small>{escape(self.text)}</small>"
+        return part("line", self.text)
 
 
 class NotebookMonitor(Monitor):

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import data_axis
+from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS
-from cpunet.calls import html
 from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
@@ -157,9 +157,7 @@ class Report:
             for (peak, parameter), iou in by_place.items()
         ]
         where = {"page": None if self.folder is None else self.folder / "report.html"}
-        parts = [html.heading("cpunet report"), html.table(head, rows)]
-        parts += [html.lines(self.verdicts), html.facts(where)]
-        return "".join(parts)
+        return part("object", "cpunet report", where, head, rows, self.verdicts)
 
 
 def validate(

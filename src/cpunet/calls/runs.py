@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.response_figure import response_figure
 from cpunet.analysis.run_figures import loss_curves
-from cpunet.calls import html
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
@@ -174,11 +174,14 @@ class Run:
 
     def _repr_html_(self) -> str:
         verdict = (self.info.get("fit") or {}).get("verdict")
-        parts = [html.heading("cpunet run"), html.facts(self._facts())]
-        parts.append(html.lines([str(verdict)] if verdict else []))
-        if isinstance(self.recipe.generator, ResponseConfig):
-            parts.append(html.picture(self.response_figure()))
-        return "".join(parts)
+        drawn = isinstance(self.recipe.generator, ResponseConfig)
+        return part(
+            "object",
+            "cpunet run",
+            self._facts(),
+            lines=[verdict] if verdict else [],
+            picture=notebook_picture(self.response_figure()) if drawn else "",
+        )
 
 
 def train(

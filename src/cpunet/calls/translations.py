@@ -15,8 +15,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import data_axis
+from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.style import COLOURS, styled
-from cpunet.calls import html
 from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
@@ -158,8 +158,8 @@ class Translation:
         }
         told |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
         small = self.kept is not None  # a file may be large
-        drawn = html.picture(self.figure()) if small and self.counts["translated"] else ""
-        return html.heading("cpunet translation") + html.facts(told) + drawn
+        drawn = notebook_picture(self.figure()) if small and self.counts["translated"] else ""
+        return part("object", "cpunet translation", told, picture=drawn)
 
 
 def translate(

@@ -211,10 +211,12 @@ def _start(
 
 def result_lines(content: dict[str, Any]) -> list[str]:
     """What a calibration has found, a line each."""
+    from cpunet.calibration.titles import titled
+
     chi = content["chi_square"]
     before, after = chi["before"] / chi["moments"], chi["after"] / chi["moments"]
     lines = [
-        f"{name} {told['value']:.5g} ± {told['error']:.2g} (simulated with "
+        f"{titled(name)} {told['value']:.5g} ± {told['error']:.2g} (simulated with "
         f"{told['simulated']:.5g}; ± {told['error_all']:.2g} if all physics were free)"
         for name, told in content["parameters"].items()
     ]
@@ -226,17 +228,23 @@ def result_lines(content: dict[str, Any]) -> list[str]:
 
 def plan_lines(content: dict[str, Any]) -> list[str]:
     """A plan as a table: errors alone and with all free, by number of pulses."""
+    from cpunet.calibration.titles import titled
+
     pulses = [str(n) for n in content["pulses"]]
-    width = max(map(len, content["errors"])) if content["errors"] else 0
+    alone = "error of one alone"
+    width = max(map(len, [alone, *map(titled, content["errors"])]))
     head = "".join(f"{'N=' + n:>12}" for n in pulses)
-    lines = [f"{'error of one alone':<{width}}{'prior':>10}{head}"]
+    lines = [f"{alone:<{width}}{'prior':>10}{head}"]
     for kind in ("alone", "all_free"):
         if kind == "all_free":
             lines.append(f"{'with all free':<{width}}{'prior':>10}{head}")
         for name, told in content["errors"].items():
             cells = "".join(f"{told[kind][n]:>12.3g}" for n in pulses)
-            lines.append(f"{name:<{width}}{told['prior']:>10.3g}{cells}")
+            lines.append(f"{titled(name):<{width}}{told['prior']:>10.3g}{cells}")
     middle = pulses[len(pulses) // 2]
     lines.append(f"directions with {middle} pulses of each side, error in units of the prior:")
-    lines += [f"{d['error']:8.3f}  {d['words']}" for d in content["directions"][middle]]
+    lines += [
+        f"{d['error']:8.3f}  {titled(d['words'], units=False)}"
+        for d in content["directions"][middle]
+    ]
     return lines

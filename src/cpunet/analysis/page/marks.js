@@ -1,9 +1,11 @@
 // What a panel can hold. Each series knows how to draw itself and which y it covers.
 const px = (v) => v.toFixed(1);
 
+const named = (s) => (s.name ? `class="${s.name}" ` : "");
+
 function look(s) {
   const dash = s.dashed ? " stroke-dasharray=\"5 3\"" : "";
-  return `stroke="${s.colour}" stroke-width="${s.width || 1.6}"${dash} fill="none"`;
+  return `${named(s)}stroke="${s.colour}" stroke-width="${s.width || 1.6}"${dash} fill="none"`;
 }
 
 function path(xs, ys, toX, toY) {
@@ -22,7 +24,7 @@ const MARKS = {
     const known = s.xs.map((x, i) => i).filter((i) => Number.isFinite(s.low[i]) && Number.isFinite(s.high[i]));
     if (!known.length) return "";
     const side = (ys, order) => order.map((i) => `${px(toX(s.xs[i]))} ${px(toY(ys[i]))}`).join("L");
-    return `<path fill="${s.colour}" fill-opacity="${s.opacity || 0.18}" d="M${side(s.high, known)}L${side(s.low, [...known].reverse())}Z"/>`;
+    return `<path ${named(s)}fill="${s.colour}" fill-opacity="${s.opacity || 0.18}" d="M${side(s.high, known)}L${side(s.low, [...known].reverse())}Z"/>`;
   },
   steps: (s, toX, toY) => {
     const base = px(toY(0));

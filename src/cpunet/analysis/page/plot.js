@@ -55,17 +55,23 @@ class Plot {
     }).observe(host);
   }
 
-  // spec: key, title, x {label, home}, panels [{label, share, series, zero, symmetric, home}], snap(x)
+  // spec: key, title, x {label, home}, panels [{label, share, series, zero, symmetric, home, id}], snap(x)
   show(spec) {
     if (!this.spec || this.spec.key !== spec.key) this.zoom = null;
     this.spec = spec;
     this.draw();
   }
 
-  zoomTo(x, y = null) {
-    this.zoom = x && { x, y };
+  // y is of one of the panels
+  zoomTo(x, y = null, panel = 0) {
+    this.zoom = x && { x, y, panel };
     this.cursor(null);
     this.draw();
+  }
+
+  zoomAlong(x) {
+    const { y, panel } = this.zoom || {};
+    this.zoomTo(x, y, panel);
   }
 
   range() {
@@ -77,7 +83,7 @@ class Plot {
     if (!this.spec || width < 50) return;
     this.width = width;
     const small = width < 480;
-    const height = Math.round(Math.min(this.options.most || 470, Math.max(340, width * 0.62)));
+    const height = Math.round(Math.min(this.options.most || 470, Math.max(340, width * (this.options.ratio || 0.62))));
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
     const x0 = MARGIN.left, x1 = width - MARGIN.right;
     const [low, high] = this.range();
@@ -89,7 +95,10 @@ class Plot {
     const shares = panels.reduce((sum, p) => sum + (p.share || 1), 0);
     const xt = ticks([low, high], small ? 5 : 8);
     let top = this.box.y0;
-    let out = `<text class="title" x="${x0}" y="15">${escapeHtml(this.spec.title)}</text>`;
+    // a long title begins further left, and is squeezed where that does not suffice
+    const long = 7.6 * this.spec.title.length, start = Math.max(4, Math.min(x0, width - long));
+    const squeezed = long > width ? ` textLength="${width - 8}" lengthAdjust="spacingAndGlyphs"` : "";
+    let out = `<text class="title" x="${start}" y="15"${squeezed}>${escapeHtml(this.spec.title)}</text>`;
     panels.forEach((panel, i) => {
       const bottom = top + (room * (panel.share || 1)) / shares;
       out += this.drawPanel(panel, i, top, bottom, xt, small);
@@ -105,7 +114,7 @@ class Plot {
 
   drawPanel(panel, index, top, bottom, xt, small) {
     const { x0, x1 } = this.box;
-    const [low, high] = this.zoom && this.zoom.y && index === 0 ? this.zoom.y : this.yRange(panel);
+    const [low, high] = this.zoom && this.zoom.y && index === this.zoom.panel ? this.zoom.y : this.yRange(panel);
     const toY = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
     panel.fromY = (py) => low + ((bottom - py) / (bottom - top)) * (high - low);
     panel.box = { top, bottom };
@@ -126,7 +135,7 @@ class Plot {
     out += `<path class="frame" d="M${x0} ${top}V${bottom}H${x1}"/>`;
     const middle = (top + bottom) / 2;
     out += `<text class="name" transform="translate(${small ? 12 : 14} ${middle}) rotate(-90)" text-anchor="middle">${escapeHtml(panel.label)}</text>`;
-    return out;
+    return panel.id ? `<g id="${panel.id}">${out}</g>` : out;
   }
 
   // of what is seen between the ends of x; series with fit: false do not count
@@ -173,6 +182,13 @@ class Plot {
         y: inside((event.clientY - frame.top) * scale, y0, y1),
       };
     };
+    const panelAt = (y) => {
+      const found = this.spec.panels.findIndex((panel) => y <= panel.box.bottom), index = found < 0 ? 0 : found;
+      return { index, panel: this.spec.panels[index] };
+    };
+    // ends of a frame that zooms in y as well, within its panel; null if it does not
+    const heights = (a, b, { box }) => this.options.box && Math.abs(a.y - b.y) >= DRAG
+      && [a.y, b.y].sort((y, z) => y - z).map((y) => Math.min(Math.max(y, box.top), box.bottom));
     svg.addEventListener("pointerdown", (event) => {
       if (event.button !== 0 || !this.box) return;
       start = where(event);
@@ -182,8 +198,8 @@ class Plot {
       if (!this.box) return;
       const now = where(event);
       if (!start) return this.cursor(this.fromX(now.x));
-      const { y0, y1 } = this.box, box = this.options.box;
-      const top = box ? Math.min(start.y, now.y) : y0, bottom = box ? Math.max(start.y, now.y) : y1;
+      const { y0, y1 } = this.box, { panel } = panelAt(start.y), tall = heights(start, now, panel);
+      const [top, bottom] = tall || [y0, y1];
       this.over.innerHTML = `<rect class="chosen" x="${Math.min(start.x, now.x)}" y="${top}" width="${Math.abs(now.x - start.x)}" height="${bottom - top}"/>`;
     });
     svg.addEventListener("pointerup", (event) => {
@@ -191,11 +207,10 @@ class Plot {
       const from = start, now = where(event);
       start = null;
       if (Math.abs(now.x - from.x) < DRAG) return this.cursor(this.fromX(now.x));
-      const pair = (a, b) => [Math.min(a, b), Math.max(a, b)];
-      const tall = this.options.box && Math.abs(now.y - from.y) >= DRAG;
-      const panel = this.spec.panels[0];
-      this.zoomTo(pair(this.fromX(from.x), this.fromX(now.x)),
-        tall ? pair(panel.fromY(from.y), panel.fromY(now.y)) : this.zoom && this.zoom.y);
+      const x = [from.x, now.x].sort((a, b) => a - b).map(this.fromX);
+      const { panel, index } = panelAt(from.y), tall = heights(from, now, panel);
+      if (tall) this.zoomTo(x, tall.reverse().map(panel.fromY), index);
+      else this.zoomAlong(x);
     });
     svg.addEventListener("pointercancel", () => { start = null; this.over.innerHTML = ""; });
     svg.addEventListener("pointerleave", () => { if (!start && this.box) this.cursor(null); });
@@ -209,10 +224,10 @@ class Plot {
     const [low, high] = this.range(), span = high - low;
     const middle = this.at ?? (low + high) / 2;
     const sign = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (sign && event.shiftKey) this.zoomTo([low + sign * span * 0.1, high + sign * span * 0.1], this.zoom && this.zoom.y);
+    if (sign && event.shiftKey) this.zoomAlong([low + sign * span * 0.1, high + sign * span * 0.1]);
     else if (sign) this.cursor(Math.min(high, Math.max(low, middle + sign * Math.max(span / 100, this.spec.stride || 0))));
-    else if (event.key === "+" || event.key === "=") this.zoomTo([middle - span / 4, middle + span / 4], this.zoom && this.zoom.y);
-    else if (event.key === "-") this.zoomTo([middle - span, middle + span], this.zoom && this.zoom.y);
+    else if (event.key === "+" || event.key === "=") this.zoomAlong([middle - span / 4, middle + span / 4]);
+    else if (event.key === "-") this.zoomAlong([middle - span, middle + span]);
     else if (event.key === "0" || event.key === "Escape") this.zoomTo(null);
     else return;
     event.preventDefault();

@@ -22,6 +22,7 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics
 from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
+from cpunet.calibration.titles import titled
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.calibration.calibration_inputs import (
@@ -149,7 +150,7 @@ class Calibration:
             self._require_hope(calibrated, sides)
             content = self._content(calibrated, sides)
             for note in content["notes"]:
-                monitor.note(note)
+                monitor.note(titled(note))
             _simulate_calibrated(calibrated, sides, folder, self.seed, monitor)
             again = load_simulated(
                 InputFile(folder / SIM), self.recipe, sides.selection, monitor
