@@ -18,7 +18,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) -e '.[dev]'
 	@echo compiling the loops that tests share: a minute or two
-	$(BIN)/python tests/compiled.py
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python tests/compiled.py
 	touch $@
 
 demo: install

@@ -1,8 +1,8 @@
-"""Compiled loops that the tests share: those of other packages, and the package's own.
+"""Compiled code that the tests share: loops of other packages and of our own, and bytecode.
 
-Both are kept for later runs.  An installation for development makes them (``make install-dev``
+All is kept for later runs.  An installation for development makes them (``make install-dev``
 runs this module), as a first run of the program does; whatever is missing is compiled by the
-test that needs it.
+process that needs it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
+ROOT = Path(__file__).parents[1]
 # What other packages compile when it is imported, a minute in all; half in each process.
 OTHERS = (
     ("lh5.compression.radware", "dspeed.processors.moving_windows"),
@@ -90,8 +91,8 @@ def share(own: Path, others: Path) -> None:
         (own / name).symlink_to(kept)
 
 
-def make_own() -> None:
-    """Run commands that need the package's own loops, in folders that are removed."""
+def make_all() -> None:
+    """Run commands that need the package's own loops, and collect the tests."""
     with tempfile.TemporaryDirectory(prefix="cpunet-compiled-") as name:
         folder = Path(name)
         share(folder / "code", of_others())
@@ -101,17 +102,18 @@ def make_own() -> None:
             edep_keV=[900.0, 300.0],
             offsets=[0, 2],
         )
-        environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "code")}
+        programs = [(["-c", RUN, *commands.split("; ")], folder) for commands in OWN]
+        programs.append((["-m", "pytest", "--collect-only", "-q"], ROOT))
         running = [
             subprocess.Popen(
-                [sys.executable, "-c", RUN, *commands.split("; ")],
-                cwd=folder,
-                env=environment,
+                [sys.executable, *words],
+                cwd=place,
+                env=os.environ | {"NUMBA_CACHE_DIR": str(folder / "code")},
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 text=True,
             )
-            for commands in OWN
+            for words, place in programs
         ]
         for process in running:
             _, told = process.communicate()
@@ -120,4 +122,4 @@ def make_own() -> None:
 
 
 if __name__ == "__main__":
-    make_own()
+    make_all()

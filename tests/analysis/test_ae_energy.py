@@ -33,6 +33,7 @@ def line(low: float, n: int, several: float, rng: np.random.Generator):
     return events(rng.uniform(low, low + 10, n), several, rng)
 
 
+@pytest.mark.thorough
 def test_the_line_through_the_continuum() -> None:
     pulls, widths = [], []
     for seed in range(6):

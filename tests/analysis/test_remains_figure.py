@@ -14,6 +14,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 
 
+@pytest.mark.thorough
 def test_slopes_without_remains_are_those_of_empty_baselines():
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (1500, 1)), 0, 1)

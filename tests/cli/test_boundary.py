@@ -148,6 +148,7 @@ def test_a_screen_without_our_signs(stand):
     assert "..." in told.stdout
 
 
+@pytest.mark.thorough
 def test_results_that_cannot_be_printed(stand):
     """A full disk, a closed stream, and a reader who is gone."""
     with Path("/dev/full").open("w") as full:

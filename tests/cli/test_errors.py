@@ -339,6 +339,7 @@ def test_the_help_does_not_load_torch():
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.thorough
 def test_the_installed_command(stand):
     executable = Path(sys.executable).parent / "cpunet"
     if not executable.is_file():

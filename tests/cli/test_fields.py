@@ -43,6 +43,7 @@ def test_impurities_from_the_measured_depletion(command):
     assert again.out.splitlines()[4] == outcome.out.splitlines()[4]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     [

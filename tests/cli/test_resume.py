@@ -51,7 +51,13 @@ def words(stand, tiny, tmp_path) -> list[object]:
     return ["train", *stand.inputs, "--out", tmp_path / "run", *SEED, *tiny, *KEPT]
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT], ids=["TERM", "INT"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param(signal.SIGTERM, id="TERM"),
+        pytest.param(signal.SIGINT, id="INT", marks=pytest.mark.thorough),
+    ],
+)
 def test_a_signal_stops_between_two_iterations(
     command, words, trained, tmp_path, monkeypatch, how
 ):

@@ -284,6 +284,7 @@ def test_memory_does_not_grow_with_the_file(file):
     assert peak < 5e6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "length"), [("waveform_windowed", 1400), ("waveform_presummed", 781)]
 )

@@ -49,7 +49,7 @@ def require_same(a: Hits, b: Hits) -> None:
 
 
 @pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("size", [1, 7, 52, 53, 1000])
+@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.thorough), 7, 52, 53, 1000])
 def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
     numbers = np.repeat(np.arange(N), 3)[:N] if repeated else 10 * np.arange(N)[::-1]
     file = write(tmp_path / "stp.lh5", numbers)

@@ -52,6 +52,7 @@ def test_bf16_has_the_direction_of_the_gradient(tiny, sets):
     assert not torch.equal(found[1], expected[1])
 
 
+@pytest.mark.thorough
 def test_only_the_plain_precision_takes_the_fast_step(tiny):
     wide = "generator.width=16"
     for settings, fast in (

@@ -80,7 +80,7 @@ def test_the_result_is_ready_for_use(tiny, sets):
 
 @pytest.mark.parametrize("residual", ["true", "false"])
 @pytest.mark.parametrize("side", [0, 1], ids=["sim", "data"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, pytest.param(np.inf, marks=pytest.mark.thorough)])
 def test_a_loss_that_is_no_number_stops_the_training(tiny, sets, residual, side, value):
     sets[side][:, 20] = value
     with pytest.raises(CpunetError) as error:

@@ -234,6 +234,7 @@ def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     assert first[0].describe() != other[0].describe()
 
 
+@pytest.mark.thorough
 def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> None:
     other = simulated(charge(N, seed=1, longest=60, steepest=7))
     short = ("training.start_factors=[1]", "training.steps=10", "training.ringing_mhz=[]")

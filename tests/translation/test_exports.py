@@ -76,6 +76,7 @@ def prepared(sim: np.ndarray) -> np.ndarray:
     return prepare(Pulses.of(sim, dt_ns=16), config, "simulated").pulses.waveforms
 
 
+@pytest.mark.thorough
 def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
     onnx = pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")

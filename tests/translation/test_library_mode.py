@@ -197,6 +197,7 @@ def test_reboost_finds_the_current_amplitude(chain, tmp_path):
     assert float(amplitude[0]) == pytest.approx(current.max(), rel=2e-3)
 
 
+@pytest.mark.thorough
 def test_a_library_of_our_own(chain, tmp_path):
     utils = pytest.importorskip("reboost.hpge.utils")
     settings = SimulationSettings(dt_ns=4, length_ns=3200, step_ns=2)

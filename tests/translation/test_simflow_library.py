@@ -81,6 +81,7 @@ def ideal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("ideal") / "ideal.lh5", charge())
 
 
+@pytest.mark.thorough
 def test_currents_about_their_maximum() -> None:
     templates = charge()[0, :3].astype(np.float32)
     found, times = currents_about_peak(templates)

@@ -95,7 +95,10 @@ def other_fine() -> FloatArray:
     return ideal(800, seed=2)
 
 
-@pytest.mark.parametrize(("sigma_ns", "tau_ns"), [(30.0, 60.0), (20.0, 90.0)])
+@pytest.mark.parametrize(
+    ("sigma_ns", "tau_ns"),
+    [(30.0, 60.0), pytest.param(20.0, 90.0, marks=pytest.mark.thorough)],
+)
 def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
     response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))
     rival = GaussExp.fit(sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
@@ -217,6 +220,7 @@ def test_bad_input_is_named(sim) -> None:
         RC.fit(sim, -sim, DT_NS, ALIGN)
 
 
+@pytest.mark.thorough
 def test_free_kernel_on_reference_pulses(reference_data: Path) -> None:
     """Closure pulses: response of siggen pulses to a known kernel, from other events."""
     path = reference_data / "closure" / "sim.lh5"
