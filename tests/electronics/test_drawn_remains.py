@@ -93,6 +93,7 @@ def test_records_get_noise_and_remains_in_proportion_to_their_energies():
     assert ratio == pytest.approx(np.exp(-8 / 54.6), rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_what_passes_is_measured_by_adding_remains_to_traces_without():
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (2500, 1)), 0, 1)
