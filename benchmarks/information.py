@@ -7,7 +7,9 @@ of the double-escape peak from the truth is given for each.  Beside them stands 
 Fisher information of the best function of a pulse that a small network finds (Charnock et al.,
 Phys. Rev. D 97 (2018) 083004), on pulses that it has not seen.
 
-``python benchmarks/information.py STAND --run RUN`` prints the shift of a run alone.
+``python benchmarks/information.py STAND --run RUN`` prints the shift of a run alone.  With
+``--chain RUN`` the data are simulated experiments: half of the stand's simulated pulses behind
+the response of a run, with noise.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from cpunet.electronics.finishing import finish
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.chain_and_inverse import known_response
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
@@ -62,6 +65,31 @@ def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray
 def off(translated: np.ndarray, wanted: np.ndarray) -> float:
     """Median relative error of current amplitudes in percent."""
     return 100 * float(np.nanmedian(np.log(current_amplitude(translated) / wanted)))
+
+
+def experiment(
+    run: Path, sim: Pulses, windows: np.ndarray, noise
+) -> tuple[Pulses, Pulses, np.ndarray]:
+    """Half of the pulses, the others as data behind a known response, and true amplitudes."""
+    half, config = len(sim) // 2, RECIPE.preparation
+    response = known_response(run, sim.dt_ns)
+    kev = sim.energy_kev[half:]
+
+    def records(pulses: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return response(torch.from_numpy(pulses)).numpy()
+
+    measured = finish(
+        records(sim.waveforms[half:]),
+        config,
+        dt_ns=sim.dt_ns,
+        noise=noise,
+        energy_kev=kev,
+        seed=1,
+    )
+    data = Pulses.of(measured, dt_ns=sim.dt_ns, energy_kev=kev)
+    true = finish(records(windows), config, dt_ns=sim.dt_ns)
+    return sim[:half], data, current_amplitude(true)
 
 
 def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
@@ -147,6 +175,11 @@ def main() -> None:
     parser.add_argument(
         "--run", type=Path, help="folder of a run: its shift is printed, no more"
     )
+    parser.add_argument(
+        "--chain",
+        type=Path,
+        help="folder of a run whose response makes data with a known answer",
+    )
     arguments = parser.parse_args()
     windows, wanted = judged(arguments.stand)
     if arguments.run is not None:
@@ -158,6 +191,8 @@ def main() -> None:
     sim = load_simulated(files[0], RECIPE, selection, Monitor()).prepared.pulses
     data = load_measured(files[1], RECIPE, selection, Monitor()).prepared.pulses
     noise, _ = measured_noise(files[1], data, RECIPE.preparation)
+    if arguments.chain is not None:
+        sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
     start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
     state = {name: value.clone() for name, value in start.state_dict().items()}
     shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
