@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -50,6 +51,10 @@ for command in sys.argv[1:]:
 """
 
 
+class NotCompiledError(Exception):
+    """What is compiled by others cannot be had: the installation is broken."""
+
+
 def of_others() -> Path:
     """Folder of compiled code of other packages; made if there is none of these versions.
 
@@ -77,7 +82,10 @@ def of_others() -> Path:
             ]
             ended = [process.wait() for process in compiling]
             if any(ended):
-                raise RuntimeError("what other packages compile cannot be imported")
+                shutil.rmtree(aside)
+                raise NotCompiledError(
+                    "lh5, dspeed or lgdo cannot be imported: run make install-dev"
+                )
             aside.replace(made)
     return made
 
@@ -97,13 +105,18 @@ def share(own: Path, others: Path) -> None:
 
 
 def make_all() -> None:
-    """Run commands that need the package's own loops, and collect the tests."""
+    """Run commands that need the package's own loops, and collect the tests.
+
+    One that fails is warned about: what it would have compiled, tests compile.
+    """
     with tempfile.TemporaryDirectory(prefix="cpunet-compiled-") as name:
         folder = Path(name)
         share(folder / "code", of_others())
         np.savez(
             folder / "hits.npz",
-            **{"x_mm": [10.0, 12.0], "y_mm": [5.0, 5.0], "z_mm": [20.0, 21.0]},
+            x_mm=[10.0, 12.0],
+            y_mm=[5.0, 5.0],
+            z_mm=[20.0, 21.0],
             edep_keV=[900.0, 300.0],
             offsets=[0, 2],
         )
@@ -122,9 +135,12 @@ def make_all() -> None:
         ]
         for process in running:
             _, told = process.communicate()
-            if process.returncode:
-                raise RuntimeError(told)
+            if process.returncode:  # tests compile what they need, and tell what is wrong
+                warnings.warn(f"not all is compiled beforehand: {told.strip()}", stacklevel=1)
 
 
 if __name__ == "__main__":
-    make_all()
+    try:
+        make_all()
+    except NotCompiledError as error:
+        sys.exit(f"error: {error}")

@@ -38,6 +38,15 @@ def beside(name: str) -> ModuleType:
 compiled = beside("compiled")
 
 
+def others_compiled() -> Path:
+    """Folder of what other packages compile."""
+    try:
+        found: Path = compiled.of_others()
+    except compiled.NotCompiledError as error:
+        raise pytest.UsageError(str(error)) from None
+    return found
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Have all compile once, and processes that are started use one thread.
 
@@ -51,12 +60,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
         os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
-        compiled.share(own, compiled.of_others())
+        compiled.share(own, others_compiled())
     elif getattr(config.option, "dist", "no") != "no":
         folder = tempfile.mkdtemp(prefix="cpunet-tests-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["NUMBA_CACHE_DIR"] = folder
-        compiled.of_others()
+        others_compiled()
 
 
 def pytest_collection_finish() -> None:
