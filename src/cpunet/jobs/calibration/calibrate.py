@@ -34,6 +34,7 @@ from cpunet.jobs.calibration.calibration_inputs import (
     read_sides,
 )
 from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
 from cpunet.jobs.common.memory import keep_freed_memory
@@ -111,6 +112,7 @@ class Calibration:
         """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return (*self.start.files, *self.data.files)
 
+    @one_thread_for_matrices()
     def run(
         self, out: Path, *, force: bool = False, monitor: Monitor = QUIET
     ) -> dict[str, Any]:
@@ -170,6 +172,7 @@ class Calibration:
             write_run(folder, model, recipe, info | {"calibration": CALIBRATION})
         return content
 
+    @one_thread_for_matrices()
     def plan(
         self, out: Path | None = None, *, force: bool = False, monitor: Monitor = QUIET
     ) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from cpunet.jobs.common.inputs import (
     require_both_sides,
     require_same_sampling,
 )
+from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
@@ -33,6 +34,7 @@ from cpunet.training.run_folder import read_info, write_run
 QUIET, AS_USUAL = Monitor(), TrainOptions()
 
 
+@one_thread_for_matrices()
 def train_run(
     sim: InputFile,
     data: InputFile,

@@ -22,6 +22,7 @@ from cpunet.jobs.common.inputs import (
     load_simulated,
     require_same_sampling,
 )
+from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
 from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
@@ -113,6 +114,7 @@ class ValidateOptions:
     device: str = "auto"
 
 
+@one_thread_for_matrices()
 def evaluate(
     run: Path, sim: InputFile, data: InputFile, how: ValidateOptions, monitor: Monitor
 ) -> Evaluation:
