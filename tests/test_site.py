@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -10,7 +14,10 @@ import pytest
 
 import cpunet
 
-HOOKS = Path(__file__).resolve().parents[1] / "docs" / "hooks"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+HOOKS = DOCS / "hooks"
+NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
+BASH = "%%bash\n"
 
 
 def hook(name: str, needs: str) -> ModuleType:
@@ -56,3 +63,44 @@ def test_formulas_of_docstrings_become_mathml():
     html = made.on_page_content('<span class="arithmatex">\\(a &lt; b\\)</span>')
     assert html.startswith("<math")
     assert "&lt;" in html or "&#x0003C;" in html
+
+
+def cells(notebook: Path) -> list[dict]:
+    return [c for c in json.loads(notebook.read_text())["cells"] if c["cell_type"] == "code"]
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_pages_with_what_their_cells_showed(notebook):
+    page = hook("notebooks", "mkdocs").page(notebook)
+    shown = [output for cell in cells(notebook) for output in cell["outputs"]]
+    assert len(shown) >= len(cells(notebook)) - 1  # of one that only imports there is nothing
+    for output in shown:
+        assert output["output_type"] != "error"
+        assert output.get("name") != "stderr"
+        for line in output.get("text", ()):
+            assert line.rstrip() in page
+        for kind in {"image/png"} & output.get("data", {}).keys() - {"text/html"}:
+            assert output["data"][kind] in page
+    assert notebook.name in page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
+    """Every cell in turn, with fewer events and a fit that ends at once."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    names: dict[str, object] = {}
+    for cell in cells(notebook):
+        source = "".join(cell["source"])
+        source = source.replace("FEP=2500,SEP=1000,DEP=1000", "FEP=500,SEP=120,DEP=120")
+        source = source.replace(
+            '"run", progress', 'settings={"training.steps": 1}, out="run", progress'
+        )
+        if source.startswith(BASH):
+            command = ["bash", "-c", source.removeprefix(BASH)]
+            subprocess.run(command, env=os.environ | {"PATH": path}, check=True)
+        else:
+            exec(compile(source, notebook.name, "exec"), names)
+    assert (tmp_path / "report" / "report.html").exists()
