@@ -285,7 +285,9 @@ def test_the_figure_shows_every_chain_beside_the_truth():
     ):
         step, residual, *rest = _panels(response_figure(chains, reference, tail_ns=6400))
         assert len(step.lines) == len(chains) + (reference is not None)
-        assert len(residual.lines) == residuals + (residuals > 0)  # and the line at 0
+        if residuals:
+            assert len(residual.lines) == residuals + 1  # and the line at 0
+        assert (residual is None) == (residuals == 0)  # no panel is empty
         assert all(len(axes.lines) == len(step.lines) for axes in rest)
     # half height is at 0, and a residual that of the chains at half height
     figure = response_figure(others[:1], others[0], tail_ns=6400)
@@ -297,7 +299,7 @@ def test_the_figure_shows_every_chain_beside_the_truth():
 
 def _panels(figure):
     titles = {axes.get_title(): axes for axes in figure.axes}
-    residual = titles.pop("")
+    residual = titles.pop("", None)
     return [titles.pop("Step response"), residual, *titles.values()]
 
 

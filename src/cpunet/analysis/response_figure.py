@@ -113,7 +113,7 @@ def response_figure(
 
     Times are counted from half height, by which pulses are aligned: an overall delay of the
     chain cannot be inferred from them.  Residuals are differences from the truth, or from
-    the mean of several chains if there is no truth.
+    the mean of several chains if there is no truth; a single chain has none.
 
     Parameters
     ----------
@@ -124,10 +124,11 @@ def response_figure(
     tail_ns
         Time after the step up to which the tail is drawn, in ns.
     """
-    figure = Figure(figsize=(10.5, 8.0))
-    panels = figure.subplot_mosaic(
-        [list(row) for row in _LAYOUT], height_ratios=(2.2, 1.3, 2.2)
-    )
+    compared = truth is not None or len(chains) > 1
+    rows = [row for row in _LAYOUT if compared or "residual" not in row]
+    heights = [1.3 if "residual" in row else 2.2 for row in rows]
+    figure = Figure(figsize=(10.5, 2.4 + sum(heights)))
+    panels = figure.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
     shades = [COLOURS["ren"], *SPARE_COLOURS]
     drawn = [(chain, shades[i % len(shades)], 1.2) for i, chain in enumerate(chains)]
     if truth is not None:
@@ -136,7 +137,8 @@ def response_figure(
     for chain, colour, width in drawn:
         _responses(panels, chain, colour, width, tail_ns)
         _noise(panels["noise"], chain, colour, width)
-    _residuals(panels["residual"], chains, truth, shades)
+    if compared:
+        _residuals(panels["residual"], chains, truth, shades)
     _annotate(panels, has_noise=bool(panels["noise"].lines))
     return figure
 
@@ -161,12 +163,8 @@ def _residuals(
     steps = [chain.whole.step(time_ns + half_height_ns(chain)) for chain in chains]
     if truth is not None:
         reference, name = truth.whole.step(time_ns + half_height_ns(truth)), "truth"
-    elif len(chains) > 1:
-        reference, name = np.mean(steps, axis=0), "mean"
     else:
-        axes.text(0.5, 0.5, "no truth given", ha="center", transform=axes.transAxes)
-        axes.set(ylabel="Residual", yticks=[])
-        return
+        reference, name = np.mean(steps, axis=0), "mean"
     for i, step in enumerate(steps):
         axes.plot(time_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
     axes.axhline(0, color="black", linewidth=0.8)
@@ -187,12 +185,13 @@ def _noise(axes: Axes, chain: Chain, colour: str, width: float) -> None:
 
 
 def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
-    for name in ("step", "residual"):
-        panels[name].set(xlim=(-100, STEP_NS))
+    steps = [panels[name] for name in ("step", "residual") if name in panels]
+    for axes in steps:
+        axes.set(xlim=(-100, STEP_NS))
+        axes.tick_params(labelbottom=axes is steps[-1])
+    steps[-1].set(xlabel="Time from half height [ns]")
     panels["step"].set(title="Step response", ylabel="Height [full charge]")
-    panels["step"].tick_params(labelbottom=False)
     panels["step"].legend(loc="lower right")
-    panels["residual"].set(xlabel="Time from half height [ns]")
     panels["impulse"].set(
         title="Impulse response",
         xlabel="Time from half height of the step [ns]",
