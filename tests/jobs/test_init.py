@@ -19,6 +19,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation.translator import REN
+from synthetic import after_pole, decay, phased_edges
 
 FAST = load_recipe(
     "fast",
@@ -79,13 +80,9 @@ def write(
 ) -> InputFile:
     """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
     rng = np.random.default_rng(seed)
-    time = np.arange(1100.0)
-    width = rng.uniform(1.0, 6.0, (n, 1))
-    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
+    pulses = phased_edges(n, rng, 450, 1100)
     if pole is not None:
-        kernel = np.exp(-np.arange(90) / pole)
-        smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())[:, :1100]
-        decayed = smooth * np.exp(-np.clip(time - 450, 0, None) / 4000)
+        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
         pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
     kev = np.full(n, 2614.5)
     write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
