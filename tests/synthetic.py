@@ -33,6 +33,33 @@ DT_NS = 16.0
 LENGTH, START, STOP = 1200, 500, 725  # of a trace, and of the charge within it
 KEV = (2614.511, 2103.511, 1592.511)
 
+PREPARATION = PreparationConfig(
+    samples_before=400,
+    samples_after=400,
+    align_fraction=0.999,
+    baseline_samples=200,
+    tail_samples=5,
+    tail_level=0.8,
+    decay_fit_samples=300,
+    max_padding_before=200,
+    max_padding_after=0,
+    saturation_run=4,
+)
+# settings of the narrowest networks, and of recipe small without its readout chain
+SMALL_NETWORK = (
+    "generator.width=2",
+    "discriminator.embedding_dim=2",
+    "discriminator.hidden=2",
+    "training.batch_size=4",
+    "training.statistics_batches=1",
+)
+WITHOUT_CHAIN = (
+    "chain=null",
+    "training.noise=none",
+    "training.losses.baseline_len=200",
+    "training.losses.tail_len=400",
+)
+
 
 def edges(
     n: int,

@@ -27,22 +27,15 @@ from cpunet.training.run_folder import write_run
 from cpunet.translation.backends import Backend
 from cpunet.translation.ensemble import EnsembleREN
 from cpunet.translation.translator import REN
-from synthetic import KEV, Files, edges, write_files
+from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, edges, write_files
 
 RECIPE = load_recipe(
     "small",
     [
-        "generator.width=2",
-        "chain=null",
-        "training.noise=none",
-        "training.losses.baseline_len=200",
-        "training.losses.tail_len=400",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
+        *SMALL_NETWORK,
+        *WITHOUT_CHAIN,
         "discriminator.samples_per_step=80",
         "training.iterations=3",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
         "scores.bootstraps=10",
     ],
 )

@@ -19,7 +19,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation.translator import REN
-from synthetic import after_pole, decay, phased_edges
+from synthetic import SMALL_NETWORK, WITHOUT_CHAIN, after_pole, decay, phased_edges
 
 FAST = load_recipe(
     "fast",
@@ -35,34 +35,23 @@ FAST = load_recipe(
 TINY = load_recipe(
     "small",
     [
-        "generator.width=2",
-        "chain=null",
-        "training.noise=none",
-        "training.losses.baseline_len=200",
-        "training.losses.tail_len=400",
+        *SMALL_NETWORK,
+        *WITHOUT_CHAIN,
         "discriminator.embedding_rows=20",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
         "discriminator.samples_per_step=16",
         "training.iterations=1",
         "training.rate_generators=1e-12",
         "training.weight_decay=0",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
     ],
 )
 
 CHAINED = load_recipe(
     "small",
     [
-        "generator.width=2",
+        *SMALL_NETWORK,
         "discriminator.embedding_rows=20",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
         "discriminator.samples_per_step=16",
         "training.iterations=2",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
         "training.pairs.iterations=1",
         "chain.training.components=4",
         "chain.training.squares=2",

@@ -32,18 +32,15 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run_folder import write_run
-from synthetic import KEV, Files, Listening, prepared_truth, write_files
+from synthetic import KEV, SMALL_NETWORK, Files, Listening, prepared_truth, write_files
 
 RECIPE = load_recipe(
     "paper",
     [
-        "generator.width=2",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
+        *SMALL_NETWORK,
         "discriminator.samples_per_step=16",
         "training.iterations=2",
         "training.batch_size=2",
-        "training.statistics_batches=1",
     ],
 )
 N = 30

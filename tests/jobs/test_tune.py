@@ -27,24 +27,17 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
 from cpunet.training.search_space import search_space, value_of, with_values
 from cpunet.translation.translator import REN
-from synthetic import KEV, Files, write_files
+from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, write_files
 
 SPACE = (
     "search={generator.width: {choices: [2, 4]}, "
     "training.rate_generators: {low: 1.0e-4, high: 1.0e-2, log: true}}"
 )
 TINY = [
-    "generator.width=2",
-    "chain=null",
-    "training.noise=none",
-    "training.losses.baseline_len=200",
-    "training.losses.tail_len=400",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
+    *SMALL_NETWORK,
+    *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
     "training.iterations=8",
-    "training.batch_size=4",
-    "training.statistics_batches=1",
     "training.checkpoint_interval=2",
     "scores.bootstraps=10",
     SPACE,

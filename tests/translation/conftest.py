@@ -14,7 +14,7 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
 from cpunet.training.run_folder import write_run
-from synthetic import decaying_traces, edges
+from synthetic import SMALL_NETWORK, decaying_traces, edges
 
 DT_NS = 16.0
 
@@ -35,12 +35,9 @@ def recipe() -> Recipe:
     return load_recipe(
         "paper",
         [
-            "generator.width=2",
-            "discriminator.embedding_dim=2",
-            "discriminator.hidden=2",
+            *SMALL_NETWORK,
             "discriminator.samples_per_step=16",
             "training.iterations=3",
-            "training.batch_size=4",
             "training.statistics_batches=2",
         ],
     )
