@@ -17,7 +17,7 @@ import numpy as np
 import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
-from cpunet.jobs.inspection.chain_description import learned_chain
+from cpunet.jobs.inspection.closed_forms import learned_chain
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector

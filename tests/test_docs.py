@@ -27,6 +27,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe, recipe_names
 from cpunet.translation.translator import RejectionWarning
+from synthetic import decay, phased_edges
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -152,11 +153,6 @@ def slugify(title: str) -> str:
     return re.sub(r"[-\s]+", "-", words)
 
 
-def edges(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
-    width = rng.uniform(1.0, 6.0, (n, 1))
-    return 1 / (1 + np.exp(-(np.arange(length) - 550 - rng.uniform(0, 1, (n, 1))) / width))
-
-
 SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
 """A fit that ends at once, whatever it has found."""
 
@@ -165,16 +161,16 @@ SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_m
 def home(tmp_path_factory) -> Path:
     """The files that the pages speak of, sim.lh5 as `cpunet simulate` may write it."""
     folder, rng = tmp_path_factory.mktemp("docs"), np.random.default_rng(1)
-    sim = edges(260, 1200, rng)
+    sim = phased_edges(260, rng, 550, 1200)
     sim[7] = 0  # of which nothing was collected
     kev = np.full(len(sim), KEV)
     kev[3] = 1.0  # the rest was lost in the lithium layer
     write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    decayed = edges(260, 1200, rng) * np.exp(-np.clip(np.arange(1200) - 550, 0, None) / 4000)
+    decayed = phased_edges(260, rng, 550, 1200) * decay(550, 4000, 1200)
     raw = np.round(1000 + 10 * KEV * decayed + rng.normal(0, 20, decayed.shape))
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=np.full(len(raw), KEV))
     write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
-    fine = Pulses.of(edges(4, 3000, rng), dt_ns=1, energy_kev=np.full(4, KEV))
+    fine = Pulses.of(phased_edges(4, rng, 550, 3000), dt_ns=1, energy_kev=np.full(4, KEV))
     write_pulses(folder / "fine.lh5", fine)
     recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")

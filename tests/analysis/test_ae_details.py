@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import numpy as np
@@ -14,6 +13,7 @@ from cpunet.analysis.ae_details import ae_against_drift_time, two_dimensional
 from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.analysis.range_survival import peak_survival, survival_by_range
 from cpunet.errors import CpunetError
+from synthetic import require_drawn
 
 
 def events(rng, n, slope=-1e-5):
@@ -78,7 +78,7 @@ def test_a_bin_with_few_events_is_missing():
     amplitude, time = by_method(np.random.default_rng(3), {"data": 100, "raw": 9})
     table = ae_against_drift_time(amplitude, time, bins=1)
     assert "(at least 10 are needed)" in table["methods"]["raw"][0]["missing"]
-    render(ae_figure(table, "SEP"))
+    require_drawn(ae_figure(table, "SEP"))
 
 
 def test_data_without_events_are_refused():
@@ -213,24 +213,18 @@ def test_figures_draw_what_is_in_the_tables():
     amplitude, time = by_method(np.random.default_rng(9), {"data": 900, "raw": 900, "ren": 900})
     table = ae_against_drift_time(amplitude, time)
     figure = ae_figure(table, "SEP")
-    render(figure)
+    require_drawn(figure)
     drawn = figure.axes[0].lines[0].get_ydata()
     assert drawn.tolist() == [row["median"] for row in table["methods"]["data"]]
 
     amplitude["raw"] = amplitude["raw"] + 100
     both = two_dimensional(amplitude, time, bootstraps=10)
     figure = two_dimensional_figure(both, "SEP")
-    render(figure)
+    require_drawn(figure)
     said = [[text.get_text() for text in axes.texts] for axes in figure.axes[:3]]
     assert said == [[], ["no event in the\nrange of the data"], []]
     mesh = figure.axes[0].collections[0].get_array()
     assert mesh.sum() == pytest.approx(100 * np.sum(both["counts"]["data"]) / 900)
-
-
-def render(figure) -> None:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=40)
-    assert stream.tell() > 1000
 
 
 def test_curves_of_survival_are_the_analytic_ones():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import numpy as np
@@ -19,6 +18,7 @@ from cpunet.analysis.drift_slices import (
 from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.slice_figure import slice_figure
 from cpunet.errors import CpunetError
+from synthetic import require_drawn
 
 DT = 16.0
 BEFORE, AFTER = 60, 80
@@ -131,7 +131,7 @@ def test_nothing_in_a_slice_is_no_failure():
     table = slice_table({"data": data, "raw": none}, DT)
     assert table["left_out"]["raw"]["outside"] == 40
     assert all(row["n"] == 0 and "missing" in row for row in table["slices"]["raw"])
-    render(slice_figure({"data": data, "raw": none}, DT, "SEP"))
+    require_drawn(slice_figure({"data": data, "raw": none}, DT, "SEP"))
 
 
 def test_what_does_not_fit_is_refused():
@@ -153,14 +153,8 @@ def test_the_figure_has_a_column_for_each_slice():
     edges = np.linspace(20, 120, 5) * DT
     sets = {"data": sliced(rng, 100, edges), "ren": sliced(rng, 120, edges, width=6.0)}
     figure = slice_figure(sets, DT, "SEP")
-    render(figure)
+    require_drawn(figure)
     assert len(figure.axes) == 8
     drawn = figure.axes[4].lines[0].get_ydata()
     expected = 100 * slice_residuals(sets["data"], sets["ren"])[0].difference
     np.testing.assert_allclose(drawn, expected)
-
-
-def render(figure) -> None:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=40)
-    assert stream.tell() > 1000

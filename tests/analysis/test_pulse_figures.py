@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import numpy as np
@@ -18,6 +17,7 @@ from cpunet.analysis.pulse_figures import (
 )
 from cpunet.analysis.seed_figure import seed_distributions, seed_figure
 from cpunet.errors import CpunetError
+from synthetic import require_drawn
 
 DT, ALIGN = 16.0, 300
 TAU_US = 50.0
@@ -66,7 +66,7 @@ def test_single_pulses_lose_their_decay_below():
     pulses = {"raw": edges([3.0], decay=False)[0], "ren": edges([8.0])[0]}
     beside = DataPulse.beside(pulses, data, DT, ALIGN)
     figure = single_pulse_figure(pulses, beside, DT, ALIGN, "SEP")
-    render(figure)
+    require_drawn(figure)
     assert len(figure.axes) == 6
     title = figure.legends[0].get_title().get_text()
     assert "data pulse 1 is nearest to “REN translation”" in title
@@ -98,7 +98,7 @@ def test_spectra_hold_all_events_and_name_the_peaks():
         "raw": rng.normal(2614.5, 0.3, 900),
     }
     figure = spectrum_figure(energies, {"FEP": 2614.5, "far": 9000.0}, bin_kev=2)
-    render(figure)
+    require_drawn(figure)
     axes = figure.axes[0]
     for patch, n in zip(axes.patches, (501, 900), strict=True):
         data = patch.get_data()
@@ -110,9 +110,9 @@ def test_spectra_hold_all_events_and_name_the_peaks():
 
 
 def test_spectra_of_any_width_are_drawn_in_so_many_bins():
-    render(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}, bin_kev=1))
+    require_drawn(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}, bin_kev=1))
     assert len(figure.axes[0].patches[0].get_data().values) < 2100
-    render(spectrum_figure({"data": np.full(3, 2614.5)}, {}))
+    require_drawn(spectrum_figure({"data": np.full(3, 2614.5)}, {}))
 
 
 def test_spectra_without_energies_are_refused():
@@ -138,7 +138,7 @@ def test_seeds_are_summed_up():
     assert row["std"] == pytest.approx(np.sqrt(7))
     assert (row["ceiling"], row["ceiling_std"]) == (85, 2)
     json.dumps(found, allow_nan=False)
-    render(seed_figure(found, marked=runs[0]))
+    require_drawn(seed_figure(found, marked=runs[0]))
 
 
 def test_one_seed_has_no_spread_and_none_no_scores():
@@ -147,23 +147,17 @@ def test_one_seed_has_no_spread_and_none_no_scores():
     assert nothing["median"] is None
     assert nothing["ceiling"] is None
     figure = seed_figure({"SEP": {"drift_time": nothing}})
-    render(figure)
+    require_drawn(figure)
     assert figure.axes[0].texts[0].get_text() == "no scores"
 
 
 def test_peaks_may_differ_between_trainings():
     found = seed_distributions([run(80.0), run(81.0, peak="DEP")])
     assert [found[p]["drift_time"]["missing"] for p in ("SEP", "DEP")] == [1, 1]
-    render(seed_figure(found))
+    require_drawn(seed_figure(found))
 
 
 @pytest.mark.parametrize("runs", [[], [{"peaks": {"SEP": {"parameters": {}}}}]])
 def test_without_scores_seeds_are_refused(runs):
     with pytest.raises(CpunetError, match="train"):
         seed_distributions(runs)
-
-
-def render(figure) -> None:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=40)
-    assert stream.tell() > 1000

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -17,15 +15,10 @@ from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.recipes import load_recipe
+from synthetic import require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 LOSSES = [name for panel in run_figures.LOSS_PANELS.values() for name in panel]
-
-
-def render(figure: Figure) -> None:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=40)
-    assert stream.tell() > 1000
 
 
 def log(n: int, names: list[str] = LOSSES) -> list[dict]:
@@ -49,7 +42,7 @@ def pulses(n: int, centre: float = 350.0) -> np.ndarray:
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():
     figure = run_figures.loss_curves(log(50), window=10)
-    render(figure)
+    require_drawn(figure)
     lines = [line for axes in figure.axes for line in axes.lines]
     assert len(lines) == 2 * len(LOSSES) == 16
     average = figure.axes[1].lines[1].get_xydata()
@@ -59,12 +52,12 @@ def test_all_eight_losses_are_drawn_with_their_moving_average():
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_a_training_shorter_than_the_window_is_drawn(n):
-    render(run_figures.loss_curves(log(n)))
+    require_drawn(run_figures.loss_curves(log(n)))
 
 
 def test_a_loss_that_was_not_recorded_is_left_out():
     figure = run_figures.loss_curves(log(20, ["cycle_forward"]))
-    render(figure)
+    require_drawn(figure)
     assert [len(axes.lines) for axes in figure.axes] == [2, 0, 0]
 
 
@@ -76,7 +69,7 @@ def test_an_empty_log_is_refused():
 def test_cycle_figure_draws_ten_pulses_in_each_panel():
     sets = pulses(15)
     figure = run_figures.cycle_figure(sets, sets, sets, ("A", "B", "C"), 16.0)
-    render(figure)
+    require_drawn(figure)
     assert [len(axes.lines) for axes in figure.axes] == [10, 10, 10]
     assert [axes.get_title() for axes in figure.axes] == ["A", "B", "C"]
     assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(799 * 0.016)
@@ -90,7 +83,7 @@ def test_histogram_legend_tells_scores_and_counts():
         "ren": rng.normal(1410, 100, 400),
     }
     figure = histogram_figure(values)
-    render(figure)
+    require_drawn(figure)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[0].startswith("Data (ceiling ")
     assert texts[1].startswith("Simulation (IoU ")
@@ -102,13 +95,13 @@ def test_histogram_legend_tells_scores_and_counts():
 def test_a_bar_too_high_for_the_figure_is_labelled():
     rng = np.random.default_rng(0)
     figure = histogram_figure({"data": rng.normal(0, 1, 500), "raw": np.full(400, 99.0)})
-    render(figure)
+    require_drawn(figure)
     assert [text.get_text() for text in figure.axes[0].texts] == ["100 %"]
     assert figure.axes[0].get_ylim()[1] < 0.5
 
 
 def test_histograms_of_one_event_and_of_none_are_drawn():
-    render(histogram_figure({"data": np.array([1.0]), "ren": np.array([])}))
+    require_drawn(histogram_figure({"data": np.array([1.0]), "ren": np.array([])}))
 
 
 def test_mean_pulse_differences_are_in_percent_of_the_charge():
@@ -116,7 +109,7 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
     sets = {"data": data, "ren": 1.01 * data}
     means = {method: MeanPulse.of(windows) for method, windows in sets.items()}
     figure = run_figures.mean_pulses(means, 16.0, "DEP")
-    render(figure)
+    require_drawn(figure)
     difference = figure.axes[1].lines[0].get_ydata()
     assert difference[-1] == pytest.approx(1.0, rel=1e-3)
     assert difference[100] == pytest.approx(0.5, rel=1e-2)
@@ -124,7 +117,9 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
 
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
     means = [MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
-    render(run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP"))
+    require_drawn(
+        run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP")
+    )
 
 
 def test_global_settings_neither_change_nor_matter():

@@ -15,6 +15,7 @@ from cpunet.calls.given import as_recipe
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from synthetic import decay, phased_edges
 
 KEV = 2614.511
 SHORT = {
@@ -29,19 +30,14 @@ SHORT = {
 N = 260
 
 
-def edges(rng: np.random.Generator) -> np.ndarray:
-    width = rng.uniform(1.0, 6.0, (N, 1))
-    return 1 / (1 + np.exp(-(np.arange(1200) - 550 - rng.uniform(0, 1, (N, 1))) / width))
-
-
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
     """Simulated pulses, one of which has no energy, and measured ones."""
     folder, rng = tmp_path_factory.mktemp("calls"), np.random.default_rng(1)
-    sim, kev = edges(rng), np.full(N, KEV)
+    sim, kev = phased_edges(N, rng, 550, 1200), np.full(N, KEV)
     kev[3] = np.nan
     write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    decayed = edges(rng) * np.exp(-np.clip(np.arange(1200) - 550, 0, None) / 4000)
+    decayed = phased_edges(N, rng, 550, 1200) * decay(550, 4000, 1200)
     raw = np.round(1000 + 10 * KEV * decayed + rng.normal(0, 20, decayed.shape))
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=np.full(N, KEV))
     write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -20,6 +19,7 @@ import pytest
 
 from cpunet.cli.main import main
 from cpunet.training.unfinished import UnfinishedRun
+from synthetic import digests
 
 PROCESS = "one of a group"  # the name of this module in a process of a group
 SETTINGS = [
@@ -68,13 +68,6 @@ def run_pair(
     )
 
 
-def result(run: Path) -> list[str]:
-    return [
-        hashlib.sha256((run / name).read_bytes()).hexdigest()
-        for name in ("weights.safetensors", "losses.jsonl")
-    ]
-
-
 @pytest.fixture
 def words(stand, tiny, tmp_path) -> list[object]:
     out = tmp_path / "out" / "run"
@@ -92,7 +85,7 @@ def test_a_group_trains_and_goes_on(words, pair, tmp_path, command):
     assert (done.out[1], done.err[1]) == ("", "")
     assert [path.name for path in run.parent.iterdir()] == ["run"]
     assert json.loads((run / "run.json").read_text())["processes"] == 2
-    expected = result(run)
+    expected = digests(run)
 
     # refused by the one that sees the folder
     again = pair(told, *words)
@@ -109,7 +102,7 @@ def test_a_group_trains_and_goes_on(words, pair, tmp_path, command):
     assert (resumed.codes, resumed.errors) == ([0, 0], [])
     assert resumed.err[0].splitlines().count("going on after 2 iterations") == 1
     assert "warning" not in resumed.err[0]
-    assert result(run) == expected
+    assert digests(run) == expected
 
     alone = command(*words, "--out", run.parent / "alone", "--resume")
     assert alone.code == 0
@@ -174,7 +167,7 @@ def test_torchrun(words, held, tmp_path):
     job = begin(plain)
     assert "Traceback" not in job.communicate()[1]
     assert job.returncode == 0
-    expected = result(run)
+    expected = digests(run)
     shutil.rmtree(run)
     job = begin(held.PROGRAM)
     held.wait_until_held(lambda: job.poll() is None, run.parent / "run.unfinished")
@@ -187,7 +180,7 @@ def test_torchrun(words, held, tmp_path):
     job = begin(plain)
     assert "Traceback" not in job.communicate()[1]
     assert job.returncode == 0
-    assert result(run) == expected
+    assert digests(run) == expected
 
 
 def signalled_after(records: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -20,17 +19,10 @@ from cpunet.recipes import load_recipe
 from cpunet.training.checkpoints import CHECKPOINT
 from cpunet.training.run_folder import LOSSES
 from cpunet.training.unfinished import UnfinishedRun
+from synthetic import digests
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
 SEED = ("--seed", "3")  # of the fixture `trained`
-
-
-def result(run: Path) -> list[str]:
-    """What must not depend on how often a training was interrupted."""
-    return [
-        hashlib.sha256((run / name).read_bytes()).hexdigest()
-        for name in ("weights.safetensors", "losses.jsonl")
-    ]
 
 
 def at_record(monkeypatch, number: int, act: Callable[[], None]) -> None:
@@ -72,7 +64,7 @@ def test_a_signal_stops_between_two_iterations(
     assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
     assert command(*words, "--resume").code == 0
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert result(tmp_path / "run") == result(trained)
+    assert digests(tmp_path / "run") == digests(trained)
     assert [path.name for path in tmp_path.glob("run/*checkpoint*")] == []
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["resumed_at"] == [3]
@@ -91,7 +83,7 @@ def test_a_second_signal_stops_at_once(command, words, trained, tmp_path, monkey
     assert stopped.code == 128 + signal.SIGTERM
     assert stopped.err.splitlines()[-1].startswith("error: interrupted")
     assert command(*words, "--resume").code == 0  # from the checkpoint before
-    assert result(tmp_path / "run") == result(trained)
+    assert digests(tmp_path / "run") == digests(trained)
 
 
 @pytest.mark.thorough
@@ -130,7 +122,7 @@ def test_what_can_be_done_with_an_unfinished_training(
     moved = shutil.copy(stand.data, tmp_path / "moved.lh5")
     same = ("--data", moved, "--set", "training.checkpoint_interval=3")
     assert command(*words, "--resume", *same).code == 0
-    assert result(tmp_path / "run") == result(trained)
+    assert digests(tmp_path / "run") == digests(trained)
 
 
 @pytest.mark.thorough
@@ -142,7 +134,7 @@ def test_force_begins_again(command, words, trained, tmp_path, monkeypatch):
     assert command(*words, "--force", "--data-table", "none").code == 2
     assert (tmp_path / "run.unfinished" / "checkpoint.safetensors").is_file()
     assert command(*words, "--force").code == 0
-    assert result(tmp_path / "run") == result(trained)
+    assert digests(tmp_path / "run") == digests(trained)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -233,7 +225,7 @@ def test_killed_at_any_moment(stand, tiny, held, tmp_path):
         job.join()
         assert job.exitcode == -signal.SIGKILL, moment
     train_run(*files, tmp_path / "run", recipe, TrainOptions(seed=5, device="cpu", resume=True))
-    assert result(tmp_path / "run") == result(tmp_path / "whole")
+    assert digests(tmp_path / "run") == digests(tmp_path / "whole")
     # one killed before its first checkpoint began again
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["resumed_at"] == [1, 2, 3, 4, 6]

@@ -10,10 +10,10 @@ import pytest
 
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.truth import load_truth
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
+from synthetic import prepared_truth
 
 EVENTS = "FEP=40,DEP=20"
 
@@ -35,7 +35,7 @@ def test_the_folder_is_read_and_prepared(made: Path):
     data = load_measured(InputFile(made / "data.lh5"), recipe, chosen, quiet)
     assert len(sim.prepared) > 20
     assert len(data.prepared) > 10
-    truth = load_truth(made / "truth.npz", sim, recipe.preparation)
+    truth = prepared_truth(made / "truth.npz", sim, recipe.preparation)
     assert np.isfinite(truth).all()
     # the mean edge of the truth is that of the data, within what the detector's shift makes
     measured = data.prepared.pulses.waveforms.mean(axis=0)

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import scipy.signal
 from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.network_start import network_start
 from cpunet.jobs.training.train import train_run
@@ -30,6 +26,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.translation.translator import IREN, REN
+from synthetic import Files, Listening, after_pole_and_decay, in_traces, sampled, two_sites
 
 DT_NS, FINE = 16.0, 16
 POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511
@@ -45,56 +42,23 @@ SHORT = ("training.steps=4", "training.ringing_mhz=[]")
 RECIPE = load_recipe("fast", ONE_START)
 
 
-class Listening(Monitor):
-    """Keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, list[int | None]] = {}
-        self.notes: list[str] = []
-        self.states: list[str] = []
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        done: list[int | None] = [total]
-        self.stages[title] = done
-        yield done.append
-
-    def state(self, text: str) -> None:
-        self.states.append(text)
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
-
-    @property
-    def warnings(self) -> list[str]:
-        return [note for note in self.notes if note.startswith("warning")]
-
-
 def charge(n: int, seed: int, slowest: float = 3.0) -> np.ndarray:
     """Charge of two sites with logistic edges, finely sampled."""
     rng = np.random.default_rng(seed)
     time = (np.arange(225 * FINE) + 0.5) / FINE
-    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
 
     def site() -> np.ndarray:
         place = rng.uniform(60, 110, (n, 1))
         return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, slowest, (n, 1))))
 
-    return np.asarray(share * site() + (1 - share) * site())
-
-
-def sampled(fine: np.ndarray) -> FloatArray:
-    return fine.reshape(len(fine), -1, FINE).mean(axis=2).astype(np.float32)
+    return two_sites(rng, n, site)
 
 
 def digitised(n: int, seed: int, *, noise_kev: float = NOISE_KEV) -> FloatArray:
     """Traces in ADC behind a pole and a decay, by recursion, with white noise."""
-    pulses = np.ones((n, 1200 * FINE))
-    pulses[:, : 500 * FINE] = 0
-    pulses[:, 500 * FINE : 725 * FINE] = charge(n, seed)
-    rise, fall = np.exp(-DT_NS / FINE / np.array([POLE_NS, 1e3 * DECAY_US]))
-    smooth = scipy.signal.lfilter([1 - rise], [1, -rise], pulses)
-    clean = sampled(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
+    pulses = in_traces(charge(n, seed), FINE)
+    fine = after_pole_and_decay(pulses, DT_NS / FINE, POLE_NS, 1e3 * DECAY_US)
+    clean = sampled(fine, FINE).astype(np.float32)
     noise = np.random.default_rng(seed + 100).normal(0, noise_kev, clean.shape)
     return np.round(15_000 + 9.6 * (KEV * clean + noise)).astype(np.float32)
 
@@ -105,16 +69,11 @@ def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> InputFile:
     return InputFile(path)
 
 
-class Files(NamedTuple):
-    sim: InputFile
-    data: InputFile
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     folder = tmp_path_factory.mktemp("files")
     return Files(
-        written(folder / "sim.lh5", sampled(charge(N, seed=1))),
+        written(folder / "sim.lh5", sampled(charge(N, seed=1), FINE)),
         written(folder / "data.lh5", digitised(N, seed=2)),
     )
 
@@ -194,7 +153,7 @@ def test_files_are_translated_in_both_directions(
 
 
 def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
-    sim = sampled(charge(6, seed=5))
+    sim = sampled(charge(6, seed=5), FINE)
     energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
@@ -262,7 +221,7 @@ def test_data_without_remains_are_given_none(run: Run) -> None:
 @pytest.mark.thorough
 def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
     # edges of many widths, as no pole makes them of the right ones
-    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0)))
+    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
     monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, *SHORT])
     info = train_run(
         other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"), monitor=monitor
@@ -278,7 +237,7 @@ def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> 
 def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> None:
     energies = np.where(np.arange(N) < 50, 1100.0, KEV)
     sim = InputFile(tmp_path / "sim.lh5")
-    more = Pulses.of(sampled(charge(N, seed=1)), dt_ns=DT_NS, energy_kev=energies)
+    more = Pulses.of(sampled(charge(N, seed=1), FINE), dt_ns=DT_NS, energy_kev=energies)
     write_pulses(tmp_path / "sim.lh5", more)
     with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of 1000-1200 can be used, sim"):
         train_run(
@@ -311,7 +270,7 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
 
 @pytest.mark.thorough
 def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
-    few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1)))
+    few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1), FINE))
     with pytest.raises(
         CpunetError, match=r"^40 simulated and \d+ measured pulses; 200 of each"
     ):

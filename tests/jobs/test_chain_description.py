@@ -19,12 +19,8 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.chain_description import (
-    describe_responses,
-    learned_chain,
-    stand_electronics,
-    true_chain_of,
-)
+from cpunet.jobs.inspection.chain_description import describe_responses, stand_electronics
+from cpunet.jobs.inspection.closed_forms import learned_chain, true_chain_of
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
@@ -375,3 +371,14 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, 
         main()
     assert stop.value.code == 2
     assert "give one of them" in capsys.readouterr().err
+
+
+def test_decays_of_free_times_are_printed(tmp_path, monkeypatch, capsys):
+    run = write_response(tmp_path / "run", "generator.free_decays=true", fast={0: 0.05})
+    monkeypatch.setattr(sys, "argv", ["cpunet", "response", str(run)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["fast", "decay", "1", "[µs]", "4"] in printed
+    assert ["share", "of", "fast", "decay", "1", "[%]", "5"] in printed

@@ -15,20 +15,15 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.demo import demonstrate
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
+from synthetic import SMALL_NETWORK, WITHOUT_CHAIN
 
 TINY = (
-    "generator.width=2",
-    "chain=null",
-    "training.noise=none",
-    "training.losses.baseline_len=200",
-    "training.losses.tail_len=400",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
+    *SMALL_NETWORK,
+    *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
     "training.iterations=2",
     "training.decay_start=1",
     "training.batch_size=2",
-    "training.statistics_batches=1",
     "training.log_interval=1",
     "scores.bootstraps=20",
 )

@@ -20,60 +20,32 @@ from cpunet.jobs.studies.ensemble import train_ensemble
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.writing import write_pulses
+from cpunet.pulses.container import FloatArray
 from cpunet.recipes import load_recipe
 from cpunet.training.ensemble_folder import read_study
 from cpunet.training.run_folder import write_run
 from cpunet.translation.backends import Backend
 from cpunet.translation.ensemble import EnsembleREN
 from cpunet.translation.translator import REN
+from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, edges, write_files
 
 RECIPE = load_recipe(
     "small",
     [
-        "generator.width=2",
-        "chain=null",
-        "training.noise=none",
-        "training.losses.baseline_len=200",
-        "training.losses.tail_len=400",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
+        *SMALL_NETWORK,
+        *WITHOUT_CHAIN,
         "discriminator.samples_per_step=80",
         "training.iterations=3",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
         "scores.bootstraps=10",
     ],
 )
 N = 60
 
 
-class Files(NamedTuple):
-    sim: InputFile
-    data: InputFile
-
-
-def charge(n: int, seed: int = 5) -> FloatArray:
-    rng = np.random.default_rng(seed)
-    width = rng.uniform(1.5, 4, (n, 1))
-    return np.asarray(1 / (1 + np.exp(-(np.arange(225) - 60) / width)), np.float32)
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Simulated and measured pulses, every third on the full-energy peak."""
-    folder = tmp_path_factory.mktemp("files")
-    sim = charge(N)
-    data = np.ones((N, 1200))
-    data[:, :500] = 0
-    data[:, 500:725] = sim[::-1]
-    data *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * 16 / 55_000)
-    kev = np.resize([2614.511, 2103.511, 1592.511], N)
-    adc = 8000 + 20_000 * data + np.random.default_rng(6).normal(0, 10, data.shape)
-    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    write_pulses(folder / "data.lh5", Pulses.of(adc, dt_ns=16, energy_kev=kev))
-    return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
+    return write_files(tmp_path_factory.mktemp("files"), np.resize(KEV, N))
 
 
 class Made(NamedTuple):
@@ -220,7 +192,7 @@ def windows() -> FloatArray:
     """Prepared simulated pulses."""
     pulses = np.ones((40, 800), np.float32)
     pulses[:, :325] = 0
-    pulses[:, 325:550] = charge(40)
+    pulses[:, 325:550] = edges(40, 5, (1.5, 4))
     return pulses
 
 
@@ -272,7 +244,7 @@ def test_pulses_without_a_translation_are_rows_of_nan(several, windows):
 
 def test_a_translated_set_is_drawn_from_all_members(several, windows):
     ensemble = EnsembleREN.load(several)
-    raw = np.repeat(charge(40), 10, axis=0)
+    raw = np.repeat(edges(40, 5, (1.5, 4)), 10, axis=0)
     done = ensemble.translate(raw, noise=False, seed=2)
     by_member = np.stack([ren.translate(raw, noise=False) for ren in ensemble.members])
     like = np.abs(by_member - done).max(axis=2) < 1e-6

@@ -24,6 +24,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from synthetic import after_pole, decay, phased_edges
 
 RECIPE = load_recipe(
     "fast",
@@ -41,15 +42,8 @@ KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
 
 def records(n: int, rng: np.random.Generator, tau: float | None) -> np.ndarray:
     """Edges of various widths at sample 450 of 1100, behind a pole and a decay if measured."""
-    time = np.arange(1100.0)
-    width = rng.uniform(1.0, 6.0, (n, 1))
-    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
-    if tau is not None:
-        since = np.clip(time - 450, 0, None)
-        kernel = np.exp(-np.arange(60) / 4.0)
-        smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())
-        pulses = smooth[:, :1100] * np.exp(-since / tau)
-    return pulses
+    pulses = phased_edges(n, rng, 450, 1100)
+    return pulses if tau is None else after_pole(pulses, 4.0, 60) * decay(450, tau, 1100)
 
 
 def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> InputFile:

@@ -19,6 +19,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation.translator import REN
+from synthetic import SMALL_NETWORK, WITHOUT_CHAIN, after_pole, decay, phased_edges
 
 FAST = load_recipe(
     "fast",
@@ -34,34 +35,23 @@ FAST = load_recipe(
 TINY = load_recipe(
     "small",
     [
-        "generator.width=2",
-        "chain=null",
-        "training.noise=none",
-        "training.losses.baseline_len=200",
-        "training.losses.tail_len=400",
+        *SMALL_NETWORK,
+        *WITHOUT_CHAIN,
         "discriminator.embedding_rows=20",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
         "discriminator.samples_per_step=16",
         "training.iterations=1",
         "training.rate_generators=1e-12",
         "training.weight_decay=0",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
     ],
 )
 
 CHAINED = load_recipe(
     "small",
     [
-        "generator.width=2",
+        *SMALL_NETWORK,
         "discriminator.embedding_rows=20",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
         "discriminator.samples_per_step=16",
         "training.iterations=2",
-        "training.batch_size=4",
-        "training.statistics_batches=1",
         "training.pairs.iterations=1",
         "chain.training.components=4",
         "chain.training.squares=2",
@@ -79,13 +69,9 @@ def write(
 ) -> InputFile:
     """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
     rng = np.random.default_rng(seed)
-    time = np.arange(1100.0)
-    width = rng.uniform(1.0, 6.0, (n, 1))
-    pulses = 1 / (1 + np.exp(-(time - 450 - rng.uniform(0, 1, (n, 1))) / width))
+    pulses = phased_edges(n, rng, 450, 1100)
     if pole is not None:
-        kernel = np.exp(-np.arange(90) / pole)
-        smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())[:, :1100]
-        decayed = smooth * np.exp(-np.clip(time - 450, 0, None) / 4000)
+        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
         pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
     kev = np.full(n, 2614.5)
     write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +19,7 @@ from cpunet.jobs.common.inputs import (
     load_simulated,
     require_same_sampling,
 )
-from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.common.truth import load_truth
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
@@ -35,56 +32,24 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run_folder import write_run
+from synthetic import KEV, SMALL_NETWORK, Files, Listening, prepared_truth, write_files
 
 RECIPE = load_recipe(
     "paper",
     [
-        "generator.width=2",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
+        *SMALL_NETWORK,
         "discriminator.samples_per_step=16",
         "training.iterations=2",
         "training.batch_size=2",
-        "training.statistics_batches=1",
     ],
 )
 N = 30
 
 
-class Listening(Monitor):
-    """Keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, list[int | None]] = {}
-        self.notes: list[str] = []
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        done: list[int | None] = [total]
-        self.stages[title] = done
-        yield done.append
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
-
-
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[InputFile, InputFile]:
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Simulated and measured pulses, every third on the full-energy peak."""
-    folder = tmp_path_factory.mktemp("files")
-    rng = np.random.default_rng(5)
-    time = np.arange(225)
-    width = rng.uniform(1.5, 4, (N, 1))
-    sim = 1 / (1 + np.exp(-(time - 60) / width))
-    data = np.ones((N, 1200))
-    data[:, :500] = 0
-    data[:, 500:725] = sim[::-1]
-    data *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * 16 / 55_000)
-    kev = np.resize([2614.511, 2103.511, 1592.511], N)
-    adc = 8000 + 20_000 * data + rng.normal(0, 10, data.shape)
-    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    write_pulses(folder / "data.lh5", Pulses.of(adc, dt_ns=16, energy_kev=kev))
-    return InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
+    return write_files(tmp_path_factory.mktemp("files"), np.resize(KEV, N))
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +128,7 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
     response[4, 300:] = 0.5  # an earlier start, so that one row differs
     response[5] = np.nan
     np.savez(tmp_path / "truth.npz", response=response)
-    truth = load_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
+    truth = prepared_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
     used = np.flatnonzero(np.arange(N) % 3)
     assert truth.shape == (len(used), 800)
     assert np.isnan(truth[used == 5]).all()
@@ -173,7 +138,7 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
     for nothing in (np.nan, np.inf):
         np.savez(tmp_path / "truth.npz", response=np.full(response.shape, nothing))
         with pytest.raises(CpunetError, match=r"truth.npz: no response is finite"):
-            load_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
+            prepared_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
 
 
 def test_a_training_tells_what_it_does(files, tmp_path):

@@ -34,6 +34,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import Transform, read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from synthetic import Listening
 
 SETTINGS = SimulationSettings(length_ns=1600)
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
@@ -192,18 +193,8 @@ def test_hits_all_outside_say_where_they_are(ppc, source):
         away.open(ppc)
 
 
-class Told(Monitor):
-    """Keeps the lines that a job tells."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
-
-
 def test_hits_outside_are_told(ppc, source, tmp_path: Path):
-    told = Told()
+    told = Listening()
     simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS, monitor=told)
     # one of five, at z = 300 mm
     assert told.notes == [
@@ -230,7 +221,7 @@ def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
 
 
 def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path):
-    out, told = tmp_path / "sim.lh5", Told()
+    out, told = tmp_path / "sim.lh5", Listening()
     known = ppc.model_copy(update={"measured_depletion_V": 2100.0})
     simulate_file(known, source, out, SETTINGS, impurity_from="depletion", monitor=told)
     made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])

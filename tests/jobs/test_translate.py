@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import resource
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -43,6 +42,7 @@ from cpunet.training.run_folder import write_run
 from cpunet.translation.ensemble import EnsembleREN
 from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
+from synthetic import Listening, decay, edges, in_traces, nearly_full_disk
 
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0
@@ -58,18 +58,9 @@ DATA = {
 ADC = Adc(length=1400, n_pre=700)
 
 
-class Listening(Monitor):
-    def __init__(self):
-        self.notes: list[str] = []
-
-    def note(self, message):
-        self.notes.append(message)
-
-
-def charge(n=N, seed=1, length=225):
+def charge(n=N, seed=1):
     """Edges of random width that end at 1."""
-    width = np.random.default_rng(seed).uniform(1.5, 5, (n, 1))
-    return (1 / (1 + np.exp(-(np.arange(length) - 80) / width))).astype(np.float32)
+    return edges(n, seed, at=80).astype(np.float32)
 
 
 def write_chain(folder, info=INFO, **buffers):
@@ -412,10 +403,8 @@ def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, 
 def measured(n=30, seed=3):
     """Traces in ADC with a decay and noise, of all energies, the edge at about sample 600."""
     rng = np.random.default_rng(seed)
-    traces = np.zeros((n, 1300))
-    traces[:, 500:725] = charge(n, seed)
-    traces[:, 725:] = 1
-    traces *= np.exp(-np.clip(np.arange(1300) - 590, 0, None) * DT_NS / 55_000)
+    traces = np.pad(in_traces(charge(n, seed)), ((0, 0), (0, 100)), mode="edge")
+    traces *= decay(590, 55_000 / DT_NS, 1300)
     height, baseline = rng.uniform(3000, 40_000, (n, 1)), rng.uniform(8000, 16000, (n, 1))
     return np.rint(baseline + height * traces + rng.normal(0, 8, traces.shape))
 
@@ -764,23 +753,12 @@ def test_what_a_killed_process_left_is_removed(run, tmp_path):
     assert names(tmp_path) == [".out-2-sxgnbmrx.partial.lh5", "out.lh5", "sim.lh5"]
 
 
-@contextmanager
-def largest_file(size):
-    """A limit on the size of files: fails as a full disk does, in the midst of a write."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("options", [{}, {"append_column": "waveform_ren"}])
 def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path, options):
     source, out = sim_file(tmp_path / "sim.lh5", n=400), tmp_path / "out" / "out.lh5"
     listing = r"out.lh5: cannot be written \(File too large\); nothing was left$"
     for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
-        with largest_file(size), pytest.raises(CpunetError, match=listing):
+        with nearly_full_disk(size), pytest.raises(CpunetError, match=listing):
             translate_file(
                 run, InputFile(source), out, TranslateOptions(**options), device="cpu"
             )

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,36 +16,28 @@ import torch
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
 from cpunet.jobs.studies.tuning_study import _is_gone, open_study, this_worker
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
 from cpunet.training.search_space import search_space, value_of, with_values
 from cpunet.translation.translator import REN
+from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, write_files
 
 SPACE = (
     "search={generator.width: {choices: [2, 4]}, "
     "training.rate_generators: {low: 1.0e-4, high: 1.0e-2, log: true}}"
 )
 TINY = [
-    "generator.width=2",
-    "chain=null",
-    "training.noise=none",
-    "training.losses.baseline_len=200",
-    "training.losses.tail_len=400",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
+    *SMALL_NETWORK,
+    *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
     "training.iterations=8",
-    "training.batch_size=4",
-    "training.statistics_batches=1",
     "training.checkpoint_interval=2",
     "scores.bootstraps=10",
     SPACE,
@@ -57,27 +49,10 @@ def tiny(*more: str) -> Recipe:
     return load_recipe("small", [*TINY, *more])
 
 
-class Files(NamedTuple):
-    sim: InputFile
-    data: InputFile
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Simulated and measured pulses of the full-energy peak, and some of another."""
-    folder = tmp_path_factory.mktemp("files")
-    rng = np.random.default_rng(5)
-    width = rng.uniform(1.5, 4, (N, 1))
-    sim = 1 / (1 + np.exp(-(np.arange(225) - 60) / width))
-    data = np.ones((N, 1200))
-    data[:, :500] = 0
-    data[:, 500:725] = sim[::-1]
-    data *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * 16 / 55_000)
-    kev = np.where(np.arange(N) < 90, 2614.511, 2103.511)
-    adc = 8000 + 20_000 * data + rng.normal(0, 10, data.shape)
-    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    write_pulses(folder / "data.lh5", Pulses.of(adc, dt_ns=16, energy_kev=kev))
-    return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
+    return write_files(tmp_path_factory.mktemp("files"), np.repeat(KEV[:2], [90, 10]))
 
 
 def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,12 +11,7 @@ from torch import Tensor, nn
 from cpunet.networks.conv_discriminator import ConvDiscriminator
 from cpunet.recipes.network_settings import ConvConfig
 
-
-@pytest.fixture(autouse=True)
-def same_weights_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 def make(**changes: Any) -> ConvDiscriminator:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -15,12 +14,7 @@ from cpunet.networks.gru_discriminator import GruDiscriminator, InterpolatedEmbe
 from cpunet.recipes import load_recipe
 from cpunet.recipes.network_settings import GruConfig
 
-
-@pytest.fixture(autouse=True)
-def same_weights_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 def config(**changes: Any) -> GruConfig:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -13,12 +12,7 @@ from cpunet.networks.positional_unet import PositionalUNet, Skip, positional_map
 from cpunet.recipes import load_recipe
 from cpunet.recipes.network_settings import PunetConfig
 
-
-@pytest.fixture(autouse=True)
-def same_weights_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 def narrow(residual: bool = False, width: int = 4, dropout: float = 0.0) -> PunetConfig:

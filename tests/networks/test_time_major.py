@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -14,12 +13,7 @@ from cpunet.networks.tiled_convolution import convolve
 from cpunet.networks.time_major import FrozenUNet, translate
 from cpunet.recipes.network_settings import PunetConfig
 
-
-@pytest.fixture(autouse=True)
-def same_numbers_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 @pytest.mark.parametrize("kernel", [1, 7, 11])

@@ -15,20 +15,9 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts, compared, fit_cuts
 from cpunet.pulses.preparation import Prepared, prepare
-from cpunet.recipes.schema import CutConfig, PreparationConfig
+from cpunet.recipes.schema import CutConfig
+from synthetic import PREPARATION
 
-PREPARATION = PreparationConfig(
-    samples_before=400,
-    samples_after=400,
-    align_fraction=0.999,
-    baseline_samples=200,
-    tail_samples=5,
-    tail_level=0.80,
-    decay_fit_samples=300,
-    max_padding_before=200,
-    max_padding_after=0,
-    saturation_run=4,
-)
 CUTS = CutConfig(decay_sigmas=6.0, chi2_sigmas=6.0, baseline_sigmas=6.0)
 Array = npt.NDArray[np.float64]
 

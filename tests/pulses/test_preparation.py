@@ -12,20 +12,8 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
-from cpunet.recipes.schema import PreparationConfig
+from synthetic import PREPARATION as CONFIG
 
-CONFIG = PreparationConfig(
-    samples_before=400,
-    samples_after=400,
-    align_fraction=0.999,
-    baseline_samples=200,
-    tail_samples=5,
-    tail_level=0.80,
-    decay_fit_samples=300,
-    max_padding_before=200,
-    max_padding_after=0,
-    saturation_run=4,
-)
 DT_NS = 16.0
 Array = npt.NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses, tables_of
 from cpunet.pulses.writing import write_pulses
+from synthetic import decay, phased_edges
 
 KEV = 2614.511
 N = 240
@@ -29,15 +30,8 @@ SHORT = {
 }
 
 
-def charge(rng: np.random.Generator, n: int, length: int, start: int) -> np.ndarray:
-    width = rng.uniform(1.0, 6.0, (n, 1))
-    late = (np.arange(length) - start - rng.uniform(0, 1, (n, 1))) / width
-    return 1 / (1 + np.exp(-np.clip(late, -50, 50)))
-
-
 def measured(rng: np.random.Generator, n: int, length: int, start: int) -> np.ndarray:
-    decay = np.exp(-np.clip(np.arange(length) - start, 0, None) / 5000)
-    traces = 200 + 2 * KEV * charge(rng, n, length, start) * decay
+    traces = 200 + 2 * KEV * phased_edges(n, rng, start, length) * decay(start, 5000, length)
     return np.round(traces + rng.normal(0, 4, traces.shape))
 
 
@@ -225,7 +219,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     one = told(capsys, monkeypatch, "info", raw, "--table", 5, "--dt-ns", 10)
     assert "Majorana release" in one
     assert re.search(rf"^lines +{2 * N * 2 // 3} FEP$", one, re.MULTILINE)
-    simulated = charge(np.random.default_rng(3), N, 1000, 500)
+    simulated = phased_edges(N, np.random.default_rng(3), 500, 1000)
     pulses = cpunet.Pulses.of(simulated, dt_ns=10, energy_kev=np.full(N, KEV))
     write_pulses(sim, pulses)
     data = cpunet.InputFile(raw, table="5", dt_ns=10)
@@ -241,7 +235,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
 @pytest.mark.slow
 def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
     rng = np.random.default_rng(5)
-    sim = write_pickles(tmp_path / "fep_wf_sim.pickle", charge(rng, N, 1000, 500))
+    sim = write_pickles(tmp_path / "fep_wf_sim.pickle", phased_edges(N, rng, 500, 1000))
     raw = write_pickles(tmp_path / "fep_wf_ornl.pickle", measured(rng, N, 1600, 700))
     assert "pickled pulses" in told(capsys, monkeypatch, "info", raw, "--dt-ns", 16)
     sides = cpunet.InputFile(sim, dt_ns=16), cpunet.InputFile(raw, dt_ns=16)

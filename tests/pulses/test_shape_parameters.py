@@ -21,24 +21,12 @@ from cpunet.pulses.shape_parameters import (
     all_parameters,
 )
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import PreparationConfig
+from synthetic import PREPARATION
 
 DT_NS = 16.0
 TIME = np.arange(800.0)
 FROM_STEP = np.clip(TIME - 400, 0, None)
 
-PREPARATION = PreparationConfig(
-    samples_before=400,
-    samples_after=400,
-    align_fraction=0.999,
-    baseline_samples=200,
-    tail_samples=5,
-    tail_level=0.8,
-    decay_fit_samples=300,
-    max_padding_before=200,
-    max_padding_after=0,
-    saturation_run=4,
-)
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from synthetic import same_random_numbers as same_random_numbers
+from synthetic import small_sides
 
 # 64-sample pulses and the narrowest networks: an iteration takes milliseconds.
 TINY = (
@@ -47,14 +48,4 @@ def tiny() -> Callable[..., Recipe]:
 @pytest.fixture
 def sets() -> tuple[FloatArray, FloatArray]:
     """Eleven simulated and nine measured pulses of 64 samples."""
-    rng = np.random.default_rng(1)
-    time = np.arange(64)
-
-    def edges(n: int) -> FloatArray:
-        width = rng.uniform(1, 4, (n, 1))
-        return 1 / (1 + np.exp(-(time - 32 + 3 * width) / width))
-
-    sim, data = edges(11), edges(9)
-    data = data * np.exp(-np.clip(time - 32, 0, None) / 150)
-    data += rng.normal(0, 0.003, data.shape)
-    return sim.astype(np.float32), data.astype(np.float32)
+    return small_sides()

@@ -28,15 +28,14 @@ from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
 from cpunet.translation.translator import IREN, REN
+from synthetic import SMALL_NETWORK
 
 DT_NS, KEV, N = 16.0, 2614.5, 240
 RECIPE = load_recipe(
     "small",
     [
-        "generator.width=2",
+        *SMALL_NETWORK,
         "discriminator.embedding_rows=20",
-        "discriminator.embedding_dim=2",
-        "discriminator.hidden=2",
         "discriminator.samples_per_step=16",
         "training.iterations=5",
         "training.decay_start=2",

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -28,6 +25,7 @@ from cpunet.training.checkpoints import (
 from cpunet.training.loop import CheckpointHooks, StoppedError, train
 from cpunet.training.run_folder import LOSSES, WEIGHTS
 from cpunet.training.unfinished import MARKER, LossLog, UnfinishedRun, unfinished_folder
+from synthetic import nearly_full_disk
 
 N = 5
 
@@ -190,17 +188,6 @@ def test_another_format_is_named(tmp_path, monkeypatch):
         CpunetError, match=r"checkpoint\.safetensors: written by another version"
     ):
         one(tmp_path)
-
-
-@contextmanager
-def nearly_full_disk(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: writing fails as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_full_disk_leaves_the_old_checkpoints(tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -12,12 +11,7 @@ from torch import nn
 from cpunet.networks.time_major import fast_passes_pay
 from cpunet.training.cyclegan import CycleGan, Step
 
-
-@pytest.fixture(autouse=True)
-def same_numbers_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 def steps_of(tiny, dtype: torch.dtype) -> tuple[Step, Step]:

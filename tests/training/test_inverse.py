@@ -21,6 +21,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import inverse as inverse_module
 from cpunet.training.inverse import fit_inverse
+from synthetic import drifting, two_sites
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50, 50]", "generator.decay_us=60"])
 DT_NS = 16.0
@@ -31,17 +32,12 @@ NOISE_KEV = 3.0
 def charge(n: int, seed: int) -> FloatArray:
     """Prepared pulses of one or two sites: slow at first, then a steep end."""
     rng = np.random.default_rng(seed)
-    time = np.arange(400)[np.newaxis]
 
     def site() -> np.ndarray:
         drift, steep = rng.uniform(10, 100, (n, 1)), rng.uniform(5, 9, (n, 1))
-        since = time - 100 - rng.uniform(0, 1, (n, 1))
-        slow = np.clip(since / drift, 0, 1) ** 2
-        return 0.3 * slow + 0.7 * np.clip((since - drift) / steep + 1, 0, 1)
+        return drifting(np.arange(400) - 100 - rng.uniform(0, 1, (n, 1)), drift, steep)
 
-    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
-    pulses = Pulses.of(share * site() + (1 - share) * site(), dt_ns=DT_NS)
-    return as_simulated(pulses.waveforms)
+    return as_simulated(Pulses.of(two_sites(rng, n, site), dt_ns=DT_NS).waveforms)
 
 
 def as_simulated(windows: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import MIN_N, Moments
+from synthetic import two_sites
 
 RECIPE = load_recipe("fast")
 CONFIG, PREPARATION = RECIPE.matching.training, RECIPE.preparation
@@ -26,12 +27,11 @@ def prepared(n: int = N, seed: int = 0, noise: float = 8e-4) -> FloatArray:
     """Windows of two-site pulses with logistic edges, a decay and white noise."""
     rng = np.random.default_rng(seed)
     time = np.arange(1200)[np.newaxis]
-    share = rng.uniform(0, 1, (n, 1))
 
     def site() -> np.ndarray:
         return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / 4))
 
-    record = share * site() + (1 - share) * site()
+    record = two_sites(rng, n, site, single=0, least=0)
     record *= np.exp(-np.maximum(time - 520, 0) * DT_NS * 1e-3 / DECAY_US)
     raw = Pulses.of(record + rng.normal(0, noise, record.shape), dt_ns=DT_NS)
     windows = prepare(raw, PREPARATION, "measured")

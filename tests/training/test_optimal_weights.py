@@ -20,6 +20,7 @@ from cpunet.training.optimal_weights import ConditionalFunctions, refine
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 from cpunet.training.smooth_parameters import SmoothParameters
 from cpunet.training.translated import Noise, Translated
+from synthetic import drifting, two_sites
 
 DT_NS, KEV, N = 16.0, 2614.5, 800
 RECIPE = load_recipe(
@@ -33,17 +34,13 @@ WHITE = BaselineNoise(np.full(4097, (6e-4 * KEV) ** 2), 8192, DT_NS, 100)
 def charge(seed: int) -> FloatArray:
     """Prepared pulses of one or two sites, each a drift and a steep end."""
     rng = np.random.default_rng(seed)
-    time = np.arange(800, dtype=float)
 
     def site() -> np.ndarray:
         drift = rng.uniform(20, 60, (N, 1))
-        since = time - 400 + drift - rng.uniform(0, 1, (N, 1))
-        return 0.4 * np.clip(since / drift, 0, 1) ** 2 + 0.6 * np.clip(
-            (since - drift) / 3 + 1, 0, 1
-        )
+        since = np.arange(800) - 400 + drift - rng.uniform(0, 1, (N, 1))
+        return drifting(since, drift, 3, slow=0.4)
 
-    share = np.where(rng.random((N, 1)) < 0.4, 1.0, rng.uniform(0.2, 0.8, (N, 1)))
-    return np.float32(share * site() + (1 - share) * site())
+    return np.float32(two_sites(rng, N, site, single=0.4, least=0.2))
 
 
 def response(poles_ns: tuple[float, float], slow: float) -> ElectronicsResponse:

@@ -34,6 +34,7 @@ from cpunet.training.process_group import (
     meeting,
 )
 from cpunet.training.sampling import EpochSampler
+from synthetic import small_sides
 
 SIZE = 2
 PROCESS = "one of a group"  # the name of this module in a process of a group
@@ -230,13 +231,8 @@ def job() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def sides() -> list[np.ndarray]:
-    random, time_ = np.random.default_rng(1), np.arange(64)
-    width = random.uniform(1, 4, (20, 1))
-    edges = 1 / (1 + np.exp(-(time_ - 32 + 3 * width) / width))
-    data = edges[11:] * np.exp(-np.clip(time_ - 32, 0, None) / 150)
-    data += random.normal(0, 0.003, data.shape)
-    return [edges[:11].astype(np.float32), data.astype(np.float32)]
+def sides() -> tuple[np.ndarray, np.ndarray]:
+    return small_sides()
 
 
 def run_pair(

@@ -22,6 +22,7 @@ from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.residual import Kept, fit_residual
 from cpunet.training.run_folder import read_recipe, write_run
 from cpunet.translation.translator import REN
+from synthetic import two_sites
 
 DT_NS, KEV, N = 16.0, 2614.5, 500
 RECIPE = load_recipe(
@@ -46,8 +47,7 @@ def charge(n: int, seed: int, stretched: float = 1.0) -> FloatArray:
         width = stretched * rng.uniform(1.5, 4, (n, 1))
         return 1 / (1 + np.exp(-(time + rng.uniform(20, 60, (n, 1))) / width))
 
-    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
-    return np.asarray(share * site() + (1 - share) * site(), np.float32)
+    return np.asarray(two_sites(rng, n, site), np.float32)
 
 
 @pytest.fixture(scope="module")

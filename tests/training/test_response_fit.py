@@ -33,6 +33,7 @@ from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.translated import Noise, Translated
+from synthetic import drifting, two_sites
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
 KEV, NOISE_KEV = 2614.5, 1.95
@@ -62,12 +63,9 @@ def charge(n: int, seed: int, longest: float = 100, steepest: float = 5) -> Puls
     def site() -> np.ndarray:
         drift = rng.uniform(10, longest, (n, 1))
         steep = rng.uniform(steepest, steepest + 4, (n, 1))
-        since = time - 30 - rng.uniform(0, 1, (n, 1))
-        slow = np.clip(since / drift, 0, 1) ** 2
-        return 0.3 * slow + 0.7 * np.clip((since - drift) / steep + 1, 0, 1)
+        return drifting(time - 30 - rng.uniform(0, 1, (n, 1)), drift, steep)
 
-    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.uniform(0.1, 0.9, (n, 1)))
-    pulses = share * site() + (1 - share) * site()
+    pulses = two_sites(rng, n, site)
     return Pulses.of(pulses, dt_ns=FINE_NS, energy_kev=np.full(n, KEV))
 
 

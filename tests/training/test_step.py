@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,14 +12,9 @@ from torch import Tensor, nn
 from cpunet.training.cyclegan import LOSS_NAMES, CycleGan, Step
 from cpunet.training.losses import real_loss
 
+pytestmark = pytest.mark.usefixtures("same_random_numbers")
+
 GENERATOR_LOSSES = LOSS_NAMES[:6]
-
-
-@pytest.fixture(autouse=True)
-def same_numbers_every_time() -> Iterator[None]:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
 
 
 @pytest.fixture

@@ -14,26 +14,20 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
 from cpunet.training.run_folder import write_run
+from synthetic import SMALL_NETWORK, decaying_traces, edges
 
 DT_NS = 16.0
 
 
-def simulated(n: int, seed: int = 1, length: int = 225) -> npt.NDArray[np.float32]:
+def simulated(n: int, seed: int) -> npt.NDArray[np.float32]:
     """Charge signals: edges of random width that end at 1."""
-    rng = np.random.default_rng(seed)
-    width = rng.uniform(1.5, 5, (n, 1))
-    edges = 1 / (1 + np.exp(-(np.arange(length) - 60) / width))
-    return np.asarray(edges, np.float32)
+    return np.asarray(edges(n, seed), np.float32)
 
 
-def measured(n: int, seed: int = 2) -> npt.NDArray[np.float32]:
+def measured(n: int, seed: int) -> npt.NDArray[np.float32]:
     """The same through a decay, in ADC counts on a baseline, with noise."""
-    rng = np.random.default_rng(seed)
-    pulses = np.zeros((n, 1200))
-    pulses[:, 500:725] = simulated(n, seed)
-    pulses[:, 725:] = 1
-    pulses *= np.exp(-np.clip(np.arange(1200) - 560, 0, None) * DT_NS / 55_000)
-    return np.asarray(8000 + 20_000 * pulses + rng.normal(0, 8, pulses.shape), np.float32)
+    traces = decaying_traces(edges(n, seed), np.random.default_rng(seed), noise_adc=8)
+    return np.asarray(traces, np.float32)
 
 
 @pytest.fixture(scope="session")
@@ -41,12 +35,9 @@ def recipe() -> Recipe:
     return load_recipe(
         "paper",
         [
-            "generator.width=2",
-            "discriminator.embedding_dim=2",
-            "discriminator.hidden=2",
+            *SMALL_NETWORK,
             "discriminator.samples_per_step=16",
             "training.iterations=3",
-            "training.batch_size=4",
             "training.statistics_batches=2",
         ],
     )
@@ -55,8 +46,10 @@ def recipe() -> Recipe:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory, recipe: Recipe) -> Path:
     """Folder of a run on twelve pulses a side."""
-    sim = prepare(Pulses.of(simulated(12), dt_ns=DT_NS), recipe.preparation, "simulated")
-    data = prepare(Pulses.of(measured(12), dt_ns=DT_NS), recipe.preparation, "measured")
+    sim = prepare(
+        Pulses.of(simulated(12, seed=1), dt_ns=DT_NS), recipe.preparation, "simulated"
+    )
+    data = prepare(Pulses.of(measured(12, seed=2), dt_ns=DT_NS), recipe.preparation, "measured")
     model = train(sim.pulses.waveforms, data.pulses.waveforms, recipe, seed=0)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": recipe.name, "peak": "FEP", "seed": 0, "dt_ns": DT_NS}

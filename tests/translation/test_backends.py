@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.signal
 import torch
 from torch import nn
 
@@ -21,6 +20,7 @@ from cpunet.training.inverse import fit_inverse
 from cpunet.training.run_folder import write_run
 from cpunet.translation import translator
 from cpunet.translation.translator import IREN, REN, RejectionWarning
+from synthetic import after_pole_and_decay, in_traces, sampled, two_sites
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
@@ -28,37 +28,27 @@ FINE = 16  # samples of the charge to one of the digitiser
 N = 40
 
 
-def charge(n: int, seed: int) -> FloatArray:
+def charge(n: int, seed: int) -> np.ndarray:
     """Charge of two sites with logistic edges, finely sampled."""
     rng = np.random.default_rng(seed)
     time = (np.arange(225 * FINE) + 0.5) / FINE
-    share = rng.uniform(0, 1, (n, 1))
 
     def site() -> np.ndarray:
         place, width = rng.uniform(60, 110, (n, 1)), rng.uniform(1.5, 3, (n, 1))
         return 1 / (1 + np.exp(-(time - place) / width))
 
-    return np.asarray(share * site() + (1 - share) * site(), np.float32)
-
-
-def sampled(fine: np.ndarray) -> FloatArray:
-    """Means over the sampling period."""
-    return fine.reshape(len(fine), -1, FINE).mean(axis=2).astype(np.float32)
+    return two_sites(rng, n, site, single=0, least=0)
 
 
 def simulated(n: int, seed: int) -> FloatArray:
     """Charge pulses, long enough and too short to be prepared windows."""
-    return sampled(charge(n, seed))
+    return sampled(charge(n, seed), FINE).astype(np.float32)
 
 
 def responded(n: int, seed: int) -> FloatArray:
     """Records of 1200 samples behind a pole of 50 ns and a decay of 60 µs, by recursion."""
-    pulses = np.ones((n, 1200 * FINE))
-    pulses[:, : 500 * FINE] = 0
-    pulses[:, 500 * FINE : 725 * FINE] = charge(n, seed)
-    rise, fall = np.exp(-DT_NS / FINE / np.array([50, 60_000]))
-    smooth = scipy.signal.lfilter([1 - rise], [1, -rise], pulses)
-    return sampled(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
+    fine = after_pole_and_decay(in_traces(charge(n, seed), FINE), DT_NS / FINE, 50, 60_000)
+    return sampled(fine, FINE).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-import scipy.signal
 from lgdo import Array, Scalar, Struct
 from torch import nn
 
@@ -23,6 +22,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import write_run
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.translator import REN
+from synthetic import after_pole_and_decay, sampled
 
 TAU_NS, DECAY_NS = 50.0, 60_000.0
 R, Z = np.arange(3.0), np.arange(4.0)
@@ -52,23 +52,15 @@ def fine_charge(n_samples: int, dt_ns: float, seed: int = 0) -> np.ndarray:
     return charge
 
 
-def sampled(fine: np.ndarray) -> np.ndarray:
-    """Means over the sampling period."""
-    return fine.reshape(*fine.shape[:-1], -1, FINE).mean(axis=-1)
-
-
 def templates(n_samples: int, dt_ns: float) -> np.ndarray:
-    return sampled(fine_charge(n_samples, dt_ns))
+    return sampled(fine_charge(n_samples, dt_ns), FINE)
 
 
 def responded(n_samples: int, dt_ns: float) -> np.ndarray:
     """The same behind the pole and the decay, by recursion in fine steps."""
-    # a step's value at its end, halfway back to that of the step before: in its middle
-    rise, fall = np.exp(-dt_ns / FINE / np.array([TAU_NS, DECAY_NS]))
-    smooth = scipy.signal.lfilter(
-        [(1 - rise) / 2] * 2, [1, -rise], fine_charge(n_samples, dt_ns)
-    )
-    return sampled(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
+    charge = fine_charge(n_samples, dt_ns)
+    fine = after_pole_and_decay(charge, dt_ns / FINE, TAU_NS, DECAY_NS, middle=True)
+    return sampled(fine, FINE)
 
 
 def write(path: Path, waveforms: np.ndarray, dt_ns: float, **more: object) -> Path:

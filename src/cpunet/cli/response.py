@@ -41,6 +41,8 @@ ROWS = {
     r"missing_(.*)_ns": (r"still missing at \1 ns", "%"),
     r"overshoot": ("overshoot", "%"),
     r"decay_us": ("main decay", "µs"),
+    r"fast_decay_(\d)_us": (r"fast decay \1", "µs"),
+    r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
     r"effective_decay_us": ("effective decay, tail", "µs"),
     r"decay_(.*)_us": (r"share decaying with \1 µs", "%"),
     r"droop_(.*)_us": (r"decayed at \1 µs", "%"),

@@ -123,7 +123,6 @@ class Remains:
         blocks: Iterable[Pulses],
         config: PreparationConfig,
         decay_us: float | None = None,
-        most: int = MOST,
     ) -> Remains:
         """Measure the remainders under raw traces and fit their law.
 
@@ -136,8 +135,6 @@ class Remains:
         decay_us
             Decay time of the preamplifier in us, if known. Otherwise it is taken from large
             remainders or, if there are none, from the tails of the pulses.
-        most
-            Maximum number of traces to use.
 
         Raises
         ------
@@ -145,7 +142,7 @@ class Remains:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        seen = gathered(blocks, config, most)
+        seen = gathered(blocks, config, MOST)
         decay = decay_us or seen.tail_decay_us
         mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay)
         broadest = widest(width)

@@ -6,12 +6,25 @@ All sums are float64.  Traces are read in place and never copied.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.kernels import kernel
+from cpunet.pulses._trace_kernels import (
+    all_finite,
+    compiled,
+    crossing,
+    first_at,
+    highest_of,
+    is_saturated,
+    line,
+    lowest_of,
+    mean_of,
+    quietest_rms,
+    tail_fit,
+    tail_mean,
+)
 
 # Stable rejection codes; `preparation.Rejection` names them.
 ACCEPTED = 0
@@ -37,13 +50,6 @@ _MAX_FIRST = 2.0
 _BEGUN_FRACTION, _BEGUN_RMS, _BEGUN_MARGIN = 0.01, 8.0, 16
 # In a thousand samples, noise alone reaches a maximum of three to four RMS.
 _MIN_AMPLITUDE_RMS = 8.0
-# An earlier pulse disturbs one part of a baseline; the quietest part gives the noise.
-_PARTS = 4
-# Probability below which equal samples at the maximum are not attributed to noise.
-_FLAT_BY_CHANCE = 1e-6
-# A smooth maximum that looks flat because of the ADC steps falls by about eight steps
-# over the next stretch of equal length; a clipped one falls by far more.
-_FLAT_BY_STEPS = 16.0
 # Values that differ by float32 rounding, in units of the amplitude, count as equal.
 _ROUNDING = 2.0 * 2.0**-23
 
@@ -64,28 +70,7 @@ class Settings(NamedTuple):
     saturation_run: int
 
 
-_compiled: Any = kernel(error_model="numpy")
-# Called on finite values only, so the compiler can vectorise the comparisons.
-_compiled_finite: Any = kernel(error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
-
-
-@_compiled
-def _all_finite(trace):  # type: ignore[no-untyped-def]
-    bad = False
-    for value in trace:
-        bad |= (value - value) != 0
-    return not bad
-
-
-@_compiled_finite
-def _lowest(trace):  # type: ignore[no-untyped-def]
-    lowest = trace[0]
-    for value in trace:
-        lowest = min(lowest, value)
-    return lowest
-
-
-@_compiled
+@compiled
 def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
     """Level of a simulated pulse before any charge has moved.
 
@@ -93,7 +78,7 @@ def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
     in this sample has come within it, and taken off as a baseline it would be lost.
     """
     first = max(start, 0)
-    lowest = np.float64(_lowest(trace[first:stop]))
+    lowest = np.float64(lowest_of(trace[first:stop]))
     if first == 0 and len(trace) > 1 and lowest == trace[0]:
         rise = np.float64(trace[1]) - lowest
         if 0 < lowest <= _MAX_FIRST * rise:
@@ -101,90 +86,7 @@ def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
     return lowest
 
 
-@_compiled_finite
-def _highest(trace):  # type: ignore[no-untyped-def]
-    highest = trace[0]
-    for value in trace:
-        highest = max(highest, value)
-    return highest
-
-
-@_compiled_finite
-def _mean(trace):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for value in trace:
-        total += np.float64(value)
-    return total / len(trace)
-
-
-@_compiled
-def _first_at(trace, level):  # type: ignore[no-untyped-def]
-    sample = 0
-    while trace[sample] != level:
-        sample += 1
-    return sample
-
-
-@_compiled
-def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
-    """Fraction of equal neighbouring samples, and the smallest step between unequal ones."""
-    equal, step = 1, math.inf  # start at 1: a probability is never exactly zero
-    for i in range(1, len(trace)):
-        difference = abs(trace[i] - trace[i - 1])
-        if difference == 0:
-            equal += 1
-        else:
-            step = min(step, difference)
-    return equal / len(trace), step
-
-
-@_compiled
-def _longest_run(trace, top, first, shortest):  # type: ignore[no-untyped-def]
-    """Length and end of the longest run of `top`, if one has at least `shortest` samples."""
-    longest = end = 0
-    for sample in range(first, len(trace), shortest):  # no such run fits in between
-        if trace[sample] == top:
-            start = stop = sample
-            while start > first and trace[start - 1] == top:
-                start -= 1
-            while stop < len(trace) and trace[stop] == top:
-                stop += 1
-            if stop - start > longest:
-                longest, end = stop - start, stop
-    return longest, end
-
-
-@_compiled
-def _is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore[no-untyped-def]
-    """Whether the top of a measured trace is flatter than noise and ADC steps can explain.
-
-    The first `quiet` samples show how often noise makes two neighbours equal.  Where it
-    mostly does (coarse steps, or no noise), the fall after the flat top decides: clipping
-    cuts off far more than one step.
-    """
-    longest, end = _longest_run(trace, top, top_sample, saturation_run)
-    if longest < saturation_run:
-        return False
-    if top == 65535 or top == 16383 or top == 4095:  # full scale of 16, 14 and 12 bits
-        return True
-    chance, _ = _equal_neighbours(trace[:quiet])
-    if chance ** (longest - 1) < _FLAT_BY_CHANCE:
-        return True
-    _, step = _equal_neighbours(trace)
-    fall = top - trace[min(end + longest, len(trace)) - 1]
-    return chance > 0.5 and fall > _FLAT_BY_STEPS * step
-
-
-@_compiled
-def _crossing(trace, top_sample, threshold):  # type: ignore[no-untyped-def]
-    """The sample after the last one below `threshold` before the maximum."""
-    sample = top_sample
-    while sample >= 0 and trace[sample] >= threshold:
-        sample -= 1
-    return sample + 1
-
-
-@_compiled
+@compiled
 def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: ignore[no-untyped-def]
     """The aligned sample; `preferred` if rounding alone could move it there or away.
 
@@ -193,28 +95,28 @@ def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: i
     """
     threshold = base + fraction * (top - base)
     slack = _ROUNDING * (top - base)
-    first = _crossing(trace, top_sample, threshold - slack)
-    last = _crossing(trace, top_sample, threshold + slack)
+    first = crossing(trace, top_sample, threshold - slack)
+    last = crossing(trace, top_sample, threshold + slack)
     if first <= preferred <= last:
         return preferred
-    return _crossing(trace, top_sample, threshold)
+    return crossing(trace, top_sample, threshold)
 
 
-@_compiled
+@compiled
 def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
     """Samples of the record in the baseline part of a window; at least one."""
     first = min(max(start, 0), length - 1)
     return first, min(max(start + s.baseline_samples, first + 1), length)
 
 
-@_compiled
+@compiled
 def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
     """Align, compute the baseline of that window, and repeat until nothing moves."""
     length = len(trace)
     if s.simulated:
         base = _charge_before(trace, 0, length)
     else:
-        base = _mean(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
+        base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = -1
     for _ in range(_ROUNDS):
         refined = _align_sample(
@@ -225,44 +127,17 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
         align = refined
         start, stop = align - s.samples_before, min(align + s.samples_after, length)
         if top_sample >= stop:
-            top = np.float64(_highest(trace[align:stop]))
-            top_sample = align + _first_at(trace[align:stop], top)
+            top = np.float64(highest_of(trace[align:stop]))
+            top_sample = align + first_at(trace[align:stop], top)
         if s.simulated:
             base = _charge_before(trace, start, stop)
         else:
             first, last = _baseline_stretch(length, start, s)
-            base = _mean(trace[first:last])
+            base = mean_of(trace[first:last])
     return align, base, top
 
 
-@_compiled_finite
-def _line(values):  # type: ignore[no-untyped-def]
-    """Mean, slope per sample and RMS about a straight line of equally spaced values."""
-    n = len(values)
-    if n < 3:
-        return _mean(values) if n else 0.0, 0.0, 0.0
-    mean, centre = _mean(values), 0.5 * (n - 1)
-    moment = squares = 0.0
-    for i in range(n):
-        deviation = values[i] - mean
-        moment += (i - centre) * deviation
-        squares += deviation * deviation
-    slope = moment / (n * (n * n - 1.0) / 12.0)
-    return mean, slope, math.sqrt(max(squares - slope * moment, 0.0) / (n - 2))
-
-
-@_compiled
-def _quietest_rms(baseline):  # type: ignore[no-untyped-def]
-    """RMS about a straight line in the quietest part of the baseline."""
-    size = len(baseline) // _PARTS
-    quietest = math.inf
-    for part in range(_PARTS):
-        _, _, rms = _line(baseline[part * size : (part + 1) * size])
-        quietest = min(quietest, rms)
-    return quietest
-
-
-@_compiled
+@compiled
 def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-def]
     """The `baseline_samples` of the record before the pulse begins; at least three.
 
@@ -271,46 +146,13 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
     that part is not slow: it is a second pulse, and stays in for the cuts to find.
     """
     level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
-    begun = _crossing(trace, min(align, len(trace) - 1), level)
+    begun = crossing(trace, min(align, len(trace) - 1), level)
     middle = align - s.samples_before + s.baseline_samples // 2
     stop = min(max(begun - _BEGUN_MARGIN, middle, 3), len(trace))
     return max(stop - s.baseline_samples, 0), stop
 
 
-@_compiled_finite
-def _residual_squares(tail, logs, mean, slope):  # type: ignore[no-untyped-def]
-    """Squared residuals of the logarithm, each in units of one over the value."""
-    centre, squares = 0.5 * (len(tail) - 1), 0.0
-    for i in range(len(tail)):
-        squares += ((logs[i] - mean - slope * (i - centre)) * tail[i]) ** 2
-    return squares
-
-
-@_compiled
-def _tail_fit(tail, rms, logs):  # type: ignore[no-untyped-def]
-    """Slope per sample of the logarithm and reduced chi-square; NaN if a value is ≤ 0."""
-    if _lowest(tail) <= 0:
-        return math.nan, math.nan
-    for i in range(len(tail)):
-        logs[i] = math.log(tail[i])
-    mean, slope, _ = _line(logs)
-    if rms == 0:
-        return slope, math.nan
-    # The error of a logarithm is the relative error of the value.
-    squares = _residual_squares(tail, logs, mean, slope)
-    return slope, squares / (rms * rms * (len(tail) - 2))
-
-
-@_compiled
-def _tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
-    """Mean of the `tail_samples` before `stop`; the last value replaces missing samples."""
-    total = 0.0
-    for i in range(stop - tail_samples, stop):
-        total += np.float64(trace[min(i, len(trace) - 1)])
-    return total / tail_samples
-
-
-@_compiled
+@compiled
 def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
     """Write `(trace - base) / scale`: 0 before the record, its last value after it."""
     length = len(trace)
@@ -322,43 +164,43 @@ def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
     window[stop:] = (trace[length - 1] - base) * factor
 
 
-@_compiled
+@compiled
 def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-def]
     """Fill `window` and `numbers` from one trace and return its code."""
-    if not _all_finite(trace):
+    if not all_finite(trace):
         return NAN
-    length, top = len(trace), np.float64(_highest(trace))
-    if top == _lowest(trace):
+    length, top = len(trace), np.float64(highest_of(trace))
+    if top == lowest_of(trace):
         return CONSTANT
-    top_sample = _first_at(trace, top)
+    top_sample = first_at(trace, top)
     quiet = min(s.baseline_samples, max(2, top_sample // 2), length)
-    if not s.simulated and _is_saturated(trace, quiet, top, top_sample, s.saturation_run):
+    if not s.simulated and is_saturated(trace, quiet, top, top_sample, s.saturation_run):
         return SATURATED
 
     align, base, top = _aligned(trace, top, top_sample, s)
     start = align - s.samples_before
     stop = align + s.samples_after
     first, last = _baseline_stretch(length, start, s)
-    mean, slope, rms = _line(trace[first:last])
+    mean, slope, rms = line(trace[first:last])
     if s.simulated:
         scale = top - base
     else:
-        quietest = _quietest_rms(trace[first:last])
+        quietest = quietest_rms(trace[first:last])
         if top - mean < _MIN_AMPLITUDE_RMS * quietest:
             return NO_AMPLITUDE
         first, last = _before_pulse(trace, align, mean, top, quietest, s)
-        _, slope, rms = _line(trace[first:last])
+        _, slope, rms = line(trace[first:last])
         if start < -s.max_padding_before or stop > length + s.max_padding_after:
             return WINDOW_OUTSIDE_RECORD
         if start + s.baseline_samples <= 0:  # no samples for the baseline
             return WINDOW_OUTSIDE_RECORD
         base = mean
-        scale = (_tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
+        scale = (tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
         if not scale > 0:
             return NO_AMPLITUDE
 
     _fill(trace, start, base, scale, window)
-    tail_slope, chi2 = _tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
+    tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
     if math.isnan(tail_slope):
         return TAIL_NOT_POSITIVE
     numbers[BASELINE], numbers[SCALE], numbers[ALIGN_SAMPLE] = base, scale, align
@@ -367,7 +209,7 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
     return ACCEPTED
 
 
-@_compiled
+@compiled
 def _prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
     """Prepare all traces; accepted ones fill the first rows.  Return how many there are."""
     logs = np.empty(s.decay_fit_samples)

@@ -201,7 +201,7 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     --------
     >>> import numpy as np
     >>> decay = np.exp(-np.arange(800) * 16 / 54_600)[np.newaxis].astype(np.float32)
-    >>> decay_constant_us(tail_slope(decay, dt_ns=16, fit_samples=300)).round(2)
+    >>> (-1e3 / tail_slope(decay, dt_ns=16, fit_samples=300)).round(2)  # in µs
     array([54.6])
     """
     lever = np.arange(fit_samples) - (fit_samples - 1) / 2
@@ -215,25 +215,6 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
         return slopes
 
     return _by_blocks(one_block, waveforms, shortest=fit_samples)
-
-
-def decay_constant_us(tail_slope_per_ms: npt.ArrayLike) -> Values:
-    r"""Decay constant :math:`\tau = -1/c_{\mathrm{tail}}` in µs; infinite for a slope of 0.
-
-    Parameters
-    ----------
-    tail_slope_per_ms
-        Slope of the logarithm of the tail in 1/ms.
-
-    Examples
-    --------
-    >>> decay_constant_us([-20.0, 0.0])
-    array([50., inf])
-    """
-    slope = np.asarray(tail_slope_per_ms, dtype=float)
-    with np.errstate(divide="ignore"):
-        # abs() gives a flat tail +inf whatever the sign of its zero
-        return np.where(slope == 0, np.inf, -1e3 / slope)
 
 
 def pulse_parameters(

@@ -227,9 +227,7 @@ class AdcForm:
         kept = usable[prepared.index]
         index = prepared.index[kept]
         windows = prepared.pulses.waveforms[kept]
-        device = backend.device if generator is None else generator.device
-        seed = torch.randint(2**62, (), generator=generator, device=device)
-        rng = np.random.default_rng(int(seed))
+        rng = rng_of(generator)
         for first in range(0, len(windows), BATCH):
             rows = index[first : first + BATCH]
             batch = windows[first : first + BATCH]

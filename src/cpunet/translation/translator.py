@@ -33,6 +33,7 @@ from cpunet.recipes.network_settings import HybridConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.translation.backends import (
+    NO_ENERGY,
     Backend,
     Drawn,
     Energies,
@@ -324,9 +325,7 @@ class Translator:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         single = waveforms.ndim == 1
         if noise and self.needs_energies and energy_kev is None:
-            raise CpunetError(
-                "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-            )
+            raise CpunetError(NO_ENERGY)
         pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
         if energy_kev is not None:
             pulses = replace(pulses, energy_kev=_one_each(energy_kev, len(pulses)))

@@ -1,4 +1,4 @@
-"""The true pulses of a virtual test stand, prepared for comparison with translated pulses."""
+"""The true pulses of a virtual test stand, for comparison with translated pulses."""
 
 from __future__ import annotations
 
@@ -10,39 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from cpunet import npz_files
-from cpunet.electronics.finishing import BLOCK, finish
+from cpunet.electronics.finishing import BLOCK
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputSet
 from cpunet.pulses.container import FloatArray
-from cpunet.recipes.schema import PreparationConfig
 
 _NAME = "response"
 _MAX_SAMPLES = 1 << 20
-
-
-def load_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
-    """Read the noise-free response of each simulated pulse, prepared like data.
-
-    Parameters
-    ----------
-    path, sim
-        See `Responses`.
-    config
-        Preparation of the run.
-
-    Returns
-    -------
-    array
-        Prepared responses, shape (pulses in use, window); NaN where a response cannot be
-        prepared.
-
-    Raises
-    ------
-    CpunetError
-        If the file is not readable or belongs to other pulses.
-    """
-    blocks = Responses(path, sim).blocks()
-    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns) for block in blocks])
 
 
 class Responses:

@@ -22,13 +22,17 @@ from cpunet.analysis.response_figure import (
     response_figure,
 )
 from cpunet.electronics.chain import Electronics
-from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.electronics.noise_traces import noise_power
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.response_errors import propagated
-from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.jobs.inspection.closed_forms import (
+    learned_chain,
+    slow_numbers,
+    true_chain_of,
+    true_parameters,
+    with_noise,
+)
+from cpunet.jobs.inspection.response_errors import fitted_errors, propagated
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import FolderKind, refuse_existing
@@ -48,8 +52,6 @@ RESPONSE = FolderKind(
 )
 
 _DPI = 150
-_MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
-_FOREVER_US = 1e9  # instead of a decay
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
 
@@ -125,7 +127,7 @@ def describe_responses(
     true_chain = None if truth is None else true_chain_of(truth)
     told |= _summary(told["runs"])
     if truth is not None and true_chain is not None:
-        values = _true_parameters(truth) | chain_numbers(
+        values = true_parameters(truth) | chain_numbers(
             true_chain, first.preparation, first.dt_ns
         )
         told["truth"] = {"name": truth.name} | _compared(told, values)
@@ -172,49 +174,6 @@ def stand_electronics(stand: Path) -> Electronics:
         raise CpunetError(f"{path}: holds no electronics; make the stand again") from error
 
 
-def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
-    """The closed form of a fitted chain: a sum of exponentials, like a true chain."""
-    poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
-    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
-    fast = dict(
-        zip(response.fast_times_us.tolist(), response.decay_weights.tolist(), strict=True)
-    )
-    taus = moved_apart([*poles, *slow, 1e3 * main, *(1e3 * tau for tau in fast)])
-    n, n_slow = len(poles), len(slow)
-    undecayed = Exponentials.of_real(
-        1 - sum(slow.values()),
-        taus[n : n + n_slow],
-        [weight / tau for weight, tau in zip(slow.values(), taus[n:], strict=False)],
-    )
-    for tau in taus[:n]:
-        undecayed = undecayed * Exponentials.low_pass(tau)
-    if len(response.ringing):
-        undecayed = undecayed * _ringing(response)
-    shares = [1 - sum(fast.values()), *fast.values()]
-    whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
-    return Chain(name, whole, undecayed)
-
-
-def true_chain_of(electronics: Electronics) -> Chain:
-    """The closed form of a true chain; its nonlinearity is left out."""
-    endless = electronics.model_dump() | {"decays": [{"fraction": 1, "tau_us": _FOREVER_US}]}
-    frequency = density = None
-    spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
-    if spectrum is not None:
-        samples = 2 * (NOISE_BINS - 1)
-        power = noise_power(spectrum, dt_ns, samples)
-        frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
-        density = electronics.noise.rms_kev**2 * power / frequency[1]
-    return Chain(
-        f"true response ({electronics.name})",
-        electronics.transfer,
-        # constructed anew, since a copy would keep the cached transfer function
-        Electronics.model_validate(endless).transfer,
-        frequency,
-        density,
-    )
-
-
 def _read_run(path: Path) -> _Learned:
     info, recipe = read_info(path), read_recipe(path)
     if not isinstance(recipe.generator, ResponseConfig):
@@ -246,11 +205,13 @@ def _described(
     response = network.response
     chain = learned_chain(response, path.name)
     if int(network.n_baselines):
-        chain = _with_noise(chain, network, preparation)
-    parameters = response.describe() | _ringing_numbers(response)
+        chain = with_noise(chain, network, preparation)
+    parameters = response.describe()
+    if len(response.ringing):
+        parameters["ringing"] = response.ringing.norm().item()
     fit = info.get("fit")
     fit = fit if isinstance(fit, Mapping) else {}
-    errors = _errors_by_name(response, fit.get("errors") or {})
+    errors = fitted_errors(response, fit.get("errors") or {})
     dt_ns = float(info["dt_ns"])
     errors |= propagated(
         response,
@@ -266,89 +227,13 @@ def _shape_numbers(
     """Derived numbers of a response, which are not parameters of the fit."""
     slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
-    return _slow(slow) | numbers
-
-
-def _with_noise(
-    chain: Chain, network: ResponseGenerator, preparation: PreparationConfig
-) -> Chain:
-    """Add the noise, converted from the units of prepared pulses to keV."""
-    noise = network.noise
-    # height of a full charge whose tail has the level of prepared pulses
-    tail = preparation.samples_after - 0.5 * preparation.tail_samples
-    tail_ns = align_ns(chain, preparation) + tail * noise.dt_ns
-    height = preparation.tail_level / float(chain.whole.step(tail_ns))
-    dt_us = 1e-3 * noise.dt_ns
-    return Chain(
-        chain.name,
-        chain.whole,
-        chain.undecayed,
-        np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float),
-        # both signs of the frequency
-        2 * dt_us * noise.density / height**2,
-    )
-
-
-def _ringing(response: ElectronicsResponse) -> Exponentials:
-    """Step response ``1 + exp(-t/damping) (a sin + b cos)``."""
-    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
-    sine, cosine = response.ringing.tolist()
-    pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
-    residue = 0.5 * complex(cosine, -sine) * pole
-    poles = np.array([pole, pole.conjugate()])
-    return Exponentials(1 + cosine, poles, np.array([residue, residue.conjugate()]))
-
-
-def _ringing_numbers(response: ElectronicsResponse) -> Numbers:
-    if not len(response.ringing):
-        return {}
-    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
-    return {
-        "ringing": response.ringing.norm().item(),
-        "ringing_mhz": frequency_mhz,
-        "ringing_damping_ns": damping_ns,
-    }
-
-
-def _errors_by_name(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
-    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
-    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
-    order = poles.argsort(descending=True).tolist()
-    sources = {
-        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
-        for i, k in enumerate(order)
-    }
-    sources["decay_us"] = ("log_decay_us.1", decay)
-    for i, (name, value) in enumerate(list(_ringing_numbers(response).items())[1:]):
-        sources[name] = (f"log_ringing.{i + 1}", value)
-    for i, tau in enumerate(response.slow_ns.tolist()):
-        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
-    free = response.config.free_decays
-    for i, tau in enumerate(response.fast_times_us.tolist()):
-        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
-        sources[name] = (f"decay_weights.{i + 1}", 1.0)
-        if free:
-            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
-    return {
-        name: scale * float(errors[source])
-        for name, (source, scale) in sources.items()
-        if source in errors
-    }
-
-
-def _slow(shares: Mapping[float, float]) -> Numbers:
-    """Total late share and its mean time, from shares by time in ns."""
-    total = sum(shares.values())
-    numbers = {"slow_share": total}
-    if abs(total) >= _MIN_SLOW:
-        numbers["slow_time_ns"] = sum(tau * w for tau, w in shares.items()) / total
-    return numbers
+    return slow_numbers(slow) | numbers
 
 
 def _told(run: _Learned) -> dict[str, Any]:
     slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
     values = {n: v for n, v in run.parameters.items() if n not in slow}
-    values |= _slow({float(n.split("_")[1]): w for n, w in slow.items()})
+    values |= slow_numbers({float(n.split("_")[1]): w for n, w in slow.items()})
     values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
     if run.fit.get("moments"):
         values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
@@ -374,21 +259,6 @@ def _noise_error(run: _Learned) -> Numbers:
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
-
-
-def _true_parameters(electronics: Electronics) -> Numbers:
-    poles = sorted(electronics.bandwidth_poles_ns, reverse=True)
-    numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
-    # an overshoot is a slow part of negative sign
-    parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
-    numbers |= _slow({part.tau_ns: sign * part.fraction for part, sign in parts if part})
-    if ring := electronics.ringing:
-        numbers["ringing"] = ring.fraction
-        numbers["ringing_mhz"] = ring.frequency_MHz
-        numbers["ringing_damping_ns"] = ring.damping_ns
-    *fast, main = sorted(electronics.decays, key=lambda part: part.tau_us)
-    numbers["decay_us"] = main.tau_us
-    return numbers | {f"decay_{part.tau_us:g}_us": part.fraction for part in fast}
 
 
 def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.reading.columns import TIME_UNITS
@@ -27,6 +28,14 @@ class Arrays:
             values, times_ns = aligned_currents(charge, dt_ns)
             self.times[rows] = times_ns.reshape(-1, self.times.shape[1])
         self.waveforms[rows] = values.reshape(-1, *self.waveforms.shape[1:])
+
+
+def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
+    """Store a number or an array with LH5's attributes."""
+    group[name] = values
+    dimensions = group[name].ndim
+    kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
+    group[name].attrs.update({"datatype": kind, "units": units})
 
 
 def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
@@ -63,8 +72,8 @@ def add_t0(dt: h5py.Dataset, made: h5py.Group, before_ns: float) -> None:
     """Put the first sample at `before_ns` before time 0, in the units of dt."""
     ns_per_unit = TIME_UNITS[dt.attrs["units"]]
     dt_ns = float(dt[()]) * ns_per_unit
-    made["t0"] = -round(before_ns / dt_ns) * dt_ns / ns_per_unit
-    made["t0"].attrs.update({"datatype": "real", "units": dt.attrs["units"]})
+    t0 = -round(before_ns / dt_ns) * dt_ns / ns_per_unit
+    put_column(made, "t0", t0, dt.attrs["units"])
 
 
 def _with_attrs(made: h5py.Dataset, given: h5py.Dataset) -> h5py.Dataset:

@@ -12,6 +12,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
@@ -87,7 +88,10 @@ def write_library(
         monitor.stage("Templates", total) as advance,
     ):
         library = made.h5.create_group(detector.name or "detector")
-        _describe(library, r_mm, z_mm, settings)
+        put_column(library, "r", r_mm, "mm")
+        put_column(library, "z", z_mm, "mm")
+        put_column(library, "dt", settings.dt_ns, "ns")
+        put_column(library, "t0", 0.0, "ns")
         for angle in angles_deg:
             _fill(library, angle, fields, settings, counts, advance)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
@@ -97,19 +101,6 @@ def write_library(
 def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:
     """Multiples of the grid's spacing within the axis."""
     return np.asarray(np.arange(int(axis_mm[-1] / grid_mm + 1e-6) + 1) * grid_mm)
-
-
-def _describe(
-    library: h5py.Group, r_mm: FloatArray, z_mm: FloatArray, settings: SimulationSettings
-) -> None:
-    for name, values, units, datatype in (
-        ("r", r_mm, "mm", "array<1>{real}"),
-        ("z", z_mm, "mm", "array<1>{real}"),
-        ("dt", settings.dt_ns, "ns", "real"),
-        ("t0", 0.0, "ns", "real"),
-    ):
-        library[name] = values
-        library[name].attrs.update({"datatype": datatype, "units": units})
 
 
 def _fill(

@@ -23,7 +23,8 @@ from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.chain_description import describe_responses, learned_chain
+from cpunet.jobs.inspection.chain_description import describe_responses
+from cpunet.jobs.inspection.closed_forms import learned_chain
 from cpunet.jobs.translation.library_file import require_whole
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,

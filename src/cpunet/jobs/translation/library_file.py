@@ -33,8 +33,14 @@ def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -
             require_stored(source, item)
 
 
-def libraries(file: h5py.File) -> list[str]:
-    """Paths of all groups with templates."""
+def libraries(file: h5py.File, source: Path) -> list[str]:
+    """Paths of all groups with templates.
+
+    Raises
+    ------
+    CpunetError
+        If there is none.
+    """
     found: set[str] = set()
 
     def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -43,6 +49,11 @@ def libraries(file: h5py.File) -> list[str]:
             found.add(group)
 
     file.visititems(visit)
+    if not found:
+        raise CpunetError(
+            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
+            "struct{r, z, dt, t0, waveform_000_deg}"
+        )
     return sorted(found)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.simulation.lithium import LithiumLayer, arrived
@@ -71,9 +72,7 @@ def write_lithium_library(
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
         group = made.h5.create_group("lithium")
         for key, (values, units) in arrays.items():
-            group[key] = values
-            kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
-            group[key].attrs.update({"datatype": kind, "units": units})
+            put_column(group, key, values, units)
         group.attrs["datatype"] = f"struct{{{','.join(arrays)}}}"
         group.attrs["cpunet"] = json.dumps({"cpunet": cpunet.__version__} | asdict(layer))
     ends = share[:, -1]

@@ -127,12 +127,7 @@ def chosen_libraries(
     CpunetError
         If one is not there, or none is of the run's detector.
     """
-    there = libraries(file)
-    if not there:
-        raise CpunetError(
-            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
-            "struct{r, z, dt, t0, waveform_000_deg}"
-        )
+    there = libraries(file, source)
     held = ", ".join(path or "/" for path in there)
     for name in wanted:
         if name not in there:

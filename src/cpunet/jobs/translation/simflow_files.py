@@ -16,6 +16,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.hdf5_files import is_column, opened, require_all_stored
+from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.jobs.translation.library_file import copy_group
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
@@ -66,12 +67,12 @@ class Made:
         cls, group: h5py.Group, r_mm: Values, z_mm: Values, dt_ns: float, basis: Floats | None
     ) -> Self:
         """Write axes and components."""
-        _column(group, "r", r_mm, "mm")
-        _column(group, "z", z_mm, "mm")
-        _column(group, "dt", np.array(dt_ns, float), "ns")
-        _column(group, "t0", np.array(-PEAK * dt_ns, float), "ns")
+        put_column(group, "r", r_mm, "mm")
+        put_column(group, "z", z_mm, "mm")
+        put_column(group, "dt", np.array(dt_ns, float), "ns")
+        put_column(group, "t0", np.array(-PEAK * dt_ns, float), "ns")
         if basis is not None:
-            _column(group, _COMPONENTS, basis, "")
+            put_column(group, _COMPONENTS, basis, "")
         return cls(group, basis)
 
     def angle(self, angle: str) -> AngleArrays:
@@ -87,12 +88,6 @@ class Made:
         times = self.group.create_dataset(f"drift_time_{angle}", shape, np.float32)
         times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
         return AngleArrays(values, times, self.basis)
-
-
-def _column(group: h5py.Group, name: str, values: npt.NDArray[Any], units: str) -> None:
-    group[name] = values
-    kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
-    group[name].attrs.update({"datatype": kind, "units": units})
 
 
 def describe(group: h5py.Group, told: str) -> None:

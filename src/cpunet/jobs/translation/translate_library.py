@@ -122,12 +122,7 @@ def translate_library(
     tally = _Tally()
     with opened(source) as given:
         require_whole(given, source, set())
-        paths = libraries(given)
-        if not paths:
-            raise CpunetError(
-                f"{source}: no pulse-shape library (no array waveform_000_deg or the like); "
-                "give a struct{r, z, dt, t0, waveform_000_deg}"
-            )
+        paths = libraries(given, source)
         total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
         with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:

@@ -1,0 +1,233 @@
+"""Pulses of known shape, files of them, and listeners, that several test modules share.
+
+Times are in samples, lengths too, if nothing else is said.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import scipy.signal
+import torch
+from matplotlib.figure import Figure
+
+from cpunet.electronics.finishing import finish
+from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.monitor import Advance, Monitor
+from cpunet.jobs.common.truth import Responses
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes.schema import PreparationConfig
+
+Values = npt.NDArray[np.float64]
+DT_NS = 16.0
+LENGTH, START, STOP = 1200, 500, 725  # of a trace, and of the charge within it
+KEV = (2614.511, 2103.511, 1592.511)
+
+PREPARATION = PreparationConfig(
+    samples_before=400,
+    samples_after=400,
+    align_fraction=0.999,
+    baseline_samples=200,
+    tail_samples=5,
+    tail_level=0.8,
+    decay_fit_samples=300,
+    max_padding_before=200,
+    max_padding_after=0,
+    saturation_run=4,
+)
+# settings of the narrowest networks, and of recipe small without its readout chain
+SMALL_NETWORK = (
+    "generator.width=2",
+    "discriminator.embedding_dim=2",
+    "discriminator.hidden=2",
+    "training.batch_size=4",
+    "training.statistics_batches=1",
+)
+WITHOUT_CHAIN = (
+    "chain=null",
+    "training.noise=none",
+    "training.losses.baseline_len=200",
+    "training.losses.tail_len=400",
+)
+
+
+def edges(
+    n: int,
+    seed: int | np.random.Generator,
+    widths: tuple[float, float] = (1.5, 5.0),
+    at: float = 60,
+    length: int = STOP - START,
+) -> Values:
+    """Charge of logistic edges of random width, shape (n, length)."""
+    width = np.random.default_rng(seed).uniform(*widths, (n, 1))
+    return np.asarray(1 / (1 + np.exp(-(np.arange(length) - at) / width)))
+
+
+def phased_edges(n: int, rng: np.random.Generator, at: float, length: int) -> Values:
+    """Logistic edges of random width at any phase of the clock."""
+    width = rng.uniform(1.0, 6.0, (n, 1))
+    late = (np.arange(length) - at - rng.uniform(0, 1, (n, 1))) / width
+    return np.asarray(1 / (1 + np.exp(-np.clip(late, -50, 50))))
+
+
+def decay(at: float, tau: float, length: int) -> Values:
+    """1 before `at`, and an exponential decay from there on."""
+    return np.exp(-np.clip(np.arange(length) - at, 0, None) / tau)
+
+
+def after_pole(pulses: Values, tau: float, kept: int) -> Values:
+    """The pulses behind a low pass whose response to an impulse has `kept` samples."""
+    kernel = np.exp(-np.arange(kept) / tau)
+    smooth = np.apply_along_axis(np.convolve, 1, pulses, kernel / kernel.sum())
+    return np.asarray(smooth[:, : pulses.shape[1]])
+
+
+def two_sites(
+    rng: np.random.Generator,
+    n: int,
+    site: Callable[[], Values],
+    single: float = 0.5,
+    least: float = 0.1,
+) -> Values:
+    """Charge of two sites in random shares, or in part of the pulses of a single one."""
+    alone = rng.random((n, 1)) < single if single else False
+    share = np.where(alone, 1.0, rng.uniform(least, 1 - least, (n, 1)))
+    return np.asarray(share * site() + (1 - share) * site())
+
+
+def drifting(since: Values, drift: Values, steep: Values | float, slow: float = 0.3) -> Values:
+    """Charge of a site: the `slow` share during its drift, the rest at its steep end."""
+    end = np.clip((since - drift) / steep + 1, 0, 1)
+    return np.asarray(slow * np.clip(since / drift, 0, 1) ** 2 + (1 - slow) * end)
+
+
+def sampled(fine: Values, steps: int) -> Values:
+    """Means over the sampling period."""
+    return np.asarray(fine.reshape(*fine.shape[:-1], -1, steps).mean(axis=-1))
+
+
+def after_pole_and_decay(
+    fine: Values, step_ns: float, pole_ns: float, decay_ns: float, *, middle: bool = False
+) -> Values:
+    """Finely sampled pulses behind a pole and a decay, by recursion.
+
+    Values are those at the ends of the steps, or in the middle, halfway back to those before.
+    """
+    rise, fall = np.exp(-step_ns / np.array([pole_ns, decay_ns]))
+    taken = [(1 - rise) / 2] * 2 if middle else [1 - rise]
+    smooth = scipy.signal.lfilter(taken, [1, -rise], fine)
+    return np.asarray(scipy.signal.lfilter([1, -1], [1, -fall], smooth))
+
+
+def in_traces(charge: Values, steps: int = 1) -> Values:
+    """Charge within a trace: nothing before it, and all of it after."""
+    traces = np.ones((len(charge), LENGTH * steps))
+    traces[:, : START * steps] = 0
+    traces[:, START * steps : STOP * steps] = charge
+    return traces
+
+
+def decaying_traces(charge: Values, rng: np.random.Generator, noise_adc: float) -> Values:
+    """Traces in ADC counts on a baseline, with a decay of 55 µs and white noise."""
+    traces = in_traces(charge) * decay(560, 55_000 / DT_NS, LENGTH)
+    return 8000 + 20_000 * traces + rng.normal(0, noise_adc, traces.shape)
+
+
+def small_sides() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Eleven simulated and nine measured pulses of 64 samples."""
+    rng, time = np.random.default_rng(1), np.arange(64)
+    width = rng.uniform(1, 4, (20, 1))
+    pulses = 1 / (1 + np.exp(-(time - 32 + 3 * width) / width))
+    data = pulses[11:] * decay(32, 150, 64) + rng.normal(0, 0.003, (9, 64))
+    return pulses[:11].astype(np.float32), data.astype(np.float32)
+
+
+def prepared_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
+    """The noise-free response of each simulated pulse in use, prepared like data."""
+    blocks = Responses(path, sim).blocks()
+    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns) for block in blocks])
+
+
+class Files(NamedTuple):
+    """Files of both sides."""
+
+    sim: InputFile
+    data: InputFile
+
+
+def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
+    """Simulated and measured pulses of these energies; the latter in another order."""
+    energies = np.asarray(kev, float)
+    rng = np.random.default_rng(5)
+    sim = edges(len(energies), rng, (1.5, 4))
+    for name, pulses in (("sim", sim), ("data", decaying_traces(sim[::-1], rng, 10))):
+        whole = Pulses.of(pulses, dt_ns=DT_NS, energy_kev=energies)
+        write_pulses(folder / f"{name}.lh5", whole)
+    return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
+
+
+class Listening(Monitor):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, list[int | None]] = {}
+        self.notes: list[str] = []
+        self.states: list[str] = []
+
+    @contextmanager
+    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
+        done: list[int | None] = [total]
+        self.stages[title] = done
+        yield done.append
+
+    def state(self, text: str) -> None:
+        self.states.append(text)
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [note for note in self.notes if note.startswith("warning")]
+
+
+@contextmanager
+def nearly_full_disk(size: int) -> Iterator[None]:
+    """No file may grow beyond `size` bytes: writing fails as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def digests(run: Path) -> list[str]:
+    """What must not depend on how often, or on how many processes, a training was begun."""
+    files = (run / name for name in ("weights.safetensors", "losses.jsonl"))
+    return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+
+
+def require_drawn(figure: Figure) -> None:
+    """That a figure can be drawn, and is not empty."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=40)
+    assert stream.tell() > 1000
+
+
+@pytest.fixture
+def same_random_numbers() -> Iterator[None]:
+    """Torch draws the same in each test, whatever ran before."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
