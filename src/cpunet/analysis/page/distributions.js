@@ -5,6 +5,7 @@ function mountDistributions(host, peaks) {
   const view = new View(host, {
     title: "Distribution of a parameter by method; arrows move the cursor, plus and minus zoom, 0 shows all",
     onCursor: (x) => readout(x),
+    look: (name) => (name === "data" ? { mark: "M1 10V2H21V10Z", width: 1, opacity: 1, fill: "#0003" } : {}),
   });
   const peak = view.select("Peak", peakChoices(peaks), update);
   const parameter = view.select("Parameter", [], update);
