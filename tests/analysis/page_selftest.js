@@ -103,7 +103,7 @@
   seen.printed = {
     before,
     open: folded(),
-    hidden: [...document.querySelectorAll("nav, .controls, .readout")].map((e) => getComputedStyle(e).display),
+    hidden: [...document.querySelectorAll("nav, .controls, .readout, .screen")].map((e) => getComputedStyle(e).display),
     widths: [document.documentElement.scrollWidth, innerWidth, svg("distributions").clientWidth],
   };
   dispatchEvent(new Event("afterprint"));

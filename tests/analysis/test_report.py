@@ -256,6 +256,20 @@ def test_many_figures_are_folded(tmp_path):
     assert "5 figures, also as PNG beside this page</summary>" in html
 
 
+def test_paper_carries_figures_of_all_peaks_and_no_long_tables(tmp_path):
+    names = ["SEP drift_time", "SEP superpulses", "SEP A over E and drift time", "losses"]
+    metrics = {"noise": {"a": 1.0}, "training": {"peak": "FEP"}}
+    views = {"distributions": {"SEP": {"missing": "none"}}, "slices": {"peaks": {}}}
+    write_report(tmp_path, metrics, {name: figure() for name in names}, [], views)
+    html = (tmp_path / "report.html").read_text()
+    shapes = html[html.index('id="shapes"') : html.index('id="ae"')]
+    assert re.findall(r'<img alt="([^"]*)"', shapes) == ["SEP drift time", "SEP superpulses"]
+    assert shapes.count('<div class="screen">') == 2
+    assert '<details class="screen"><summary>Noise' in html
+    details = html[html.index('id="details"') :]
+    assert '<img alt="losses"' in details[details.index('<div class="screen">') :]
+
+
 def test_any_nesting_becomes_tables():
     html = nested_html(
         {
@@ -265,7 +279,10 @@ def test_any_nesting_becomes_tables():
                 "ren": {"rms": 0.0123, "rms_std": 0.001, "fits": True},
                 "raw": {"rms": 0.5, "rms_std": 0.1, "more": None},
             },
-            "slices": {"ren": [{"n": 4, "rms": 1.5}, {"n": 1, "missing": "1 <pulse>"}]},
+            "slices": {
+                "ren": [{"n": 4, "rms": 1.5}, *2 * [{"n": 1, "missing": "1 <pulse>"}]],
+                "raw": [{"n": 0, "missing": "no pulse"}],
+            },
             "FEP": {"missing": "no pulses"},
         }
     )
@@ -275,7 +292,9 @@ def test_any_nesting_becomes_tables():
         "<h4>SEP</h4>",
         "<td>REN translation</td><td>0.0123 ± 0.0010</td><td>yes</td><td>–</td>",
         "<td>Simulation</td><td>0.50 ± 0.10</td><td>–</td><td>–</td>",
-        "<td>2</td><td>1</td><td>–</td><td>1 &lt;pulse&gt;</td>",
+        "<td>1</td><td>4</td><td>1.5</td></tr>",
+        "<p>Missing: 2–3: 1 &lt;pulse&gt;.</p>",
+        "<p>Missing: 1: no pulse.</p>",
         "<p>Missing: no pulses.</p>",
     ):
         assert text in html

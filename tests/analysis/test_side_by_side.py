@@ -138,8 +138,8 @@ def test_the_page_is_whole_and_alone():
     page = side_by_side_page(side_by_side({name: metrics(), "other": metrics(85.0)}))
     assert "<b>&" not in page
     assert re.search(r"https?:|src=|href=|url\(|<script", page) is None
-    assert "<b>85.0 ± 2.5 (88.0)</b>" in page
-    assert "<td>80.0 ± 2.5 (88.0)</td>" in page
+    assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in page
+    assert "<td>80.0\u00a0±\u00a02.5 (88.0)</td>" in page
     panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
     assert len(panels) == 5
     for panel in panels:

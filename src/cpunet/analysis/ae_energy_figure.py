@@ -80,13 +80,14 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
     ]
     about = (
         "Place and width of the single-site peak of A/E in ranges of energy: a Gaussian with a "
-        "tail below. The lines are those that `cpunet export --to legend-pars` writes."
+        "tail below. The lines are those that “cpunet export --to legend-pars” writes."
     )
     if found.get("multi_site"):
         about += (
             " There are too few events off the lines, so that SEP and FEP take part, although "
             "most of their events have several sites: slopes can be compared, but are no more "
-            "than a guess of that of single sites. With `--ae-range 900,2350` the continuum is "
+            "than a guess of that of single sites. With --ae-range 900,2350 the continuum is "
             "read, if the files have it."
         )
-    return joined([part("p", about), html_table(head, rows, words={0}), figure])
+    drawn = part("grid", "figures", [figure] if figure else [])
+    return joined([part("p", about), html_table(head, rows, words={0}), drawn])

@@ -15,7 +15,8 @@ from cpunet.pulses.parameters import PARAMETERS
 
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label
-LINEAR = 1.0  # percent, up to which the scale of the ratios is linear
+LINEAR = 1.0  # percent, up to which the scale of the ratios is linear if some are large
+FAR = 5  # times that
 COLUMNS = 3  # panels per row
 BAR = 0.09  # width of the colours beside them, in panels
 ROC_POINTS = 201  # points per curve
@@ -39,24 +40,32 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     palette = colours(methods)
     figure = Figure(figsize=(6.4, 5.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    # so that small differences show beside those of an untranslated simulation
-    below.set_yscale("symlog", linthresh=LINEAR)
-    below.yaxis.set_major_formatter("{x:g}")
+    ratios: list[float] = []
     for method, rows in methods.items():
         known = [row for row in rows if "missing" not in row]
+        if not known:
+            continue
         time, median, low, high, error = (
             np.array([row[key] for row in known], float)
             for key in ("time_ns", "median", "q16", "q84", "median_error")
         )
         look = {"color": palette[method], "marker": "o", "markersize": 3.5}
         above.errorbar(time, median, error, label=label(method), **look)
-        for edge in (low, high):
+        # the ends of a line of one point would not be seen, but make room for themselves
+        for edge in (low, high) if len(known) > 1 else ():
             above.plot(time, edge, color=palette[method], linestyle=":", linewidth=1.1)
         if method != "data":
-            below.errorbar(*_ratio(rows, methods["data"]), **look)
+            points = _ratio(rows, methods["data"])
+            below.errorbar(*points, **look)
+            ratios += points[1]
     below.axhline(0, color="black", linewidth=0.8)
     above.set(ylabel=AMPLITUDE)
     below.set(xlabel=DRIFT_TIME, ylabel="Median,\nmethod / data − 1 [%]")
+    if max(map(abs, ratios), default=0.0) > FAR * LINEAR:
+        # so that small differences show beside those of an untranslated simulation
+        below.set_yscale("symlog", linthresh=LINEAR)
+        below.yaxis.set_major_formatter("{x:g}")
+        below.set_ylabel(f"{below.get_ylabel()[:-1]},\nlinear within ± {LINEAR:g}]")
     figure.legend(
         *above.get_legend_handles_labels(),
         loc="outside upper left",

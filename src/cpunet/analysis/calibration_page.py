@@ -16,7 +16,7 @@ from cpunet.calibration.titles import titled
 
 _PROFILES = (
     "Chi-square along the valley of each parameter, everything else following; grey: the "
-    "parabola of the error quoted."
+    "parabola of the error quoted; dashed: as simulated."
 )
 _PULLS = "Deviation of each function of the pulses from the data; grey: two sigmas."
 _DIRECTIONS = (

@@ -93,8 +93,20 @@ def with_std(value: Any, error: Any) -> str:
 
 
 def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
-    """Return mappings of values as one table: one row each, or one column each if shorter."""
-    rows = {name: _with_errors(row) for name, row in rows.items()}
+    """Return mappings of values as one table: one row each, or one column each if shorter.
+
+    Rows with a reason why they are missing are told in a sentence.
+    """
+    reasons: dict[str, list[str]] = {}
+    for name, row in rows.items():
+        if isinstance(row.get("missing"), str):
+            reasons.setdefault(row["missing"], []).append(name)
+    told = "; ".join(f"{_rows_told(names)}: {reason}" for reason, names in reasons.items())
+    sentence = part("p", f"Missing: {told}.") if told else Markup()
+    absent = {name for names in reasons.values() for name in names}
+    rows = {name: _with_errors(row) for name, row in rows.items() if name not in absent}
+    if not rows:
+        return sentence
     names = list(dict.fromkeys(column for row in rows.values() for column in row))
     if len(names) > BROAD and len(names) > len(rows):
         turned = {
@@ -105,7 +117,24 @@ def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
         [words_of(name), *(_cell(row[n]) if n in row else NO_VALUE for n in names)]
         for name, row in rows.items()
     ]
-    return html_table([corner, *map(words_of, names)], body)
+    return joined([html_table([corner, *map(words_of, names)], body), sentence])
+
+
+def _rows_told(names: Sequence[str]) -> str:
+    """Names of rows one after the other, neighbouring numbers as ranges.
+
+    Examples
+    --------
+    >>> _rows_told(["2", "3", "4", "7"]), _rows_told(["ren", "raw"])
+    ('2–4, 7', 'REN translation, Simulation')
+    """
+    told: list[tuple[str, str]] = []
+    for name in names:
+        if told and name.isdecimal() and int(name) - 1 == int(told[-1][1]):
+            told[-1] = (told[-1][0], name)
+        else:
+            told.append((name, name))
+    return ", ".join(words_of(a) if a == b else f"{a}–{b}" for a, b in told)
 
 
 def _with_errors(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,8 +35,19 @@ from cpunet.analysis.report_tables import (
     survival_html,
     verdicts_html,
 )
+from cpunet.pulses.parameters import PARAMETERS
 
-FIRST = 2  # figures of mean pulses at the top of the page
+FIRST = 2  # figures of mean pulses at the top of the page, and of noise
+# where a figure stands, by the end of its name; all others are under Details
+PLACES = {
+    "A over E survival": "ae",
+    "A over E and drift time": "ae_drift",
+    "A over E": "ae_drift",
+    "mean pulse": "first",
+    "superpulses": "slices",
+    "noise": "noise",
+    **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
+}
 MANY = 4  # number of figures from which they are collapsed
 
 SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
@@ -118,14 +129,14 @@ def write_report(
         (folder / f"{_file_stem(name)}.png").write_bytes(png)
         drawn[name] = figure_html(name.replace("_", " "), figure, png)
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
-    first, of_noise, of_ae, others = _shared_out(drawn, metrics.get("training", {}).get("peak"))
+    placed = _placed(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
     views = _json_ready(views or {})
     html = rendered(
         "report.html",
         title="CPU-Net validation",
         compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
-        first=_gallery(first),
+        first=_gallery(placed["first"]),
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts")),
         scores=joined(
@@ -133,14 +144,23 @@ def write_report(
             for name, scores in metrics.get("peaks", {}).items()
         )
         or part("gap", "no peak was scored"),
-        shapes=_views_html(views, ("distributions", "slices")),
+        shapes=joined(
+            [
+                _views_html(views, ("distributions",), placed["distributions"]),
+                _of_all_peaks("Distributions", placed["distributions"]),
+                _views_html(views, ("slices",), placed["slices"]),
+                _of_all_peaks("Mean pulses by rise time", placed["slices"]),
+            ]
+        ),
         pulses=_views_html(views, ("pulses", "scatter")),
         survival=survival_html(metrics.get("ae_survival", {})),
-        ae=_gallery(of_ae),
+        ae=joined(
+            [_gallery(placed["ae"]), _of_all_peaks("A/E and drift time", placed["ae_drift"])]
+        ),
         ae_energy=ae_energy,
-        noise=_gallery(of_noise),
+        noise=_gallery(placed["noise"]),
         details=_details_html(metrics),
-        figures=_gallery(others) or part("gap", "no figures were drawn"),
+        figures=_gallery(placed["others"]) or part("gap", "no figures were drawn"),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=script(views, SCRIPTS) if _drawn(views) else "",
@@ -148,40 +168,52 @@ def write_report(
     (folder / "report.html").write_text(html, encoding="utf-8")
 
 
-def _shared_out(
-    drawn: Mapping[str, Markup], trained_on: str | None
-) -> tuple[list[Markup], list[Markup], list[Markup], list[Markup]]:
-    """Figures at the top of the page, those of noise, those of A/E cuts, and all others.
+def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
+    """Figures by their place on the page, see `PLACES`.
 
-    Mean pulses come first, preferably of peaks that were not used in the training.
+    Mean pulses and noise are those of a few peaks, if possible not used in the training.
     """
-    held_out = [name for name in drawn if not name.startswith(f"{trained_on} ")]
-    chosen = {
-        end: [name for name in held_out if name.endswith(end)][:FIRST]
-        or [name for name in drawn if name.endswith(end)][:FIRST]
-        for end in (" mean pulse", " noise", "A over E survival")
-    }
-    used = {name for names in chosen.values() for name in names}
-    others = [html for name, html in drawn.items() if name not in used]
-    first, noise, cuts = ([drawn[name] for name in names] for names in chosen.values())
-    return first, noise, cuts, others
+    names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
+    for name in drawn:
+        told = name.replace("_", " ")
+        end = next((end for end in PLACES if told.endswith(end)), None)
+        names[PLACES[end] if end else "others"].append(name)
+    for place in ("first", "noise"):
+        held_out = [n for n in names[place] if not n.startswith(f"{trained_on} ")]
+        few = (held_out or names[place])[:FIRST]
+        names["others"] += [name for name in names[place] if name not in few]
+        names[place] = few
+    return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
+
+
+def _of_all_peaks(title: str, drawn: Sequence[Markup]) -> Markup:
+    if not drawn:
+        return Markup()
+    return part("folded", f"{title} of every peak, as figures", part("grid", "figures", drawn))
 
 
 def _drawn(views: Mapping[str, Any]) -> bool:
     return any(views.get(name) for name in VIEWS)
 
 
-def _views_html(views: Mapping[str, Any], names: Sequence[str]) -> Markup:
-    """Elements in which the script draws, or the reason why it does not."""
+def _views_html(
+    views: Mapping[str, Any], names: Sequence[str], figures: Sequence[Markup] = ()
+) -> Markup:
+    """Elements in which the script draws, or the reason why it does not.
+
+    On paper the figures stand for them, if there are any.
+    """
     if not _drawn(views):
         return part("gap", "this report was written without the data of the interactive views")
-    return joined(part("view", name, *VIEWS[name], bool(views.get(name))) for name in names)
+    return joined(
+        part("view", name, *VIEWS[name], bool(views.get(name)), bool(figures)) for name in names
+    )
 
 
 def _details_html(metrics: Mapping[str, Any]) -> Markup:
     """Return those parts of the metrics that are shown as nested tables, if any."""
     return joined(
-        part("folded", title, nested_html(metrics[name]))
+        part("folded", title, nested_html(metrics[name]), screen=True)
         for name, title in DETAILS.items()
         if metrics.get(name)
     )

@@ -35,7 +35,7 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> Markup:
     if rows:
         head = ["Peak", "Method", "Quantity", "σ", "In words"]
         table = html_table(head, rows, words={0, 1, 2, 4})
-        parts.append(part("folded", "Each verdict", table))
+        parts.append(part("folded", "Each verdict", table, screen=True))
     return joined(parts)
 
 
@@ -63,20 +63,22 @@ def peak_html(
         )
     if others:
         title = f"Further parameters: {len(others)}"
-        parts.append(part("folded", title, _parameter_table(others, _noisy, verdicts)))
+        table = _parameter_table(others, _noisy, verdicts)
+        parts.append(part("folded", title, table, screen=True))
     if any(not _noisy(m) for found in chief.values() for m in found["wasserstein"]):
         without = _parameter_table(chief, lambda m: not _noisy(m))
-        parts.append(part("folded", "Scores without noise", without))
+        parts.append(part("folded", "Scores without noise", without, screen=True))
     if scores.get("not_prepared"):
         counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
         text = "Simulated pulses left out because they cannot be prepared as data are once "
         parts.append(part("p", f"{text}they are translated: {'; '.join(counts)}."))
+    tables = []
     if scores.get("two_sample"):
         title = "The classifier as a table"
-        parts.append(part("folded", title, _two_sample_table(scores["two_sample"])))
+        tables.append(part("folded", title, _two_sample_table(scores["two_sample"])))
     if scores.get("paired"):
-        parts.append(_paired_table(scores["paired"]))
-    return joined(parts)
+        tables.append(_paired_table(scores["paired"]))
+    return joined([*parts, part("grid", "beside", tables)])
 
 
 def survival_html(survival: Mapping[str, Any]) -> Markup:

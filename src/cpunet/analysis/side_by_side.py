@@ -193,17 +193,19 @@ def _cell(
 def _notes(runs: Mapping[str, Metrics]) -> list[str]:
     """Signs that the runs were not scored on the same pulses."""
     first, *others = runs
-    notes = []
+    found: dict[str, list[str]] = {}
     for other in others:
         if crystals := _crystals(runs[first], runs[other]):
-            notes.append(f"{first} and {other} are of different detectors, {crystals}.")
-        apart = _differences(runs[first], runs[other])
-        if apart:
-            notes.append(
-                f"{first} and {other} were scored on different pulses "
-                f"({', '.join(apart)}): their scores differ for that reason, too."
-            )
-    return notes
+            found.setdefault(f"are of different detectors, {crystals}.", []).append(other)
+        if apart := _differences(runs[first], runs[other]):
+            words = f"were scored on different pulses ({', '.join(apart)}): their scores "
+            found.setdefault(f"{words}differ for that reason, too.", []).append(other)
+    return [
+        f"{first} and {names[0]} {words}"
+        if len(names) == 1
+        else f"{first} on one side, {', '.join(names)} on the other {words}"
+        for words, names in found.items()
+    ]
 
 
 def _crystals(one: Metrics, other: Metrics) -> str:

@@ -80,7 +80,7 @@ def _label(figure: Figure, first: Axes, below: list[Axes], peak: str) -> None:
     # so that small differences show beside those of an untranslated simulation
     below[0].set_yscale("symlog", linthresh=LINEAR)
     below[0].yaxis.set_major_formatter("{x:g}")
-    below[0].set_ylabel("Method − data\n[% of full charge]")
+    below[0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
     first.set_ylabel("Pulse height")
     handles, names = first.get_legend_handles_labels()
     figure.legend(

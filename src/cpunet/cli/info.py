@@ -13,6 +13,7 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.messages import out, print_table, show, tell, warn
+from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
 
@@ -52,6 +53,8 @@ def info(
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
     detector: Crystal = None,
+    length_unit: LengthUnit = None,
+    energy_unit: EnergyUnit = None,
     page: Page = None,
     without_remains: WithoutRemains = None,
     force: options.Force = False,
@@ -81,6 +84,7 @@ def info(
         dt_ns=dt,
         recipe=load_recipe("fast"),
         detector=None if detector is None else read_detector(detector),
+        hit_units=(length_unit, energy_unit),
         without_remains=without_remains,
         out=page,
         force=force,

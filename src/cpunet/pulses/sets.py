@@ -36,7 +36,8 @@ _REMEDIES = {
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
     Rejection.ENERGY_UNKNOWN: (
-        "name the column of their calibrated energies, or give --kev-per-adc"
+        "name the column of their calibrated energies (--energy, --data-energy), or give "
+        "--kev-per-adc"
     ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }

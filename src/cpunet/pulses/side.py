@@ -72,7 +72,8 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     if found is None and not insist:
         found = apparent_side(next(iter(source.blocks(_LOOKED_AT))).waveforms)
     if found is not None and found.side != wanted:
-        sure = "" if found.certain else f"; if they are {wanted}, say so with --insist"
+        begin = " If" if remedy.endswith("?") else "; if"
+        sure = "" if found.certain else f"{begin} they are {wanted}, say so with --insist"
         raise CpunetError(
             f"{source.path}: given as {wanted} pulses, but these {found.why}; {remedy}{sure}"
         )

@@ -93,12 +93,15 @@ class Fit:
     def verdict(self) -> str:
         """What is left between translation and data, in a sentence."""
         shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
+        off = abs(shift) >= 2 * error
         size = f"the current amplitude is off by {shift:+.2f} ± {error:.2f} %"
-        if abs(shift) < 2 * error:
+        if not off:
             size = f"the current amplitude is right to {abs(shift) + error:.2f} %"
         per = self.chi_square / self.moments
         if self.poor:
-            return f"chi-square is {per:.1f} per moment, too much for chance; {size}"
+            # a shift that is small beside its error does not make the shape right
+            more = f"; {size}" if off else ""
+            return f"chi-square is {per:.1f} per moment, too much for chance{more}"
         if per > GOOD_FIT:
             return (
                 f"chi-square is {per:.1f} per moment, of a misfit that only so many pulses "

@@ -5,6 +5,7 @@ function mountDistributions(host, peaks) {
   const view = new View(host, {
     title: "Distribution of a parameter by method; arrows move the cursor, plus and minus zoom, 0 shows all",
     onCursor: (x) => readout(x),
+    look: (name) => (name === "data" ? { mark: "M1 10V2H21V10Z", width: 1, opacity: 1, fill: "#0003" } : {}),
   });
   const peak = view.select("Peak", peakChoices(peaks), update);
   const parameter = view.select("Parameter", [], update);
@@ -37,7 +38,7 @@ function mountDistributions(host, peaks) {
     const centres = edges.slice(1).map((e, i) => (e + edges[i]) / 2);
     const data = share("data"), dataVariance = variance("data");
     const upper = [mark(found.low), mark(found.high)], lower = [mark(found.low), mark(found.high)];
-    for (const name of names.filter(isShown)) {
+    for (const name of onTop(names.filter(isShown))) {
       const { colour, dashed } = methodOf(name), ys = share(name), spread = variance(name);
       upper.push(steps(edges, ys, { colour, dashed, outer: true, filled: name === "data", width: name === "data" ? 1 : 1.8 }));
       if (name === "data") {

@@ -51,7 +51,7 @@ const nearestIndex = (x) => times.reduce((best, t, i) => (Math.abs(t - x) < Math
 
 function series(xs, lines, bands, at) {
   const drawn = pulses.map((pulse, i) => ({ pulse, ys: lines[i] })).filter(({ pulse }) => isShown(pulse.name));
-  const of = ({ pulse, ys }) => line(xs, ys, { name: pulse.kind, ...methodOf(pulse.name), ...(pulse.kind === "data" ? { width: 1, opacity: 0.45 } : { width: 1.8 }) });
+  const of = ({ pulse, ys }) => line(xs, ys, { name: pulse.kind, width: 1.8, ...methodOf(pulse.name) });
   const within = bands && isShown("ren") ? [band(xs, ...bands.map((b) => row(b, at)), { name: "band", colour: methodOf("ren").colour, opacity: 0.3 })] : [];
   const side = (kind) => drawn.filter(({ pulse }) => (pulse.kind === "data") === kind).map(of);
   return [...within, ...side(true), ...side(false)];

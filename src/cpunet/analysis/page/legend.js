@@ -5,10 +5,13 @@ const shown = new Map(METHODS.map((m) => [m.name, !m.dashed]));
 const redraws = [];
 
 const NEAREST = { name: "nearest", label: "Nearest measured pulse", colour: "#000", dashed: false };
+// measured pulses are broad and grey, so that a line on top of them is seen
+const SOFT = { width: 5, opacity: 0.28 };
 
 function methodOf(name) {
-  return name === "nearest" ? NEAREST
+  const found = name === "nearest" ? NEAREST
     : METHODS.find((m) => m.name === name) || { name, label: name, colour: "#555", dashed: false };
+  return /^(data|nearest)/.test(name) ? { ...found, ...SOFT } : found;
 }
 
 // in the page's order, then those that it does not know
@@ -53,9 +56,11 @@ const LIVE = ["at", "off"];
 const live = (column) => (LIVE.includes(column) ? " class=\"live\"" : "");
 
 // A table of methods; its first column switches them on and off, others are set by name.
+// look(name): how this plot draws a method, where it is no line
 class Legend {
-  constructor(host) {
+  constructor(host, look = () => ({})) {
     this.host = host;
+    this.look = look;
     this.key = null;
   }
 
@@ -66,9 +71,9 @@ class Legend {
     this.key = key;
     const head = columns.map(([column, title]) => `<th scope="col"${live(column)}>${title}</th>`).join("");
     const rows = names.map((name) => {
-      const m = methodOf(name);
+      const m = { width: 3, ...methodOf(name), ...this.look(name) };
       const dash = m.dashed ? " stroke-dasharray=\"5 3\"" : "";
-      const swatch = `<svg class="swatch" viewBox="0 0 22 10" aria-hidden="true"><path stroke="${m.colour}" stroke-width="3"${dash} d="M1 5H21"/></svg>`;
+      const swatch = `<svg class="swatch" viewBox="0 0 22 10" aria-hidden="true"><path stroke="${m.colour}" stroke-width="${m.width}" stroke-linecap="${m.cap || "butt"}" opacity="${m.opacity || 1}" fill="${m.fill || "none"}"${dash} d="${m.mark || "M1 5H21"}"/></svg>`;
       const cells = columns.map(([column]) => `<td data-cell="${escapeHtml(name)}/${column}"${live(column)}></td>`).join("");
       return `<tr><th scope="row"><button type="button" data-method="${escapeHtml(name)}">${swatch}${escapeHtml(m.label)}</button></th>${cells}</tr>`;
     });
@@ -98,7 +103,7 @@ class View {
     this.readout = host.querySelector(".readout");
     this.gap = host.querySelector(".gap");
     this.pair = host.querySelector(".pair");
-    this.legend = new Legend(host.querySelector(".legend-host"));
+    this.legend = new Legend(host.querySelector(".legend-host"), options.look);
     this.plot = new Plot(host.querySelector(".plot-host"), options);
   }
 

@@ -57,7 +57,7 @@ function mountSuperpulses(host, data) {
     const base = means.data;
     const upper = [], lower = [];
     if (base && isShown("data")) {
-      upper.push(line(xs, base, { colour: "#000", width: 5, opacity: 0.28 }));
+      upper.push(line(xs, base, methodOf("data")));
       lower.push(band(xs, sigma.data.map((e) => -100 * e), sigma.data.map((e) => 100 * e), { colour: "#000", opacity: 0.2 }));
     }
     view.legend.build(names, columns);
@@ -149,7 +149,7 @@ function mountPulses(host, data) {
     const what = reference && methodOf(reference).label.toLowerCase();
     view.legend.build(names, [["at", "Height"], ["off", reference ? `Less ${what}` : "–"], ["rms", "RMS of that"]]);
     const wide = names.includes("nearest") && isShown("nearest");
-    if (wide) upper.push(line(xs, pulses.nearest, { colour: "#000", width: 5, opacity: 0.28 }));
+    if (wide) upper.push(line(xs, pulses.nearest, methodOf("nearest")));
     for (const name of onTop(names)) {
       const { colour, dashed } = methodOf(name), fit = scale.checked || name !== "raw";
       const residual = reference ? pulses[name].map((y, i) => 100 * (y - pulses[reference][i])) : [];

@@ -1,4 +1,7 @@
 // Two parameters of single pulses.
+const cloud = (name) => ({ ...(name === "data" ? { colour: "#888", opacity: 0.45, width: 4.2 } : { colour: methodOf(name).colour, opacity: 0.6, width: 2.6 }),
+  mark: "M11 5h0", cap: "round", dashed: false });
+
 function mountScatter(host, data) {
   const columns = [["n", "Pulses"], ["drawn", "Drawn"], ["inside", "In the frame"], ["none", "No value"]];
   let clouds = {};
@@ -6,6 +9,7 @@ function mountScatter(host, data) {
     title: "Current amplitude and drift time of single pulses by method",
     box: true,
     most: 560,
+    look: cloud,
     onCursor: () => {},
   });
   const peak = view.select("Peak", peakChoices(data.peaks), update);
@@ -52,9 +56,7 @@ function mountScatter(host, data) {
       panels: [{
         label: withUnit(data.axes[1]),
         home: found.home[1],
-        series: names.filter(isShown).map((name) => dots(clouds[name].x, clouds[name].y, name === "data"
-          ? { colour: "#888", opacity: 0.45, width: 4.2 }
-          : { colour: methodOf(name).colour, opacity: 0.6, width: 2.6 })),
+        series: names.filter(isShown).map((name) => dots(clouds[name].x, clouds[name].y, cloud(name))),
       }],
     });
   }

@@ -17,12 +17,15 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import hit_detectors, read_hits
 from cpunet.simulation.hits import Hits
 
+Units = tuple[str | None, str | None]
+
 
 def describe_hits(
     path: Path,
     detector: str | None,
     peaks: Mapping[str, PeakConfig],
     crystal: Detector | None = None,
+    units: Units = (None, None),
 ) -> dict[str, Any]:
     """Describe the hits of a file, detector by detector.
 
@@ -36,6 +39,8 @@ def describe_hits(
         Gamma lines whose events are counted, by the energy deposited.
     crystal
         Crystal in which the hits should lie.
+    units
+        Units of lengths and energies, where the file names none.
 
     Returns
     -------
@@ -51,7 +56,8 @@ def describe_hits(
         "kind": "hits",
         "path": str(path),
         "detectors": {
-            name or "": _of_detector(path, name, peaks, crystal) for name in names or [None]
+            name or "": _of_detector(path, name, peaks, crystal, units)
+            for name in names or [None]
         },
     }
 
@@ -61,9 +67,11 @@ def _of_detector(
     name: str | None,
     peaks: Mapping[str, PeakConfig],
     crystal: Detector | None,
+    units: Units,
 ) -> dict[str, Any] | str:
+    length, energy = units
     try:
-        hits = read_hits(path, detector=name).hits
+        hits = read_hits(path, detector=name, length_unit=length, energy_unit=energy).hits
     except CpunetError as error:
         return str(error).removeprefix(f"{path}: ")
     told = _summary(hits, peaks)

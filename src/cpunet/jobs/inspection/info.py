@@ -15,7 +15,7 @@ from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.channels import ALL, channels_of
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.inspection.hits_info import describe_hits
+from cpunet.jobs.inspection.hits_info import Units, describe_hits
 from cpunet.jobs.inspection.info_page import Spectra, write_info_page
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
@@ -49,6 +49,7 @@ def describe(
     dt_ns: float | None = None,
     recipe: Recipe | None = None,
     detector: Detector | None = None,
+    hit_units: Units = (None, None),
     without_remains: Path | None = None,
     out: Path | None = None,
     force: bool = False,
@@ -67,6 +68,8 @@ def describe(
         Its gamma lines are counted, and with its preparation measured traces are described.
     detector
         Crystal in which hits should lie.
+    hit_units
+        Units of lengths and energies of hits, where the file names none.
     without_remains
         LH5 file to write: the traces after subtraction of their remains, with columns
         ``remains_kev`` and ``remains_error_kev``.
@@ -119,7 +122,7 @@ def describe(
         told: dict[str, Any] = {"kind": "run", "path": str(path), **_run(path)}
         spectra: Spectra = {}
     elif holds_hits(path) and without_remains is None:
-        told = describe_hits(path, table, recipe.peaks if recipe else {}, detector)
+        told = describe_hits(path, table, recipe.peaks if recipe else {}, detector, hit_units)
         spectra = {}
     else:
         file = InputFile(path, table, energy, kev_per_adc, dt_ns)

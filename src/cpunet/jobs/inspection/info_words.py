@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from cpunet.analysis.nested_tables import with_std
+
 Lines = list[tuple[str, str]]
 NOTHING = "–"
 PARTS = 8  # deviating parts of a fit, at most
@@ -101,7 +103,7 @@ def _hits(told: Mapping[str, Any]) -> Lines:
 
 
 def _hits_of(told: Mapping[str, Any]) -> Lines:
-    extents = ", ".join(f"{axis} {_span(told[f'{axis}_mm'])}" for axis in "xyzr")
+    extents = ", ".join(f"{axis} {_span(told[f'{axis}_mm'], 2)}" for axis in "xyzr")
     lines = [
         ("hits", f"{told['hits']} of {told['events']} events"),
         ("energy", f"{_span(told['energy_kev'])} keV an event"),
@@ -152,9 +154,9 @@ def _run(told: Mapping[str, Any]) -> Lines:
     ]
     noise = _mapping(fit, "noise")
     if "rms" in noise:
-        error = f" ± {_text(noise['rms_error'])}" if "rms_error" in noise else ""
         of = f" (RMS, {noise.get('baselines')} baselines)"
-        lines.append(("noise", f"{_text(noise['rms'])}{error} keV{of}"))
+        value = with_std(noise["rms"], noise.get("rms_error"))
+        lines.append(("noise", f"{value} keV{of}"))
     if "rate_khz" in (remains := _mapping(fit, "remains")):
         lines += _remains(remains)
     versions = _mapping(told, "versions")
@@ -215,8 +217,9 @@ def _counts(counts: Mapping[str, Any]) -> str:
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)
 
 
-def _span(values: Any) -> str:
-    return f"{values[0]:.6g} … {values[1]:.6g}" if values else NOTHING
+def _span(values: Any, digits: int = 9) -> str:
+    """Both ends to six digits, and no more than `digits` after the point."""
+    return " … ".join(f"{round(v, digits):.6g}" for v in values) if values else NOTHING
 
 
 def _text(value: Any) -> str:

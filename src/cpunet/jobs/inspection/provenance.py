@@ -68,9 +68,16 @@ def _of_simulation(made: Mapping[str, Any]) -> dict[str, str]:
     return {
         "detector": ", ".join(physics),
         "hits": _of_hits(hits),
-        "events": f"{made.get('events')}, of which {made.get('events_without_signal')} without "
-        f"a signal; seed {made.get('seed')}",
+        "events": _of_events(made),
     }
+
+
+def _of_events(made: Mapping[str, Any]) -> str:
+    """Numbers of events and the seed; a stand's file has them in its ``stand.json``."""
+    if "events" not in made:
+        return ""
+    lost = made.get("events_without_signal")
+    return f"{made['events']}, of which {lost} without a signal; seed {made.get('seed')}"
 
 
 def _of_hits(hits: Mapping[str, Any]) -> str:

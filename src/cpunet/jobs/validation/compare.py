@@ -97,9 +97,14 @@ def _metrics_file(report: Path) -> Path:
 
 
 def _names(reports: Sequence[Path]) -> list[str]:
-    """Name each report by its folder, with as many parent folders as make it unique."""
+    """Name each report by its folder, with as many parent folders as make it unique.
+
+    Folders at the end that all reports share, as ``report``, are left out.
+    """
     given = [report.resolve() for report in reports]
     parts = [(path if path.is_dir() else path.parent).parts for path in given]
+    while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
     longest = max(map(len, parts), default=1)
     names: list[str] = []
     for depth in range(1, longest + 1):

@@ -69,7 +69,7 @@ def _waveform_key(options: ReadOptions, headers: dict[str, Header]) -> str:
     if len(named) > 1:
         raise CpunetError(
             f"{options.path}: {len(named)} arrays of two dimensions ({shortened(named)}); "
-            "choose one with --table"
+            "choose one with --table (--sim-table, --data-table)"
         )
     return named[0]
 

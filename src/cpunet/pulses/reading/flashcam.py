@@ -136,7 +136,7 @@ def _channel(options: ReadOptions, n_channels: int) -> int:
             return 0
         raise CpunetError(
             f"{options.path}: {n_channels} channels ({shortened(known)}); "
-            "choose one with --table"
+            "choose one with --table (--sim-table, --data-table)"
         )
     if options.table not in known:
         raise CpunetError(

@@ -55,7 +55,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
         if not found:
             raise CpunetError(
                 f"{path}: no waveforms in it; it holds {shortened(_tables(file))}; "
-                "give a file of traces"
+                "give a file of traces (their energies may be here: --data-energy FILE:COLUMN)"
             )
         return _only(path, found)
     item = file.get(table)
@@ -84,7 +84,7 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     if len(tables) > 1:
         raise CpunetError(
             f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
-            "choose one with --table"
+            "choose one with --table (--sim-table, --data-table)"
         )
     if len(found) == 1:
         return found[0]
@@ -94,7 +94,7 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
             return by_name[name]
     raise CpunetError(
         f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
-        "choose one with --table"
+        "choose one with --table (--sim-table, --data-table)"
     )
 
 

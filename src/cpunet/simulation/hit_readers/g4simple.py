@@ -44,7 +44,7 @@ def of_detector(
     if detector is None:
         if len(there) > 1:
             raise CpunetError(
-                f"{path}: holds detectors {names}; give detector (--hits-detector) as one"
+                f"{path}: holds detectors {names}; choose one with detector (--hits-detector)"
             )
         return steps
     known = {str(n): n for n in there}

@@ -82,7 +82,7 @@ def _detector(path: Path, detector: str | None) -> str:
     if detector is None:
         if len(there) != 1:
             raise CpunetError(
-                f"{path}: holds detectors {names}; give detector (--hits-detector) as one"
+                f"{path}: holds detectors {names}; choose one with detector (--hits-detector)"
             )
         return there[0]
     if detector not in there:
