@@ -50,7 +50,7 @@ def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
 
 def test_remage_without_a_detector_names_those_there(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
-    with pytest.raises(CpunetError, match="det1, det2, scint1, scint2; give detector"):
+    with pytest.raises(CpunetError, match="det1, det2, scint1, scint2; choose one with detector"):
         read_hits(path)
     with pytest.raises(CpunetError, match="no detector optdet1"):
         read_hits(path, detector="optdet1")
@@ -91,7 +91,7 @@ def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
 
 
 def test_g4simple_detector_and_columns_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(CpunetError, match="holds detectors 1, 2; give detector"):
+    with pytest.raises(CpunetError, match="holds detectors 1, 2; choose one with detector"):
         read_hits(g4simple_file(tmp_path))
     with pytest.raises(CpunetError, match="no detector 3; it holds 1, 2"):
         read_hits(g4simple_file(tmp_path), detector="3")

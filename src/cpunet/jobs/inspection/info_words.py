@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from cpunet.analysis.nested_tables import with_std
 
 Lines = list[tuple[str, str]]
 NOTHING = "–"
@@ -155,6 +154,9 @@ def _run(told: Mapping[str, Any]) -> Lines:
     noise = _mapping(fit, "noise")
     if "rms" in noise:
         of = f" (RMS, {noise.get('baselines')} baselines)"
+        # loads matplotlib, which a command's help does without
+        from cpunet.analysis.nested_tables import with_std
+
         value = with_std(noise["rms"], noise.get("rms_error"))
         lines.append(("noise", f"{value} keV{of}"))
     if "rate_khz" in (remains := _mapping(fit, "remains")):
