@@ -50,7 +50,9 @@ def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
 
 def test_remage_without_a_detector_names_those_there(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
-    with pytest.raises(CpunetError, match="det1, det2, scint1, scint2; choose one with detector"):
+    with pytest.raises(
+        CpunetError, match="det1, det2, scint1, scint2; choose one with detector"
+    ):
         read_hits(path)
     with pytest.raises(CpunetError, match="no detector optdet1"):
         read_hits(path, detector="optdet1")

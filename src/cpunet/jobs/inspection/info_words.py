@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-
 Lines = list[tuple[str, str]]
 NOTHING = "–"
 PARTS = 8  # deviating parts of a fit, at most
