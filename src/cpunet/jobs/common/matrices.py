@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 
 @contextmanager
@@ -18,5 +18,6 @@ def one_thread_for_matrices() -> Iterator[None]:
     """Let matrix products and decompositions use one thread; also a decorator of jobs."""
     import scipy.linalg  # noqa: F401 - brings an OpenBLAS of its own, which is to be limited
 
-    with threadpool_limits(limits=1, user_api="blas"):
+    # other libraries may be torch's own, whose products of a network are large
+    with ThreadpoolController().select(internal_api="openblas").limit(limits=1):
         yield
