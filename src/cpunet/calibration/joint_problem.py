@@ -150,7 +150,7 @@ class JointProblem:
     def _weigh(self, clip: float | None) -> None:
         """Set the clip, and errors and correlations of the functions with it."""
         self._clip = clip
-        self._wanted, self._sigma, self._whiten = [], [], []
+        self._wanted, self._sigma, self._whiten, self._counted = [], [], [], []
         for band, functions in zip(self.bands, self.functions, strict=True):
             values = functions(band.moments.data, clip)
             covariance = np.cov(values.T) / band.pairs
@@ -159,8 +159,10 @@ class JointProblem:
                 simulated = self._covariance(band, functions) / band.pairs
                 covariance = 0.5 * (covariance + simulated)
             sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
-            correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
-            correlation += RIDGE * np.eye(len(sigma))
+            correlation = covariance / sigma[:, np.newaxis] / sigma
+            variances = np.maximum(np.linalg.eigvalsh(correlation), 0)
+            correlation = (1 - RIDGE) * correlation + RIDGE * np.eye(len(sigma))
+            self._counted.append(variances / ((1 - RIDGE) * variances + RIDGE))
             self._wanted.append(values.mean(axis=0))
             self._sigma.append(sigma)
             self._whiten.append(scipy.linalg.cholesky(np.linalg.inv(correlation)))
@@ -169,6 +171,18 @@ class JointProblem:
     def moments(self) -> int:
         """Number of compared functions in all bands."""
         return sum(len(sigma) for sigma in self._sigma)
+
+    @property
+    def by_chance(self) -> tuple[float, float]:
+        r"""Mean and standard deviation of chi-square if simulation and data agree.
+
+        The ridge makes directions in which the functions hardly vary count for little. With the
+        eigenvalues :math:`\lambda` of the correlation matrix and the ridge :math:`\rho`, each
+        contributes :math:`q = \lambda / [(1 - \rho) \lambda + \rho]` instead of 1, so the mean
+        is :math:`\sum q` and the variance :math:`2 \sum q^2`.
+        """
+        counted = np.concatenate(self._counted)
+        return float(counted.sum()), float(np.sqrt(2 * counted @ counted))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -188,6 +202,16 @@ class JointProblem:
         r""":math:`\mathbf{d}^T C^{-1} \mathbf{d}` of the functions alone, without priors."""
         deviations = self._deviations(vector)
         return float(deviations @ deviations)
+
+    def of_chain(self, response: ElectronicsResponse) -> JointProblem:
+        """The same comparison, weights included, for another chain and fixed physics."""
+        physics, own = self.nearby.simulator.physics, self.parameters
+        parameters = JointParameters(response, physics, own.coordinates, [], own.given)
+        problem = type(self)(
+            parameters, self.bands, self.functions, self.nearby, self._energy_kev, self._recipe
+        )
+        problem.weigh_like(self)
+        return problem
 
     def weigh_like(self, other: JointProblem) -> None:
         """Adopt errors and correlations of the same functions from another problem."""
