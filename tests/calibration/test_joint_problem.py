@@ -122,6 +122,29 @@ def test_chance_gives_less_than_one_per_function_because_of_the_ridge(sides):
     assert spread == pytest.approx(chi_square.std(), rel=0.01)
 
 
+def test_derivatives_are_of_steps_in_which_the_functions_are_linear(sides):
+    """A function that saturates far within the step first taken."""
+
+    class Saturates(Numbers):
+        def __call__(self, readings, clip=None):
+            return np.tanh(300 * (readings.linear - 1e-9)) / 300
+
+    sim, data = (1e-4 * side for side in sides)
+    both = problem(sim, data)
+    both.functions = (Saturates(),)
+    both._weigh(None)
+    vector = both.parameters.vector()
+    first = both.parameters.steps.copy()
+    found = both.jacobian(vector, both.residuals(vector))[:2, -1]
+    shorter = both.parameters.steps
+    assert shorter[-1] < 0.1 * first[-1]
+    assert (shorter <= first).all()
+    moved = vector.copy()
+    moved[-1] += 1e-3 * shorter[-1]
+    true = (both.residuals(moved) - both.residuals(vector))[:2] / (1e-3 * shorter[-1])
+    assert found == pytest.approx(true, rel=0.05)
+
+
 def test_another_chain_is_compared_with_the_same_weights(sides):
     sim, data = sides
     both = problem(sim, data)

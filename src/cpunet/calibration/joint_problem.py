@@ -27,8 +27,11 @@ HOLD = 4.0
 FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
-# Step of a finite difference as a fraction of the reach of a derivative.
-FINITE = 0.1
+# Step of a finite difference as a fraction of the reach of a derivative. A step that changes
+# the residuals by more standard deviations than this is replaced by one of a single one: tail
+# slopes are clipped and cut, and fast decays make them so precise that a step of 1 % is nowhere
+# near linear.
+FINITE, LONGEST = 0.1, 3.0
 
 
 class JointParameters:
@@ -133,7 +136,10 @@ class JointProblem:
         self.functions, self.known = tuple(functions), known
         self._energy_kev, self._recipe = energy_kev, recipe
         self.held = held
-        self.few = fewest(self.bands)
+        # Number of events for derivatives; None for all. At a minimum, the derivatives must be
+        # those of the residuals: along weak directions the sampling error of some of the events
+        # is as large as the derivative itself.
+        self.few = fewest(self.bands) if held else None
         self._translated: dict[int | None, tuple[Nearby, Values, list[Translated]]] = {}
         self._weigh(None)
 
@@ -239,16 +245,25 @@ class JointProblem:
     def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters).
 
-        They need not be exact: some of the pulses and one draw of noise are used.
+        If `few` is set, of so many pulses and one draw of noise.
         """
-        here = self._residuals(vector, self.few)
+        here, steps = self._residuals(vector, self.few), self.parameters.steps
         columns = []
-        for i, step in enumerate(self.parameters.steps):
-            moved = vector.copy()
-            moved[i] += step
-            columns.append((self._residuals(moved, self.few) - here) / step)
+        for i in range(len(steps)):
+            change = self._change(vector, here, i)
+            size = float(np.linalg.norm(change))
+            if size > LONGEST and not self.held:
+                steps[i] /= size
+                change = self._change(vector, here, i)
+            columns.append(change / steps[i])
         self.parameters.set(vector)
         return np.stack(columns, axis=1)
+
+    def _change(self, vector: Values, here: Values, i: int) -> Values:
+        """Change of the residuals by one step of a parameter."""
+        moved = vector.copy()
+        moved[i] += self.parameters.steps[i]
+        return self._residuals(moved, self.few) - here
 
     def prepared(self, coordinates: Values, most: int | None = None) -> Pulses:
         """Prepared simulated pulses of the first `most` events, as input of a readout."""

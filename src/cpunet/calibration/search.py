@@ -144,6 +144,7 @@ class Search:
         few = fewest(self._bands)
         nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._looked_at, few)
         problem = self._problem(self._chain(), nearby, self._looked_at)
+        problem.few = few
         return Information.of(problem, _jacobian(problem))
 
     def run(self) -> Calibrated:
@@ -220,6 +221,7 @@ class Search:
         if self.free is not None:
             return list(self.free)
         problem = self._problem(response, nearby, self._first)
+        problem.few = fewest(self._bands)
         told = Information.of(problem, _jacobian(problem)).told()
         return [self._first[i] for i in told]
 
