@@ -1,10 +1,13 @@
-"""Are the errors of a calibration right? Many small, disjoint experiments from one large stand.
+"""Are the errors of a calibration right? Many small, disjoint experiments from large stands.
 
     cpunet stand --preset legend200 --events FEP=20000 --seed 11 --out big
     OMP_NUM_THREADS=1 python benchmarks/calibration_coverage.py big --sets 50
 
-Prints mean and width of the pulls, (found - true) / error, of each free parameter, and with
+Prints the pulls, (found - true) / error, of each free parameter, their mean and width, and with
 ``--figure FILE`` draws them.  The truth is that of the stand's ``stand.json``.
+
+Events of a stand are independent, and each is in one experiment only.  So the mean pull of n
+experiments varies by 1 / sqrt(n) if errors are right, for one stand as for several.
 """
 
 from __future__ import annotations
@@ -12,15 +15,18 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.analysis.style import styled
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics, named
+from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
+from cpunet.calibration.titles import titled
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
@@ -42,64 +48,90 @@ def pulls_figure(pulls: dict[str, np.ndarray]) -> Figure:
         panel.hist(values, edges, color="#0072B2", label=f"{len(values)} experiments")
         normal = np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi)
         panel.plot(grid, len(values) * 0.5 * normal, color="black", label="normal")
-        panel.set_xlabel(f"pull of {name}")
+        panel.set_xlabel(f"pull of {titled(name, units=False)}")
+        panel.set_ylabel("experiments")
         panel.set_title(f"{values.mean():+.2f}, width {values.std(ddof=1):.2f}")
     figure.axes[0].legend()
     return figure
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("stand", type=Path)
-    parser.add_argument("--sets", type=int, default=50)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("stands", type=Path, nargs="+")
+    parser.add_argument("--sets", type=int, default=50, help="parts of each stand")
+    parser.add_argument("--first", type=int, help="only so many of them")
     parser.add_argument("--free", default="temperature,impurity")
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
-    recipe, quiet = load_recipe("fast"), Monitor()
-    selection = parse_selection("FEP", recipe.peaks)
-    files = [InputFile(arguments.stand / f"{name}.lh5") for name in ("sim", "data")]
-    sim = load_simulated(files[0], recipe, selection, quiet).prepared
-    data = load_measured(files[1], recipe, selection, quiet).prepared
-    noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)
-    stored = StoredSimulation.read(files[0].path)
     nuisances = tuple(named(name) for name in arguments.free.split(","))
-    physics = Physics(stored.detector, stored.settings, nuisances)
-    made = json.loads((arguments.stand / "stand.json").read_text())["data"]
-    truth = true_coordinates(physics, made)
-    rng = np.random.default_rng(1)
-    n = min(len(sim), len(data)) // arguments.sets
-    rows = [rng.permutation(len(side))[: n * arguments.sets] for side in (sim, data)]
-    found, errors, chi, begun = [], [], [], time.perf_counter()
-    for i in range(arguments.sets):
-        some, measured = (
-            side[order[i * n : (i + 1) * n]]
-            for side, order in zip((sim, data), rows, strict=True)
-        )
-        sets = PulseSets(some.pulses, measured.pulses, noise, recipe, np.random.default_rng(i))
-        calibrated = Search(
-            simulator=Simulator(stored.hits[some.index], physics),
-            sets=sets,
-            energy_kev=some.pulses.energy_kev,
-            recipe=recipe,
-            free=list(range(len(nuisances))),
-        ).run()
-        found.append(calibrated.problem.parameters.coordinates)
-        errors.append(calibrated.errors)
-        chi.append(calibrated.chi_square / calibrated.problem.moments)
-    pulls = (np.array(found) - truth) / np.array(errors)
-    seconds = time.perf_counter() - begun
-    print(f"{arguments.sets} experiments of {n} pulses a side, {seconds:.0f} s")
-    print(f"chi-square per function {np.mean(chi):.2f}, from {min(chi):.2f} to {max(chi):.2f}")
-    for j, nuisance in enumerate(nuisances):
-        of = pulls[:, j]
+    found, begun = [], time.perf_counter()
+    print("stand, part, chi-square, pulls of", ", ".join(n.name for n in nuisances))
+    for stand in arguments.stands:
+        for i, result in enumerate(experiments(stand, nuisances, arguments.sets)):
+            found.append(result)
+            told = "  ".join(f"{pull:+.2f}" for pull in result.pulls)
+            print(f"{stand} {i + 1:3d}  {result.chi_square:.2f}  {told}", flush=True)
+            if i + 1 == arguments.first:
+                break
+    pulls = np.array([result.pulls for result in found])
+    errors = np.median([result.errors for result in found], axis=0)
+    chi = np.array([result.chi_square for result in found])
+    print(f"{len(found)} experiments, {time.perf_counter() - begun:.0f} s")
+    print(f"chi-square per function {chi.mean():.2f}, from {chi.min():.2f} to {chi.max():.2f}")
+    for nuisance, error, of in zip(nuisances, errors, pulls.T, strict=True):
         print(
-            f"{nuisance.name}: error {np.median(np.array(errors)[:, j]):.3g}, pulls: mean "
+            f"{nuisance.name}: error {error:.3g}, pulls: mean "
             f"{of.mean():+.2f} ± {of.std() / len(of) ** 0.5:.2f}, width {of.std(ddof=1):.2f}"
         )
     if arguments.figure:
         named_pulls = {n.name: pulls[:, j] for j, n in enumerate(nuisances)}
         pulls_figure(named_pulls).savefig(
             arguments.figure, dpi=110, metadata={"Software": None}
+        )
+
+
+class Experiment(NamedTuple):
+    """Pulls and errors of the free coordinates, and chi-square per function."""
+
+    pulls: np.ndarray
+    errors: np.ndarray
+    chi_square: float
+
+
+def experiments(
+    stand: Path, nuisances: tuple[Nuisance, ...], sets: int
+) -> Iterator[Experiment]:
+    """Calibrations of disjoint parts of a stand."""
+    recipe, quiet = load_recipe("fast"), Monitor()
+    selection = parse_selection("FEP", recipe.peaks)
+    files = [InputFile(stand / f"{name}.lh5") for name in ("sim", "data")]
+    sim = load_simulated(files[0], recipe, selection, quiet).prepared
+    data = load_measured(files[1], recipe, selection, quiet).prepared
+    noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)
+    stored = StoredSimulation.read(files[0].path)
+    physics = Physics(stored.detector, stored.settings, nuisances)
+    truth = true_coordinates(physics, json.loads((stand / "stand.json").read_text())["data"])
+    rng = np.random.default_rng(1)
+    n = min(len(sim), len(data)) // sets
+    rows = [rng.permutation(len(side))[: n * sets] for side in (sim, data)]
+    for i in range(sets):
+        some, measured = (
+            side[order[i * n : (i + 1) * n]]
+            for side, order in zip((sim, data), rows, strict=True)
+        )
+        calibrated = Search(
+            simulator=Simulator(stored.hits[some.index], physics),
+            sets=PulseSets(
+                some.pulses, measured.pulses, noise, recipe, np.random.default_rng(i)
+            ),
+            energy_kev=some.pulses.energy_kev,
+            recipe=recipe,
+            free=list(range(len(nuisances))),
+        ).run()
+        yield Experiment(
+            (calibrated.problem.parameters.coordinates - truth) / calibrated.errors,
+            calibrated.errors,
+            calibrated.chi_square / calibrated.problem.moments,
         )
 
 

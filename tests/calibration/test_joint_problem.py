@@ -108,6 +108,54 @@ def test_chi_square_is_that_of_the_definition(sides):
     assert both.names == ("first", "second")
 
 
+def test_chance_gives_less_than_one_per_function_because_of_the_ridge(sides):
+    both = problem(*sides)
+    mean, spread = both.by_chance
+    covariance = sum(np.cov(side.T, bias=i == 0) for i, side in enumerate(sides))
+    drawn = np.random.default_rng(1).multivariate_normal([0, 0], covariance, 400_000)
+    sigma = np.sqrt(covariance.diagonal())
+    correlation = (1 - RIDGE) * covariance / np.outer(sigma, sigma) + RIDGE * np.eye(2)
+    pulls = drawn / sigma
+    chi_square = (pulls @ np.linalg.inv(correlation) * pulls).sum(axis=1)
+    assert mean == pytest.approx(chi_square.mean(), rel=0.01)
+    assert mean < 1.98
+    assert spread == pytest.approx(chi_square.std(), rel=0.01)
+
+
+def test_derivatives_are_of_steps_in_which_the_functions_are_linear(sides):
+    """A function that saturates far within the step first taken."""
+
+    class Saturates(Numbers):
+        def __call__(self, readings, clip=None):
+            return np.tanh(300 * (readings.linear - 1e-9)) / 300
+
+    sim, data = (1e-4 * side for side in sides)
+    both = problem(sim, data)
+    both.functions = (Saturates(),)
+    both._weigh(None)
+    vector = both.parameters.vector()
+    first = both.parameters.steps.copy()
+    found = both.jacobian(vector, both.residuals(vector))[:2, -1]
+    shorter = both.parameters.steps
+    assert shorter[-1] < 0.1 * first[-1]
+    assert (shorter <= first).all()
+    moved = vector.copy()
+    moved[-1] += 1e-3 * shorter[-1]
+    true = (both.residuals(moved) - both.residuals(vector))[:2] / (1e-3 * shorter[-1])
+    assert found == pytest.approx(true, rel=0.05)
+
+
+def test_another_chain_is_compared_with_the_same_weights(sides):
+    sim, data = sides
+    both = problem(sim, data)
+    moved = both.parameters.vector()
+    moved[-2:] = 0.1, 0.05
+    cost = both.chi_square(moved)
+    other = both.of_chain(ElectronicsResponse(RECIPE.matching[0], 16.0))
+    assert other.parameters.free == []
+    assert other.chi_square(other.parameters.vector()) == pytest.approx(cost)
+
+
 def test_far_from_the_data_only_their_covariance_counts(sides):
     sim, data = sides
     held = problem(sim, data, held=True)

@@ -9,9 +9,9 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 
 
-@pytest.mark.parametrize("ringing_mhz", [None, 5.0])
-def test_every_parameter_has_a_row(ringing_mhz):
-    config = load_recipe("fast").matching[0].model_copy(update={"ringing_mhz": ringing_mhz})
+@pytest.mark.parametrize("also", [{}, {"ringing_mhz": 5.0}, {"free_decays": True}])
+def test_every_parameter_has_a_row(also):
+    config = load_recipe("fast").matching[0].model_copy(update=also)
     values = ElectronicsResponse(config, 16.0).describe()
     values = {k: v for k, v in values.items() if not k.startswith("slow_")}  # told as a sum
     table = response_table({"runs": [{"path": "run", "values": values, "errors": {}}]})

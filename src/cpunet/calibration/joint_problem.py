@@ -27,8 +27,11 @@ HOLD = 4.0
 FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
-# Step of a finite difference as a fraction of the reach of a derivative.
-FINITE = 0.1
+# Step of a finite difference as a fraction of the reach of a derivative. A step that changes
+# the residuals by more standard deviations than this is replaced by one of a single one: tail
+# slopes are clipped and cut, and fast decays make them so precise that a step of 1 % is nowhere
+# near linear.
+FINITE, LONGEST = 0.1, 3.0
 
 
 class JointParameters:
@@ -133,7 +136,10 @@ class JointProblem:
         self.functions, self.known = tuple(functions), known
         self._energy_kev, self._recipe = energy_kev, recipe
         self.held = held
-        self.few = fewest(self.bands)
+        # Number of events for derivatives; None for all. At a minimum, the derivatives must be
+        # those of the residuals: along weak directions the sampling error of some of the events
+        # is as large as the derivative itself.
+        self.few = fewest(self.bands) if held else None
         self._translated: dict[int | None, tuple[Nearby, Values, list[Translated]]] = {}
         self._weigh(None)
 
@@ -150,7 +156,7 @@ class JointProblem:
     def _weigh(self, clip: float | None) -> None:
         """Set the clip, and errors and correlations of the functions with it."""
         self._clip = clip
-        self._wanted, self._sigma, self._whiten = [], [], []
+        self._wanted, self._sigma, self._whiten, self._counted = [], [], [], []
         for band, functions in zip(self.bands, self.functions, strict=True):
             values = functions(band.moments.data, clip)
             covariance = np.cov(values.T) / band.pairs
@@ -159,8 +165,10 @@ class JointProblem:
                 simulated = self._covariance(band, functions) / band.pairs
                 covariance = 0.5 * (covariance + simulated)
             sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)
-            correlation = (1 - RIDGE) * covariance / sigma[:, np.newaxis] / sigma
-            correlation += RIDGE * np.eye(len(sigma))
+            correlation = covariance / sigma[:, np.newaxis] / sigma
+            variances = np.maximum(np.linalg.eigvalsh(correlation), 0)
+            correlation = (1 - RIDGE) * correlation + RIDGE * np.eye(len(sigma))
+            self._counted.append(variances / ((1 - RIDGE) * variances + RIDGE))
             self._wanted.append(values.mean(axis=0))
             self._sigma.append(sigma)
             self._whiten.append(scipy.linalg.cholesky(np.linalg.inv(correlation)))
@@ -169,6 +177,18 @@ class JointProblem:
     def moments(self) -> int:
         """Number of compared functions in all bands."""
         return sum(len(sigma) for sigma in self._sigma)
+
+    @property
+    def by_chance(self) -> tuple[float, float]:
+        r"""Mean and standard deviation of chi-square if simulation and data agree.
+
+        The ridge makes directions in which the functions hardly vary count for little. With the
+        eigenvalues :math:`\lambda` of the correlation matrix and the ridge :math:`\rho`, each
+        contributes :math:`q = \lambda / [(1 - \rho) \lambda + \rho]` instead of 1, so the mean
+        is :math:`\sum q` and the variance :math:`2 \sum q^2`.
+        """
+        counted = np.concatenate(self._counted)
+        return float(counted.sum()), float(np.sqrt(2 * counted @ counted))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -188,6 +208,16 @@ class JointProblem:
         r""":math:`\mathbf{d}^T C^{-1} \mathbf{d}` of the functions alone, without priors."""
         deviations = self._deviations(vector)
         return float(deviations @ deviations)
+
+    def of_chain(self, response: ElectronicsResponse) -> JointProblem:
+        """The same comparison, weights included, for another chain and fixed physics."""
+        physics, own = self.nearby.simulator.physics, self.parameters
+        parameters = JointParameters(response, physics, own.coordinates, [], own.given)
+        problem = type(self)(
+            parameters, self.bands, self.functions, self.nearby, self._energy_kev, self._recipe
+        )
+        problem.weigh_like(self)
+        return problem
 
     def weigh_like(self, other: JointProblem) -> None:
         """Adopt errors and correlations of the same functions from another problem."""
@@ -215,16 +245,25 @@ class JointProblem:
     def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters).
 
-        They need not be exact: some of the pulses and one draw of noise are used.
+        If `few` is set, of so many pulses and one draw of noise.
         """
-        here = self._residuals(vector, self.few)
+        here, steps = self._residuals(vector, self.few), self.parameters.steps
         columns = []
-        for i, step in enumerate(self.parameters.steps):
-            moved = vector.copy()
-            moved[i] += step
-            columns.append((self._residuals(moved, self.few) - here) / step)
+        for i in range(len(steps)):
+            change = self._change(vector, here, i)
+            size = float(np.linalg.norm(change))
+            if size > LONGEST and not self.held:
+                steps[i] /= size
+                change = self._change(vector, here, i)
+            columns.append(change / steps[i])
         self.parameters.set(vector)
         return np.stack(columns, axis=1)
+
+    def _change(self, vector: Values, here: Values, i: int) -> Values:
+        """Change of the residuals by one step of a parameter."""
+        moved = vector.copy()
+        moved[i] += self.parameters.steps[i]
+        return self._residuals(moved, self.few) - here
 
     def prepared(self, coordinates: Values, most: int | None = None) -> Pulses:
         """Prepared simulated pulses of the first `most` events, as input of a readout."""

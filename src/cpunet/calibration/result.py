@@ -9,8 +9,8 @@ import numpy as np
 from cpunet.calibration.identifiability import Direction
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values, priors
+from cpunet.calibration.other_chains import BEYOND_CHANCE
 from cpunet.calibration.search import Calibrated
-from cpunet.training.response_starts import GOOD_FIT
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
@@ -63,6 +63,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
             },
         }
     vector = parameters.vector()
+    mean, spread = problem.by_chance
     return {
         "parameters": free,
         "fixed": {
@@ -74,6 +75,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
             "after": calibrated.chi_square,
             "moments": problem.moments,
             "degrees_of_freedom": problem.moments - len(vector),
+            "by_chance": {"mean": mean, "standard_deviation": spread},
             "errors_scaled_by": calibrated.scale,
         },
         "directions": [_direction(direction) for direction in calibrated.directions],
@@ -117,9 +119,11 @@ def notes(calibrated: Calibrated) -> list[str]:
     per = calibrated.chi_square / problem.moments
     asked = {k: v for k, v in calibrated.promised.items() if v > WORTH_TELLING}
     best = max(asked, key=lambda name: asked[name], default=None)
-    if per <= GOOD_FIT:
+    mean, spread = (number / problem.moments for number in problem.by_chance)
+    if per <= mean + BEYOND_CHANCE * spread:
         found.append(
-            f"chi-square is {per:.2f} per function, as by chance: no other physics are needed"
+            f"chi-square is {per:.2f} per function, as by chance ({mean:.2f} ± {spread:.2f}): "
+            "no other physics are needed"
         )
     else:
         rest = (
@@ -127,7 +131,10 @@ def notes(calibrated: Calibrated) -> list[str]:
             if best
             else "none of the parameters looked at explains it"
         )
-        found.append(f"chi-square is {per:.2f} per function, too much for chance; {rest}")
+        found.append(
+            f"chi-square is {per:.2f} per function, too much for chance ({mean:.2f} ± "
+            f"{spread:.2f}); {rest}"
+        )
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,15 +18,18 @@ from cpunet.calibration.identifiability import Direction, Information, promises
 from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
+from cpunet.calibration.other_chains import decaying_chain, ringing_chain
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
+from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import ResponseProblem
-from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, start_response
+from cpunet.training.response_starts import start_response
 
 Note = Callable[[str], None]
+OtherChain = Callable[[JointProblem, PulseSets, MatchingConfig], ElectronicsResponse | None]
 
 ROUNDS, STEPS, FIRST_STEPS = 8, 12, 20
 # The search ends when all coordinates move by less than this fraction of their error.
@@ -37,6 +40,9 @@ FARTHEST, HALVINGS = 1.5, 4
 # Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
 # freed, and maximum number of such parameters.
 NEEDED, MAX_MORE = 25.0, 3
+# Other chains, and the round in which each is first tried: without its ringing no physics
+# explain a readout that rings, but early decays show only when physics are about right.
+OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
 # Events with which fixed parameters are looked at.
 LOOKED_AT_WITH = 1024
 
@@ -50,8 +56,7 @@ class Calibrated:
     problem
         Comparison at the end of the search: chain, coordinates, functions, pulses.
     covariance
-        Covariance of its parameters, multiplied by chi-square per degree of freedom if this
-        is above 1.
+        Covariance of its parameters, multiplied by the square of `scale`.
     chi_square_before, pulls_before
         Chi-square and pulls with the chain alone, for the physics as simulated.
     chi_square
@@ -90,7 +95,7 @@ class Calibrated:
 
     @property
     def scale(self) -> float:
-        """Factor of the errors from imperfect agreement: the root of the reduced chi-square."""
+        """Factor of the errors from imperfect agreement, see `JointProblem.by_chance`."""
         return _scale(self.problem, self.chi_square)
 
 
@@ -139,6 +144,7 @@ class Search:
         few = fewest(self._bands)
         nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._looked_at, few)
         problem = self._problem(self._chain(), nearby, self._looked_at)
+        problem.few = few
         return Information.of(problem, _jacobian(problem))
 
     def run(self) -> Calibrated:
@@ -154,7 +160,7 @@ class Search:
         before = self._problem(response, nearby, [], held=True)
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
-        may_ring, more, last = True, 0, np.zeros(self._n)
+        kinds, more, last = dict(OTHER_CHAINS), 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
             problem = self._problem(response, nearby, free, held=number == 1)
             found = levenberg_marquardt(problem, STEPS, None, coarse=number == 1)
@@ -162,10 +168,8 @@ class Search:
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
             settled = number > 1 and _settled(problem, found, moved)
-            if may_ring and (number == 1 or settled) and _poor(problem):
-                rings = self._ringing(problem)
-                may_ring = rings is None and not settled
-                response, settled = rings or response, settled and rings is None
+            other = self._other_chain(problem, kinds, number, settled=settled)
+            response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
             if settled and added is None:
                 break
@@ -217,6 +221,7 @@ class Search:
         if self.free is not None:
             return list(self.free)
         problem = self._problem(response, nearby, self._first)
+        problem.few = fewest(self._bands)
         told = Information.of(problem, _jacobian(problem)).told()
         return [self._first[i] for i in told]
 
@@ -240,23 +245,20 @@ class Search:
         outdated = there.outdated(free, farthest / FARTHEST)
         return there.again(outdated) if outdated else there
 
-    def _ringing(self, problem: JointProblem) -> ElectronicsResponse | None:
-        """A chain with ringing if it explains much of the remaining deviation."""
-        config, training = self.recipe.matching
-        if config.ringing_mhz is not None:
-            return None
-        waveforms = problem.prepared(problem.parameters.coordinates).waveforms
-        bands = [
-            replace(band, sim=replace(band.sim, sim=waveforms[band.rows]))
-            for band in self.sets.bands(training.search_pulses)
-        ]
-        chain = copy.deepcopy(problem.parameters.chain.response)
-        plain = ResponseProblem(chain, bands, draws=1)
-        found = levenberg_marquardt(plain, STEPS, None, coarse=False)
-        if found.cost < GOOD_FIT * plain.moments:
-            return None
-        best, _ = ringing_if_better(plain, found, config, training, None)
-        return best.response if len(best.response.ringing) else None
+    def _other_chain(
+        self, problem: JointProblem, kinds: dict[OtherChain, int], number: int, *, settled: bool
+    ) -> ElectronicsResponse | None:
+        """Another chain if the data need one. Each kind is found once, or given up."""
+        _, training = self.recipe.matching
+        for kind, first in list(kinds.items()):
+            if not settled and number != first:
+                continue
+            chain = kind(problem, self.sets, training)
+            if settled or chain is not None:
+                del kinds[kind]
+            if chain is not None:
+                return chain
+        return None
 
     def _needed(self, problem: JointProblem) -> int | None:
         """Fixed parameter with the largest expected decrease of chi-square, if significant."""
@@ -337,18 +339,14 @@ class Search:
 
 
 def _scale(problem: JointProblem, chi_square: float) -> float:
-    """Scale errors by the root of the reduced chi-square if it is above 1."""
-    freedom = problem.moments - len(problem.parameters.vector())
-    return float(np.sqrt(max(1.0, chi_square / freedom)))
+    """Scale errors by the root of chi-square over what chance (two sigmas) may give."""
+    mean, spread = problem.by_chance
+    return float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
 
 
 def _jacobian(problem: JointProblem) -> Values:
     vector = problem.parameters.vector()
     return problem.jacobian(vector, problem.residuals(vector))
-
-
-def _poor(problem: JointProblem) -> bool:
-    return problem.chi_square(problem.parameters.vector()) > GOOD_FIT * problem.moments
 
 
 def _relaxed(moved: Values, last: Values) -> Values:

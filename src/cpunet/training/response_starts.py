@@ -108,9 +108,26 @@ def free_decay_if_better(
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
     """Let a fast decay have a time of its own, if that explains much of what is left."""
+    other = with_free_decay(problem, training, decay, listener)
+    if other is None:
+        return problem, found
+    again, fitted = other
+    steps = found.steps + fitted.steps
+    if fitted.cost < RINGS * found.cost:
+        return again, fitted._replace(steps=steps)
+    return problem, found._replace(steps=steps)
+
+
+def with_free_decay(
+    problem: ResponseProblem,
+    training: MatchingConfig,
+    decay: KnownDecay | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum] | None:
+    """Fit a response whose fast decay has a time of its own; None if there is no other."""
     config = problem.response.config
     if config.free_decays or not config.fast_decays_us:
-        return problem, found
+        return None
     slow = tuple(tau for tau in config.slow_ns if tau <= SLOWEST_NS)
     free = config.model_copy(
         update={"free_decays": True, "fast_decays_us": FAST_DECAYS_US[:1], "slow_ns": slow}
@@ -120,11 +137,7 @@ def free_decay_if_better(
         for us, share in _decays(problem, decay)
     ]
     again = min(starts, key=_cost)
-    fitted = levenberg_marquardt(again, training.steps, listener)
-    steps = found.steps + fitted.steps
-    if fitted.cost < RINGS * found.cost:
-        return again, fitted._replace(steps=steps)
-    return problem, found._replace(steps=steps)
+    return again, levenberg_marquardt(again, training.steps, listener)
 
 
 def _free_decay_start(

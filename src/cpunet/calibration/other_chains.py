@@ -1,0 +1,78 @@
+"""Other chains, for data that a chain of fixed times does not explain.
+
+What such a chain leaves is not only a larger chi-square. Physics take up part of it: a readout
+with an early decay between the fixed ones looks like more self-repulsion.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+from cpunet.calibration.joint_problem import JointProblem
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, with_free_decay
+
+STEPS = 12
+# Chi-square beyond chance, in its standard deviations, for which another chain is tried.
+BEYOND_CHANCE = 4.0
+# Decrease of chi-square (five standard deviations) for which a decay gets a time of its own.
+NEEDED = 25.0
+
+
+def ringing_chain(
+    problem: JointProblem, sets: PulseSets, training: MatchingConfig
+) -> ElectronicsResponse | None:
+    """Return a chain with ringing if it explains much of the remaining deviation."""
+    chain = copy.deepcopy(problem.parameters.chain.response)
+    if chain.config.ringing_mhz is not None or _cost(problem) < GOOD_FIT * problem.moments:
+        return None
+    plain = _at_these_physics(problem, chain, sets, training)
+    found = levenberg_marquardt(plain, STEPS, None, coarse=False)
+    if found.cost < GOOD_FIT * plain.moments:
+        return None
+    best, _ = ringing_if_better(plain, found, chain.config, training, None)
+    return best.response if len(best.response.ringing) else None
+
+
+def decaying_chain(
+    problem: JointProblem, sets: PulseSets, training: MatchingConfig
+) -> ElectronicsResponse | None:
+    """Return a chain whose early decay has a time of its own if the data need it.
+
+    The main decay is held to that of the remains, if these are known.
+    """
+    mean, spread = problem.by_chance
+    if _cost(problem) < mean + BEYOND_CHANCE * spread:
+        return None
+    chain = copy.deepcopy(problem.parameters.chain.response)
+    plain = _at_these_physics(problem, chain, sets, training)
+    remains = sets.remains
+    other = with_free_decay(
+        plain, training, None if remains is None else remains.known_decay, None
+    )
+    if other is None:
+        return None
+    tried = problem.of_chain(other[0].response)
+    levenberg_marquardt(tried, STEPS, None, coarse=False)
+    return None if _cost(tried) > _cost(problem) - NEEDED else tried.parameters.chain.response
+
+
+def _cost(problem: JointProblem) -> float:
+    return problem.chi_square(problem.parameters.vector())
+
+
+def _at_these_physics(
+    problem: JointProblem, chain: ElectronicsResponse, sets: PulseSets, training: MatchingConfig
+) -> ResponseProblem:
+    """Comparison for the chain alone, of some of the pulses with the physics of a problem."""
+    waveforms = problem.prepared(problem.parameters.coordinates).waveforms
+    bands = [
+        replace(band, sim=replace(band.sim, sim=waveforms[band.rows]))
+        for band in sets.bands(training.search_pulses)
+    ]
+    return ResponseProblem(chain, bands, draws=1)
