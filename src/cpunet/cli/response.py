@@ -45,8 +45,6 @@ ROWS = {
     r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
     r"effective_decay_us": ("effective decay, tail", "µs"),
     r"decay_(.*)_us": (r"share decaying with \1 µs", "%"),
-    r"fast_decay_(\d)_us": (r"early decay \1", "µs"),
-    r"fast_decay_(\d)_share": (r"share of early decay \1", "%"),
     r"droop_(.*)_us": (r"decayed at \1 µs", "%"),
     r"noise_rms_kev": ("noise RMS", "keV"),
     r"noise_corner_mhz": ("noise corner", "MHz"),
