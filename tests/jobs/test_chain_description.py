@@ -382,3 +382,25 @@ def test_decays_of_free_times_are_printed(tmp_path, monkeypatch, capsys):
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["fast", "decay", "1", "[µs]", "4"] in printed
     assert ["share", "of", "fast", "decay", "1", "[%]", "5"] in printed
+
+
+def test_a_poor_fit_is_doubted_and_damaged_facts_of_a_fit_are_not_needed(run, tmp_path):
+    info = json.loads((run / "run.json").read_text())
+
+    def doubts(fit: object) -> list[str]:
+        (run / "run.json").write_text(json.dumps(info | {"fit": fit}))
+        return describe_responses([run])["runs"][0]["doubts"]
+
+    assert doubts(FIT) == []
+    poor = FIT | {
+        "verdict": "chi-square is 9 per moment",
+        "causes": ["the detector", "energies"],
+    }
+    (said,) = doubts(poor)
+    assert said.startswith("poor fit: chi-square is 9 per moment; ")
+    assert said.endswith("the detector")
+    for fit in (None, {}, FIT | {"causes": {"a": 1}}, FIT | {"causes": 5, "parameters": 5}):
+        assert doubts(fit) == []
+    early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
+    (said,) = describe_responses([early])["runs"][0]["doubts"]
+    assert said.startswith("60 % of the charge would arrive too early")

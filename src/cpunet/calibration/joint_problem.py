@@ -222,6 +222,7 @@ class JointProblem:
     def weigh_like(self, other: JointProblem) -> None:
         """Adopt errors and correlations of the same functions from another problem."""
         self._sigma, self._whiten = other._sigma, other._whiten
+        self._counted = other._counted
 
     def residuals(self, vector: Values) -> Values:
         """Uncorrelated deviations of the functions, priors and further knowledge.

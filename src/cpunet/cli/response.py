@@ -82,24 +82,8 @@ def response(
         tell_table(response_table(told))
         tell(f"{out_folder / 'response.png'}")
     for run in told["runs"]:
-        for doubt in _doubts(Path(run["path"])):
+        for doubt in run["doubts"]:
             warn(f"{Path(run['path']).name}: {doubt}")
-
-
-def _doubts(run: Path) -> list[str]:
-    """Why the numbers of a run are not those of a readout alone."""
-    from cpunet.training.diagnosis import beyond
-    from cpunet.training.run_folder import read_info
-
-    fit = read_info(run).get("fit", {})
-    doubts = beyond(fit.get("parameters", {}))
-    if fit.get("causes"):
-        doubts.insert(
-            0,
-            f"poor fit: {fit.get('verdict')}; these numbers stand in for what is wrong with "
-            f"the simulation, too: {fit['causes'][0]}",
-        )
-    return doubts
 
 
 def response_table(told: dict[str, Any]) -> Table:

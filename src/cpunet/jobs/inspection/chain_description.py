@@ -39,6 +39,7 @@ from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.regular_files import read_text
+from cpunet.training.diagnosis import beyond
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
@@ -100,7 +101,8 @@ def describe_responses(
     dict
         Content of ``response.json``.  ``runs``: for each run its ``values`` by name, with the
         unit as suffix (shares of the full charge have none), ``errors`` of the fitted
-        quantities and of the noise, and all ``parameters`` with their ``parameter_errors``.
+        quantities and of the noise, all ``parameters`` with their ``parameter_errors``, and
+        ``doubts``, why these are not those of a readout alone.
         ``mean`` and ``spread`` (standard deviation) of several runs.  ``truth``: the same
         ``values`` of the true chain, the ``difference`` of the run or of the mean of the runs
         from it, and ``sigma``, the difference divided by the error or the spread, whichever
@@ -246,7 +248,21 @@ def _told(run: _Learned) -> dict[str, Any]:
         "errors": {n: e for n, e in run.errors.items() if n in values} | _noise_error(run),
         "parameters": run.parameters,
         "parameter_errors": run.errors,
+        "doubts": _doubts(run),
     }
+
+
+def _doubts(run: _Learned) -> list[str]:
+    """Why the numbers of a run are not those of a readout alone."""
+    causes = run.fit.get("causes")
+    found = beyond(run.parameters)
+    if isinstance(causes, list) and causes:
+        found.insert(
+            0,
+            f"poor fit: {run.fit.get('verdict')}; these numbers stand in for what is wrong "
+            f"with the simulation, too: {causes[0]}",
+        )
+    return found
 
 
 def _noise_error(run: _Learned) -> Numbers:
