@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -14,55 +13,42 @@ import pytest
 import cpunet
 from cpunet import installation
 
-HERE = Path(cpunet.__file__).parent
-
-
-class Other:
-    """A distribution called cpunet."""
-
-    version = "1.0.0"
-
-    def __init__(self, folder: Path, *names: str) -> None:
-        self.folder, self.files = folder, [Path(name) for name in names]
-
-    def locate_file(self, name: Path) -> Path:
-        return self.folder / name
-
 
 @pytest.fixture
-def installed(monkeypatch):
-    """Pretend that a distribution is installed."""
+def installed(monkeypatch, tmp_path):
+    """Pretend that this package lies in a folder, with another distribution beside it."""
+    monkeypatch.setattr(installation, "__file__", str(tmp_path / "cpunet" / "installation.py"))
 
-    def install(other: Other | None) -> None:
-        def find(name: str) -> Other:
-            assert name == "cpunet"
-            if other is None:
-                raise PackageNotFoundError(name)
-            return other
-
-        monkeypatch.setattr(installation, "distribution", find)
+    def install(*files: str) -> None:
+        information = tmp_path / "cpunet-1.0.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text("Name: cpunet\nVersion: 1.0.0\n")
+        (information / "RECORD").write_text("".join(f"{file},,\n" for file in files))
         installation.other_package.cache_clear()
 
+    installation.other_package.cache_clear()
     yield install
     installation.other_package.cache_clear()
 
 
 @pytest.mark.parametrize(
-    "other",
+    "files",
     [
         None,
-        Other(HERE.parent, "_editable_impl_cpunet.pth", "cpunet-0.1.0.dist-info/RECORD"),
-        Other(HERE.parent.parent, "cpunet/__init__.py"),  # elsewhere, not over this one
+        ["_editable_impl_cpunet.pth", "cpunet-1.0.0.dist-info/RECORD"],
+        ["cpunet_other/__init__.py"],  # beside this one, not over it
+        [],
     ],
 )
-def test_alone(installed, other):
-    installed(other)
+def test_alone(installed, files):
+    if files is not None:
+        installed(*files)
     assert installation.other_package() is None
     assert cpunet.Pulses
 
 
 def test_over_this_one(installed):
-    installed(Other(HERE.parent, "cpunet/__init__.py", "cpunet/model.py"))
+    installed("cpunet/__init__.py", "cpunet/model.py")
     told = (
         "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "
         "pip uninstall cpunet cpunet-hpge, then install the one you want"
@@ -75,7 +61,7 @@ def test_over_this_one(installed):
 def test_the_command_line_tells_it(installed, capsys, monkeypatch):
     from cpunet.cli import main
 
-    installed(Other(HERE.parent, "cpunet/__init__.py"))
+    installed("cpunet/__init__.py")
     monkeypatch.setattr(sys, "argv", ["cpunet", "--version"])
     with pytest.raises(SystemExit):
         main.main()

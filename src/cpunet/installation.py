@@ -8,7 +8,6 @@ so an environment can contain only one of them.
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
@@ -23,11 +22,14 @@ def other_package() -> str | None:
     str or None
         None if it is not installed, or in another folder.
     """
-    try:
-        other = distribution(OTHER)
-    except PackageNotFoundError:
-        return None
     here = Path(__file__).resolve().parent
+    found = next(here.parent.glob(f"{OTHER}-*.dist-info"), None)
+    if found is None:
+        return None
+    # Imported only here, since it would make `cpunet --help` wait for tens of milliseconds
+    from importlib.metadata import Distribution
+
+    other = Distribution.at(found)
     files = (Path(str(other.locate_file(file))) for file in other.files or ())
     if not any(here == file.parent.resolve() for file in files if file.suffix == ".py"):
         return None
