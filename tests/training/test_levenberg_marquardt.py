@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 
@@ -14,12 +15,12 @@ SIGMA = 0.05
 
 
 class Vector:
-    """Where the fit is, and how far it may go at once."""
+    """Where the fit is, and how far it may go."""
 
-    widths = np.full(2, PRIOR)
-
-    def __init__(self, start: list[float]) -> None:
-        self.now = np.array(start)
+    def __init__(self, start: list[float], width: float = PRIOR) -> None:
+        self.now, self.centre = np.array(start), np.array(start)
+        self.widths = np.full(len(start), width)
+        self.low, self.high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
 
     def vector(self) -> np.ndarray:
         return self.now.copy()
@@ -67,3 +68,47 @@ def test_the_truth_is_found_within_its_errors() -> None:
     apart = np.abs(problem.parameters.now - TRUTH)
     assert (apart < np.sqrt(found.covariance.diagonal())).all()
     assert found.cost < 0.3  # of which 0.1 is the prior's
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.6, 4.0), (0.1, 1.2)])
+def test_a_fit_ends_at_a_bound_with_the_others_at_their_best(low: float, high: float) -> None:
+    problem = Decay([4.0, high])
+    problem.parameters.low[1], problem.parameters.high[1] = low, high
+    found = levenberg_marquardt(problem, 30, None, coarse=False)
+    bounds = ([-np.inf, low], [np.inf, high])
+    known = least_squares(problem.residuals, [4.0, 0.5 * (low + high)], bounds=bounds)
+    np.testing.assert_allclose(problem.parameters.now, known.x, rtol=1e-3)
+    assert found.cost == pytest.approx(2 * known.cost, rel=1e-3)
+
+
+class Clipped:
+    """A value that is the same for all numbers below 0, as physics at a bound are."""
+
+    clip: float | None = None
+    moments = 1
+
+    def __init__(self, start: float, centre: float, width: float) -> None:
+        self.parameters = Vector([start], width)
+        self.parameters.centre[:] = centre
+        self.parameters.low[:] = 0.0
+
+    def residuals(self, vector: np.ndarray) -> np.ndarray:
+        of, true = (np.exp(-3 * max(x, 0)) for x in (vector[0], 0.1))
+        prior = (vector[0] - self.parameters.centre[0]) / self.parameters.widths[0]
+        return np.array([(of - true) / 0.01, prior])
+
+    def jacobian(self, vector: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        return (self.residuals(vector + 1e-6) - residuals)[:, np.newaxis] / 1e-6
+
+
+def test_a_fit_whose_step_crosses_a_bound_comes_back() -> None:
+    problem = Clipped(3.0, centre=0.0, width=PRIOR)
+    levenberg_marquardt(problem, 30, None, coarse=False)
+    assert problem.parameters.now[0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_prior_far_from_the_start_is_reached() -> None:
+    """Its width limits steps near its centre only."""
+    problem = Clipped(0.1, centre=2.0, width=1e-4)
+    levenberg_marquardt(problem, 12, None, coarse=False)
+    assert problem.parameters.now[0] == pytest.approx(2.0, abs=0.01)

@@ -72,7 +72,9 @@ class JointParameters:
             *(nuisance.name for nuisance in chosen),
         )
         bounds = [n.bounds(physics.nominal(n)) for n in chosen]
-        self._low, self._high = np.reshape(bounds, (len(chosen), 2)).T
+        low, high = np.reshape(bounds, (len(chosen), 2)).T
+        self.low = np.concatenate([self.chain.low, low])
+        self.high = np.concatenate([self.chain.high, high])
 
     def vector(self) -> Values:
         """Current values of all parameters as one vector."""
@@ -82,7 +84,8 @@ class JointParameters:
         """Set all parameters from a vector. Coordinates are limited to their bounds."""
         self.chain.set(vector[: self.n_chain])
         self.coordinates = self.coordinates.copy()
-        self.coordinates[self.free] = np.clip(vector[self.n_chain :], self._low, self._high)
+        n = self.n_chain
+        self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
 
 
 class JointProblem:
@@ -261,10 +264,11 @@ class JointProblem:
         return np.stack(columns, axis=1)
 
     def _change(self, vector: Values, here: Values, i: int) -> Values:
-        """Change of the residuals by one step of a parameter."""
-        moved = vector.copy()
-        moved[i] += self.parameters.steps[i]
-        return self._residuals(moved, self.few) - here
+        """Change of the residuals by one step of a parameter, backwards at its upper bound."""
+        moved, step = vector.copy(), self.parameters.steps[i]
+        sign = -1.0 if vector[i] + step > self.parameters.high[i] else 1.0
+        moved[i] += sign * step
+        return sign * (self._residuals(moved, self.few) - here)
 
     def prepared(self, coordinates: Values, most: int | None = None) -> Pulses:
         """Prepared simulated pulses of the first `most` events, as input of a readout."""

@@ -23,9 +23,15 @@ UPDATES = 2  # steps with derivatives that were only updated
 
 
 class Unknowns(Protocol):
-    """Free parameters as a vector, and the largest step of each."""
+    """Free parameters as a vector, with the centres and widths of their priors and bounds.
 
+    No step of a parameter is longer than its width or its distance from its centre.
+    """
+
+    centre: Values
     widths: Values
+    low: Values
+    high: Values
 
     def vector(self) -> Values: ...
 
@@ -137,14 +143,36 @@ def _step(
     problem: Problem, jacobian: Values, vector: Values, residuals: Values, damping: float
 ) -> tuple[Values, Values, float] | None:
     """A step that lowers the cost, what is left after it, and the next damping."""
-    widths, cost = problem.parameters.widths, residuals @ residuals
+    parameters, cost = problem.parameters, residuals @ residuals
+    longest = np.maximum(parameters.widths, np.abs(parameters.centre - vector))
     curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
     for _ in range(TRIES):
         scaled = curvature + damping * np.diag(curvature.diagonal())
-        move = -np.linalg.solve(scaled, gradient)
-        tried = vector + np.clip(move, -widths, widths)
+        move = np.clip(_within(parameters, vector, scaled, gradient), -longest, longest)
+        tried = np.clip(vector + move, parameters.low, parameters.high)
         found = problem.residuals(tried)
         if found @ found < cost:
             return tried, found, damping / DAMPING_DOWN
         damping *= DAMPING_UP
     return None
+
+
+def _within(
+    parameters: Unknowns, vector: Values, curvature: Values, gradient: Values
+) -> Values:
+    """Return the step to the minimum of a parabola; parameters at a bound do not cross it.
+
+    The others move as if those were fixed. Beyond a bound a parameter has no derivative, and a
+    fit that stepped there would not come back.
+    """
+    low, high = vector <= parameters.low, vector >= parameters.high
+    free = np.ones(len(vector), dtype=bool)
+    move = np.zeros(len(vector))
+    while free.any():
+        move[:] = 0
+        move[free] = -np.linalg.solve(curvature[np.ix_(free, free)], gradient[free])
+        out = (low & (move < 0)) | (high & (move > 0))
+        if not out.any():
+            break
+        free &= ~out
+    return np.where(free, move, 0.0)
