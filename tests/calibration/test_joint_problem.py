@@ -6,14 +6,14 @@ and derivatives follow from the definition.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
-from cpunet.calibration.nearby import Nearby
+from cpunet.calibration.nearby import Derivative, Nearby
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
@@ -66,9 +66,13 @@ def problem(sim, data, *, free=(0, 1), held=False, known=None, centre=(0.0, 0.0)
     response = ElectronicsResponse(RECIPE.matching[0], 16.0)
     at = np.array(centre)
     parameters = JointParameters(response, PHYSICS, at, free, {})
-    slopes = {i: np.tile(slope, (len(sim), 1)) for i, slope in SLOPES.items()}
     simulator = SimpleNamespace(physics=PHYSICS)
-    nearby = Nearby(simulator, at, sim, slopes, at)
+    nearby = Nearby(simulator, at, sim, {})
+    slopes = {
+        i: Derivative(np.tile(slope, (len(sim), 1)), at, nearby.half)
+        for i, slope in SLOPES.items()
+    }
+    nearby = replace(nearby, derivatives=slopes)
     ones = np.ones(len(sim))
     band = SimpleNamespace(
         name="FEP",
@@ -222,5 +226,5 @@ def test_pulses_are_prepared_once_for_all_derivatives_of_the_chain(sides):
     both.jacobian(vector, np.empty(0))
     assert len(asked) == 3  # here, and for either parameter of the physics
     here = both.pulls(vector)
-    both.nearby = Nearby(both.nearby.simulator, both.nearby.centre, sides[1], {}, None)
+    both.nearby = Nearby(both.nearby.simulator, both.nearby.centre, sides[1], {})
     assert not np.allclose(both.pulls(vector), here)  # other pulses at the same place

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration._shape_kernels import half_maxima, move
-from cpunet.calibration.nearby import Nearby, Simulator
+from cpunet.calibration.nearby import Derivative, Nearby, Simulator
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
@@ -47,6 +47,29 @@ def test_small_changes_are_those_of_a_simulation(simulator):
     assert np.sqrt((left**2).mean()) < 0.25 * np.sqrt((change**2).mean())
 
 
+def test_derivatives_follow_the_edge(simulator):
+    """Edges of a warmer detector are later, and self-repulsion smears them there."""
+    warmer = np.array([0.5, 0.0, 0.0])
+    fresh = Nearby.about(simulator, warmer, [2])
+    nearby = Nearby.about(simulator, np.zeros(3), [2]).moved(warmer)
+    late = nearby.half - nearby.derivatives[2].half
+    assert late.max() > 0.3  # samples
+    far = np.argmax(late)
+    followed, stale = (
+        np.linalg.norm(slopes[far] - fresh.slopes[2][far])
+        for slopes in (nearby.slopes[2], nearby.derivatives[2].pulses)
+    )
+    assert followed < 0.5 * stale
+
+
+def test_derivatives_are_simulated_again_if_edges_have_moved(simulator):
+    nearby = Nearby.about(simulator, np.zeros(3), [2])
+    reach = np.array([1.5, 0.03, 0.9])
+    for kelvin, outdated in ((0.02, []), (1.2, [2])):
+        moved = nearby.moved(np.array([kelvin, 0.0, 0.0]))
+        assert moved.outdated([2], reach) == moved.unknown([2]) == outdated
+
+
 def test_at_its_centre_nothing_is_added(simulator):
     centre = np.array([1.0, 0.0, 0.0])
     nearby = Nearby.about(simulator, centre, [])
@@ -63,11 +86,15 @@ def test_self_repulsion_is_never_negative(simulator):
 def test_only_derivatives_from_afar_are_simulated_again():
     base, far, reach = np.zeros((4, 2)), np.array([2.0, 0.1, 0.0]), np.ones(3)
     near = np.array([1.5, 0.1, 0.0])
-    slopes = {0: base, 1: base, 2: base[:3]}
-    nearby = Nearby(None, far, base, slopes, {0: near, 1: np.zeros(3), 2: far})
+    known = {
+        0: Derivative(base, near, np.zeros(4)),
+        1: Derivative(base, np.zeros(3), np.zeros(4)),
+        2: Derivative(base[:3], far, np.zeros(3)),
+    }
+    nearby = Nearby(None, far, base, known)
     assert nearby.outdated([0, 1, 2], reach) == [1, 2]  # the last of too few events
     assert nearby.outdated([1], reach) == []  # what is not free does not count
-    assert Nearby(None, far, base, {}, {}).outdated([0], reach) == [0]
+    assert Nearby(None, far, base, {}).outdated([0], reach) == [0]
 
 
 @given(st.floats(1, 8), st.floats(-6, 6))

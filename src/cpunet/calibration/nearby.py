@@ -7,13 +7,14 @@ therefore simulated once on either side of a point and interpolated linearly in 
 
 Other drift velocities shift the end of a pulse by more than the width of its edge. Only shapes
 aligned at half maximum change linearly. This loses no information, since no measured dataset
-contains the start time of a pulse.
+contains the start time of a pulse. Derivatives from another point are moved with the edge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,9 @@ from cpunet.simulation.settings import SimulationSettings
 FloatArray = npt.NDArray[np.float32]
 # Factors by which the sampling period is divided for alignment; the first possible one is used.
 FINER = (4, 5, 3, 2, 1)
+# Root mean square of the moves of the edges, in samples, for which a derivative is moved along.
+# A longer move loses shape between the samples: a third at half a sample.
+MOVED = 0.15
 
 
 class Simulator:
@@ -75,6 +79,31 @@ class Simulator:
 
 
 @dataclass(frozen=True, eq=False)
+class Derivative:
+    """Change of the pulses with one coordinate.
+
+    Parameters
+    ----------
+    pulses
+        Derivatives of the pulses, shape (events, samples).
+    point
+        Coordinates at which they were simulated.
+    half
+        Half maxima of the pulses there in samples, shape (events,).
+    """
+
+    pulses: FloatArray
+    point: Values
+    half: Values
+
+    def moved(self, half: Values) -> FloatArray:
+        """Derivatives of pulses with other half maxima: each is moved with its edge."""
+        pulses = np.empty_like(self.pulses)
+        move(self.pulses, self.half - half[: len(pulses)], pulses)
+        return pulses
+
+
+@dataclass(frozen=True, eq=False)
 class Nearby:
     """Pulses near a point of the physics.
 
@@ -86,51 +115,69 @@ class Nearby:
         Coordinates of the point.
     base
         Pulses at the point, shape (events, samples).
-    slopes
-        Derivatives of the pulses by the position of the coordinate.
-    simulated_at
-        Point at which each derivative was simulated, close to the centre.
+    derivatives
+        Derivatives by the position of the coordinate, simulated at the centre or close to it.
     """
 
     simulator: Simulator
     centre: Values
     base: FloatArray
-    slopes: Mapping[int, FloatArray]
-    simulated_at: Mapping[int, Values]
+    derivatives: Mapping[int, Derivative]
 
     @classmethod
     def about(cls, simulator: Simulator, centre: Values, of: Sequence[int]) -> Nearby:
         """Simulate pulses at a point, and their derivatives in some coordinates."""
-        base = simulator.exact(centre)
-        slopes = _slopes(simulator, centre, of)
-        return cls(simulator, centre, base, slopes, dict.fromkeys(of, centre))
+        return cls(simulator, centre, simulator.exact(centre), {}).again(of)
 
     def moved(self, centre: Values) -> Nearby:
-        """Pulses at another point, with the same derivatives."""
+        """Pulses at another point, with derivatives from the same points as before."""
         return replace(self, centre=centre, base=self.simulator.exact(centre))
 
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
         """The same point, with some derivatives simulated anew for the first `most` events."""
-        slopes = {**self.slopes, **_slopes(self.simulator, self.centre, of, most)}
-        return replace(
-            self,
-            slopes=slopes,
-            simulated_at={**self.simulated_at, **dict.fromkeys(of, self.centre)},
-        )
+        half = self.half[:most]
+        new = {
+            i: Derivative(pulses, self.centre, half)
+            for i, pulses in _slopes(self.simulator, self.centre, of, most).items()
+        }
+        return replace(self, derivatives={**self.derivatives, **new})
+
+    @cached_property
+    def half(self) -> Values:
+        """Half maxima of the pulses in samples."""
+        half = np.zeros(len(self.base))
+        half_maxima(self.base, half)
+        return half
+
+    @cached_property
+    def slopes(self) -> Mapping[int, FloatArray]:
+        """Derivatives of these pulses by the position of the coordinate."""
+        return {i: derivative.moved(self.half) for i, derivative in self.derivatives.items()}
 
     def outdated(self, of: Sequence[int], reach: Values) -> list[int]:
         """Coordinates without derivatives for all events from within reach of the centre.
 
-        Only distances along the coordinates `of` count.
+        Only distances along the coordinates `of` count. Derivatives are out of reach, too, if
+        the edges of the pulses have moved.
         """
         found = []
         for i in of:
-            if i in self.slopes and len(self.slopes[i]) == len(self.base):
-                away = np.abs(self.centre - self.simulated_at[i])
-                if (away <= reach)[list(of)].all():
+            known = self.derivatives.get(i)
+            if known is not None and len(known.pulses) == len(self.base):
+                away = np.abs(self.centre - known.point)
+                if (away <= reach)[list(of)].all() and self._still(known):
                     continue
             found.append(i)
         return found
+
+    def unknown(self, of: Sequence[int]) -> list[int]:
+        """Coordinates without derivatives for any events here."""
+        known = {i: self.derivatives.get(i) for i in of}
+        return [i for i, one in known.items() if one is None or not self._still(one)]
+
+    def _still(self, known: Derivative) -> bool:
+        moved = self.half[: len(known.half)] - known.half
+        return bool((moved @ moved) <= MOVED**2 * len(moved))
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Pulses of the first `most` events at some coordinates, shape (events, samples)."""
@@ -142,9 +189,11 @@ class Nearby:
 
 
 def _slopes(
-    simulator: Simulator, centre: Values, wanted: Sequence[int], most: int | None = None
+    simulator: Simulator, centre: Values, wanted: Sequence[int], most: int | None
 ) -> dict[int, FloatArray]:
     """Derivatives of the aligned shapes in each coordinate, from two simulations each."""
+    if not wanted:
+        return {}
     physics = simulator.physics
     here = simulator.quick(centre, most)
     half = np.zeros(len(here))

@@ -273,7 +273,8 @@ class Search:
     def _promised(self, problem: JointProblem) -> tuple[dict[int, float], Information]:
         """Expected decreases for fixed parameters, and the information on all."""
         parameters = problem.parameters
-        missing = [i for i in self._looked_at if i not in problem.nearby.slopes]
+        fixed = [i for i in self._looked_at if i not in parameters.free]
+        missing = problem.nearby.unknown(fixed)
         few = fewest(self._bands, LOOKED_AT_WITH)
         if missing:
             problem.nearby = problem.nearby.again(missing, few)
