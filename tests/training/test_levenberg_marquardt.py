@@ -18,8 +18,8 @@ class Vector:
     """Where the fit is, and how far it may go."""
 
     def __init__(self, start: list[float], width: float = PRIOR) -> None:
-        self.now, self.centre = np.array(start), np.array(start)
-        self.widths = np.full(len(start), width)
+        self.now, self.widths = np.array(start), np.full(len(start), width)
+        self.longest = self.widths
         self.low, self.high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
 
     def vector(self) -> np.ndarray:
@@ -89,12 +89,13 @@ class Clipped:
 
     def __init__(self, start: float, centre: float, width: float) -> None:
         self.parameters = Vector([start], width)
-        self.parameters.centre[:] = centre
+        self.centre = centre
+        self.parameters.longest = np.maximum(width, np.abs(centre - self.parameters.now))
         self.parameters.low[:] = 0.0
 
     def residuals(self, vector: np.ndarray) -> np.ndarray:
         of, true = (np.exp(-3 * max(x, 0)) for x in (vector[0], 0.1))
-        prior = (vector[0] - self.parameters.centre[0]) / self.parameters.widths[0]
+        prior = (vector[0] - self.centre) / self.parameters.widths[0]
         return np.array([(of - true) / 0.01, prior])
 
     def jacobian(self, vector: np.ndarray, residuals: np.ndarray) -> np.ndarray:

@@ -66,6 +66,8 @@ class JointParameters:
         known = priors(physics.of(chosen), given)
         self.centre = np.concatenate([self.chain.centre, [p.centre for p in known]])
         self.widths = np.concatenate([self.chain.widths, [p.width for p in known]])
+        # a prior may lie far from what was simulated, and its centre must be reached
+        self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
         self.steps = np.concatenate([self.chain.steps, [FINITE * n.reach for n in chosen]])
         self.names = (
             *self.chain.by_name(self.chain.vector()),

@@ -23,13 +23,10 @@ UPDATES = 2  # steps with derivatives that were only updated
 
 
 class Unknowns(Protocol):
-    """Free parameters as a vector, with the centres and widths of their priors and bounds.
+    """Free parameters as a vector, with widths of priors, longest steps, and bounds."""
 
-    No step of a parameter is longer than its width or its distance from its centre.
-    """
-
-    centre: Values
     widths: Values
+    longest: Values
     low: Values
     high: Values
 
@@ -144,7 +141,7 @@ def _step(
 ) -> tuple[Values, Values, float] | None:
     """A step that lowers the cost, what is left after it, and the next damping."""
     parameters, cost = problem.parameters, residuals @ residuals
-    longest = np.maximum(parameters.widths, np.abs(parameters.centre - vector))
+    longest = parameters.longest
     curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
     for _ in range(TRIES):
         scaled = curvature + damping * np.diag(curvature.diagonal())

@@ -43,6 +43,7 @@ class Parameters:
         self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
         if response.decay_known is not None:
             self.widths[self.labels.index("log_decay_us")] = response.decay_known
+        self.longest = self.widths
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
         times = [label.startswith("log") for label in self.labels]
