@@ -69,5 +69,5 @@ def test_it_learns_to_tell_slow_from_fast_edges():
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    assert (network.probability(draw(2.0)) > 0.5).float().mean() > 0.9
-    assert (network.probability(draw(2.4)) < 0.5).float().mean() > 0.9
+    assert (network(draw(2.0)) > 0).float().mean() > 0.9
+    assert (network(draw(2.4)) < 0).float().mean() > 0.9

@@ -145,9 +145,3 @@ def test_no_sample_is_lost_in_a_step():
     x = pulses(2).requires_grad_()
     network(x).sum().backward()
     assert bool((x.grad != 0).all())
-
-
-def test_probability_is_the_sigmoid_of_the_logits():
-    network = GruDiscriminator(config()).eval()
-    expected = 1 / (1 + torch.exp(-network(pulses())))
-    assert torch.allclose(network.probability(pulses()), expected)

@@ -125,7 +125,7 @@ def test_while_judging_only_the_norm_is_in_evaluation(tiny, batches):
     step = make_step(tiny("training.discriminator_interval=2"))
     modes: list[tuple[bool, bool]] = []
     judge = step.model.discriminator_data
-    judge.register_forward_hook(
+    judge.norm.register_forward_hook(
         lambda *_: modes.append((judge.gru.training, judge.norm.training))
     )
     step(0, *batches)
@@ -222,7 +222,7 @@ def test_the_gradient_penalty_by_finite_differences(tiny, batches):
     assert float(penalty.detach()) == pytest.approx(0.7 * squares / 4, rel=1e-3)
 
 
-def test_judges_see_the_instance_noise_and_it_fades(tiny, batches):
+def test_judges_see_the_instance_noise_and_it_fades(tiny, batches, monkeypatch):
     sim, data = batches
     recipe = tiny(
         "training.instance_noise=0.3",
@@ -233,7 +233,13 @@ def test_judges_see_the_instance_noise_and_it_fades(tiny, batches):
     step = make_step(recipe)
     seen: list[Tensor] = []
     judge = step.model.discriminator_data
-    judge.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].detach()))
+    read = judge.read
+
+    def noted(pulses: Tensor) -> Tensor:
+        seen.append(pulses.detach())
+        return read(pulses)
+
+    monkeypatch.setattr(judge, "read", noted)
     for iteration in range(10):
         seen.clear()
         step(iteration, sim, data)

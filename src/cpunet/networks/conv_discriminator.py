@@ -41,9 +41,5 @@ class ConvDiscriminator(nn.Module):
         logits = self.outlet(x.mean(dim=2))
         return logits[:, 0]  # type: ignore[no-any-return]
 
-    def probability(self, pulses: Tensor) -> Tensor:
-        """Probability of being real, in [0, 1], shape (batch,)."""
-        return torch.sigmoid(self(pulses))
-
     def fix_statistics(self) -> None:
         """Nothing here depends on the batch."""

@@ -55,7 +55,7 @@ class InterpolatedEmbedding(nn.Module):
 class GruDiscriminator(nn.Module):
     """Say how measured (or simulated) a pulse looks.
 
-    `forward` gives logits; `probability` their sigmoid.
+    `forward` gives logits: the log of the odds that a pulse is real.
 
     The batch norm on the context uses the statistics of the batch in training
     mode: give it real and translated pulses in one batch then, or the difference
@@ -104,10 +104,6 @@ class GruDiscriminator(nn.Module):
             return (x - low) / (high - low)
         least, most = x.amin(dim=1, keepdim=True), x.amax(dim=1, keepdim=True)
         return (x - least) / (most - least).clamp(min=torch.finfo(x.dtype).eps)
-
-    def probability(self, pulses: Tensor) -> Tensor:
-        """Probability of being real, in [0, 1], shape (batch,)."""
-        return torch.sigmoid(self(pulses))
 
     def fix_statistics(self) -> None:
         """Judge by the running statistics until the next ``train()``."""

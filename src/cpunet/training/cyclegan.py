@@ -23,7 +23,7 @@ from cpunet.training.chain_step import ChainStep
 from cpunet.training.compared import Compared, Judged
 from cpunet.training.fast_step import (
     fast_translations,
-    judge_together,
+    logits,
     plain_translations,
 )
 from cpunet.training.generator_pass import generator_pass
@@ -193,10 +193,8 @@ class Step:
         """Return the six losses of the generators and what each discriminator is shown."""
         model, weights = self.model, self.weights
         done = self._compared(sim, data, rows)
-        judged_data, judged_sim = self._judged(
-            (model.discriminator_data, self._noisy(done.judged_data.fake)),
-            (model.discriminator_sim, self._noisy(done.judged_sim.fake)),
-        )
+        judged_data = logits(model.discriminator_data, self._noisy(done.judged_data.fake))
+        judged_sim = logits(model.discriminator_sim, self._noisy(done.judged_sim.fake))
         losses = {
             "identity_data": weighted_l1(*done.identity_data, weights),
             "identity_sim": weighted_l1(*done.identity_sim, weights),
@@ -229,13 +227,6 @@ class Step:
             Judged(sim, done.fake_sim),
             noise,
         )
-
-    def _judged(self, *pairs: tuple[Discriminator, Tensor]) -> list[Tensor]:
-        """Logits of the pulses of each discriminator."""
-        grus = [(n, pulses) for n, pulses in pairs if isinstance(n, GruDiscriminator)]
-        if self.fast and len(grus) == len(pairs):
-            return judge_together(*grus)
-        return [network(pulses) for network, pulses in pairs]
 
     def total(self, losses: dict[str, Tensor]) -> Tensor:
         """Weighted sum of the generators' six losses."""
@@ -277,14 +268,14 @@ class Step:
         weight = self.config.losses.gradient_penalty
         # one batch: the norm inside must see both kinds at once
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
-        # cuDNN's GRU has no second derivative
+        # neither cuDNN's GRU nor the quick one has a second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
-            (logits,) = self._judged((network, pulses)) if not weight else (network(pulses),)
-        loss = real_loss(logits[: len(real)]) + fake_loss(logits[len(real) :])
-        self._right = torch.cat([logits[: len(real)] > 0, logits[len(real) :] < 0])
+            found = network(pulses) if weight else logits(network, pulses)
+        loss = real_loss(found[: len(real)]) + fake_loss(found[len(real) :])
+        self._right = torch.cat([found[: len(real)] > 0, found[len(real) :] < 0])
         if not weight:
             return loss, torch.zeros_like(loss)
-        (slope,) = torch.autograd.grad(logits.sum(), pulses, create_graph=True)
+        (slope,) = torch.autograd.grad(found.sum(), pulses, create_graph=True)
         return loss, weight * slope.square().sum(dim=(1, 2)).mean()
 
     def _update_discriminators(self, judged: dict[str, Judged]) -> dict[str, Tensor]:

@@ -2,18 +2,19 @@
 
 On a CPU, convolutions take most of a step, and the discriminators' GRUs most of the rest.  The
 passes of each generator that need not wait for each other go through together, each with its
-own batch statistics, by way of `cpunet.networks.time_major`; both discriminators' GRUs walk
-together (`cpunet.networks.gru_chains`).  On a GPU, cuDNN does better.
+own batch statistics, by way of `cpunet.networks.time_major`; the steps of a GRU are one
+compiled loop (`cpunet.networks.gru_walk`).  On a GPU, cuDNN does better.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-from cpunet.networks.gru_chains import run_together
 from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.gru_walk import walk
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.time_major import translate
 from cpunet.training.generator_pass import Pass
@@ -48,10 +49,10 @@ def fast_translations(
     return Translations(fake_data, fake_sim, same_data, same_sim, cycled_sim, cycled_data)
 
 
-def judge_together(*pairs: tuple[GruDiscriminator, Tensor]) -> list[Tensor]:
-    """Logits of the pulses of each discriminator; they have no second derivative."""
-    read = [network.read(pulses) for network, pulses in pairs]
-    results = run_together([network.gru for network, _ in pairs], read)
-    return [
-        network.judged(*result) for (network, _), result in zip(pairs, results, strict=True)
-    ]
+def logits(network: nn.Module, pulses: Tensor) -> Tensor:
+    """Logits of a discriminator for pulses; they may have no second derivative."""
+    quick = pulses.device.type == "cpu" and pulses.dtype == torch.float32
+    if quick and isinstance(network, GruDiscriminator):
+        return network.judged(*walk(network.gru, network.read(pulses)))
+    result: Tensor = network(pulses)
+    return result
