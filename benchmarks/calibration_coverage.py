@@ -51,7 +51,8 @@ def pulls_figure(pulls: dict[str, np.ndarray]) -> Figure:
         panel.set_xlabel(f"pull of {titled(name, units=False)}")
         panel.set_ylabel("experiments")
         panel.set_title(f"{values.mean():+.2f}, width {values.std(ddof=1):.2f}")
-    figure.axes[0].legend()
+        panel.margins(y=0.35)  # room for the legend
+    figure.axes[0].legend(loc="upper left", ncols=2)
     return figure
 
 
