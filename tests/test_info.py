@@ -16,7 +16,7 @@ import pytest
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info import describe
-from cpunet.jobs.inspection.trace_properties import trace_properties
+from cpunet.jobs.inspection.trace_properties import _last_below, trace_properties
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
@@ -236,6 +236,11 @@ def test_the_properties_are_those_that_were_made():
     assert told["saturated_percent"] == pytest.approx(5)
     with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
         trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
+
+
+def test_a_pulse_that_is_never_below_a_level():
+    pulses = np.array([[0, 1, 3, 2], [2, 2, 3, 2]], np.float32)
+    assert _last_below(pulses, np.array([2, 2]), np.array([1.5, 1.5])).tolist() == [2, 0]
 
 
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):

@@ -119,10 +119,12 @@ def test_swapped_sides(sides, check):
 def test_another_period(sides, check):
     sim = sides.write_sim()
     other = sides.write_data("other", dt_ns=10.0)
-    told = first(check(sim, other))
+    done = check(sim, other)
+    told = first(done)
     assert "sampled every 16 ns" in told
     assert "every 10 ns" in told
     assert "resample" in told
+    assert "ok" not in done.out  # nor that the sampling is fine
 
 
 def test_another_detector(sides, check):

@@ -1,4 +1,4 @@
-"""``cpunet ensemble`` on the command line, stopped and gone on with."""
+"""``cpunet ensemble`` on the command line, stopped and resumed."""
 
 from __future__ import annotations
 

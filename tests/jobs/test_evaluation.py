@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.drawings import drawings, figure_names
 from cpunet.jobs.validation.energy_ranges import validation_selection
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
-from cpunet.jobs.validation.figure_store import read_drawings, write_drawings
+from cpunet.jobs.validation.figure_store import made_of, read_drawings, write_drawings
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
@@ -173,6 +174,17 @@ def test_figures_are_the_same_when_they_were_stored(whole, tmp_path) -> None:
             assert len(axes.lines) == len(others.lines)
             for line, other in zip(axes.lines, others.lines, strict=True):
                 np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
+
+
+def test_figures_of_other_choices_are_not_those_stored(run, files) -> None:
+    choices = [
+        ValidateOptions(),
+        ValidateOptions(most=7),
+        ValidateOptions(ae_range_kev=(9, 20)),
+    ]
+    made = [made_of(run, files["sim"], files["data"], how) for how in choices]
+    assert made[0] not in made[1:]
+    assert json.loads(json.dumps(made)) == made
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04"])

@@ -192,6 +192,19 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
         expand_library(tmp_path / "whole.lh5", tmp_path / "x.lh5")
 
 
+def test_components_of_a_detector_are_its_own(
+    chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cpunet.jobs.translation.simflow_library.MOST", 20)
+    source = write(tmp_path / "ideal.lh5", charge())
+    alone = translate_for_simflow(chain, source, tmp_path / "alone.lh5", rank=8)
+    with h5py.File(source, "a") as file:
+        for name in ("V02", "V03", "V04"):
+            file.copy("V01", name)
+    beside = translate_for_simflow(chain, source, tmp_path / "beside.lh5", rank=8)
+    assert beside["V01"]["loss"] == alone["V01"]["loss"]
+
+
 def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
     other = write(tmp_path / "ideal.lh5", charge(), "B02")
     for source, name in ((ideal, "v.lh5"), (other, "b.lh5")):

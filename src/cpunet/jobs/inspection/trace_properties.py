@@ -15,18 +15,18 @@ from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from cpunet.recipes.schema import Recipe
 
-BLOCKS, BLOCK = 4, 1024  # traces that are looked at: a few thousand tell all of this
-START = 0.01  # of the height: the pulse has begun
-START_SIGMAS = 5.0  # of the noise, where that is more
-MIN_BASELINE = 16  # samples from which noise can be told
-MIN_NUMBER = 10  # traces
-SHORTEST = 0.05  # share of the traces whose baseline may be shorter than is told
+BLOCKS, BLOCK = 4, 1024  # number of blocks, traces per block: a few thousand are enough
+START = 0.01  # share of the height at which a pulse begins
+START_SIGMAS = 5.0  # the same in standard deviations of the noise, if that is more
+MIN_BASELINE = 16  # minimum number of samples to estimate the noise
+MIN_NUMBER = 10  # minimum number of traces
+SHORTEST = 0.05  # share of the traces whose baseline may be shorter than reported
 
 Values = npt.NDArray[np.float64]
 
 
 def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]:
-    """Describe what a digitiser recorded.
+    """Describe the traces of a digitiser.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
     Raises
     ------
     CpunetError
-        If too few traces hold a pulse.
+        If too few traces contain a pulse.
     """
     seen = list(islice(blocks, BLOCKS))
     found = [_edges(block) for block in seen]
@@ -105,4 +105,5 @@ def _last_below(
     """Number of samples up to the last one below a level before the maximum."""
     below = waveforms < level[:, np.newaxis]
     below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
-    return np.asarray(waveforms.shape[1] - below[:, ::-1].argmax(axis=1))
+    samples = waveforms.shape[1] - below[:, ::-1].argmax(axis=1)
+    return np.where(below.any(axis=1), samples, 0)

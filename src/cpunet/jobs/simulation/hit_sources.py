@@ -1,8 +1,7 @@
-"""Where a simulation's hits come from, block by block: a file, or the gamma Monte Carlo."""
+"""Sources of hits, read block by block: a file or the gamma Monte Carlo."""
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.pool import cores
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
@@ -22,14 +22,14 @@ from cpunet.simulation.hit_readers.steps import require_some
 from cpunet.simulation.hits import Hits
 
 BLOCK_EVENTS = 2000
-# Events of one round of the Monte Carlo, and gammas tried for each before it gives up: the
-# rarest windows, 1 keV of the continuum, take some ten thousand.
+# Events per round of the Monte Carlo, and maximum number of gammas per event; the rarest
+# windows, 1 keV of the continuum, need about ten thousand.
 _ROUND_EVENTS = 1000
 _GAMMAS_PER_EVENT = 100_000
-# Each round under way holds some ten MB of hits.
+# Each running round holds about ten MB of hits.
 _MAX_WORKERS = 8
-# Shares of hits outside the crystal: up to the first, rounding at its surface may be the
-# reason; beyond the second, these are no hits of this detector.
+# Shares of hits outside the crystal: up to the first, rounding at its surface can be the
+# reason; above the second, the hits are not those of this detector.
 _STRAY, _MISPLACED = 1e-3, 0.9
 
 
@@ -51,9 +51,9 @@ def energy_windows(
     text
         Names and ranges, separated by commas.
     peaks
-        The lines known.
+        Known gamma lines.
     half_width_kev
-        Of the windows about the lines.
+        Half-width of the windows around the lines.
 
     Raises
     ------
@@ -83,8 +83,8 @@ def energy_windows(
 class HitFile:
     """Hits of a file, see `cpunet.simulation.hit_readers.read_hits`.
 
-    With `windows`, only events whose deposits add up to an energy in one of them.  If they are
-    `placed`, it was looked at already whether they lie in the crystal.
+    With `windows`, only events with a deposited energy in one of them are used.  `placed` hits
+    have been checked against the crystal and are not checked again.
     """
 
     path: Path
@@ -101,8 +101,8 @@ class HitFile:
         Raises
         ------
         CpunetError
-            As `read_hits`; also if no event is in a window, or nearly no hit in the
-            crystal.
+            If the hits cannot be read, no event is in a window, or nearly all hits are outside
+            the crystal.
         """
         parts = hit_parts(
             self.path,
@@ -130,7 +130,7 @@ class HitFile:
         return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
 
     def provenance(self) -> dict[str, Any]:
-        """Description of the hits, for the output."""
+        """Provenance of the hits, for the output."""
         return {
             "file": str(self.path),
             "table": self.table,
@@ -160,7 +160,7 @@ class _Astray:
                 self.spans[axis] = min(low, values.min()), max(high, values.max())
 
     def told(self, path: Path) -> str:
-        """What there is to say of them; refused if nearly all are outside."""
+        """Return a warning, or an empty text; raise an error if nearly all hits are outside."""
         n, total, detector = self.outside, self.total, self.detector
         if n <= _STRAY * total:
             return ""
@@ -180,7 +180,7 @@ class _Astray:
 
 
 def _regrouped(parts: Iterator[Hits], size: int) -> Iterator[Hits]:
-    """The same events in blocks of `size`, wherever the parts end; the last one is shorter."""
+    """The same events in blocks of `size`; the last block can be shorter."""
     left: Hits | None = None
     for part in parts:
         hits = part if left is None else Hits.concatenate([left, part])
@@ -194,9 +194,9 @@ def _regrouped(parts: Iterator[Hits], size: int) -> Iterator[Hits]:
 
 @dataclass(frozen=True)
 class GammaSource:
-    """Events of the built-in Monte Carlo: so many in each window of energy.
+    """Events of the built-in Monte Carlo, a given number in each energy window.
 
-    A disc of `radius_mm` lies `height_mm` above the crystal's top, see
+    The source is a disc of radius `radius_mm`, `height_mm` above the top of the crystal, see
     `cpunet.simulation.gammas.simulate_gammas`.
     """
 
@@ -212,7 +212,7 @@ class GammaSource:
         Raises
         ------
         CpunetError
-            If no event is wanted; later as `simulate_gammas`.
+            If no event is requested; during iteration, if `simulate_gammas` fails.
         """
         total = sum(self.events)
         if total < 1:
@@ -220,7 +220,7 @@ class GammaSource:
         return OpenHits(total, self._blocks(detector, -(-total // _ROUND_EVENTS)))
 
     def provenance(self) -> dict[str, Any]:
-        """Description of the hits, for the output."""
+        """Provenance of the hits, for the output."""
         return {
             "monte_carlo": "Tl-208, 2614.511 keV",
             "windows_kev": _by_name(self.windows),
@@ -231,12 +231,12 @@ class GammaSource:
         }
 
     def _blocks(self, detector: Detector, rounds: int) -> Iterator[Hits]:
-        """Rounds in parallel, in their order; as many ahead as there are cores.
+        """Run rounds in parallel, at most one per core, and yield their hits in order.
 
-        Each round has a seed of its own, so that the events do not depend on the cores.
+        Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
-        workers = min(len(os.sched_getaffinity(0)), _MAX_WORKERS, rounds)
+        workers = min(cores(), _MAX_WORKERS, rounds)
         waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0
@@ -270,7 +270,7 @@ class GammaSource:
 
 @dataclass(frozen=True, eq=False)
 class OpenHits:
-    """The number of events, the events in blocks, to be taken once, and a warning if any."""
+    """Number of events, a single-use iterator over blocks of them, and a warning or ``""``."""
 
     n_events: int
     blocks: Iterator[Hits]
@@ -281,7 +281,7 @@ HitSource = HitFile | GammaSource
 
 
 def _in_windows(energy_kev: Any, windows: tuple[Window, ...]) -> Any:
-    # deposits add up to a line only within rounding, as float32 of some formats
+    # sums of deposits are rounded, in some formats to float32; windows are wider than that
     inside = [(energy_kev >= w.low_kev) & (energy_kev <= w.high_kev) for w in windows]
     return np.logical_or.reduce(inside)
 

@@ -1,9 +1,9 @@
-"""Can these two sets of pulses be compared? What a training would trip over, found before it.
+"""Check before a training whether two sets of pulses can be compared.
 
 A training on the wrong energies, on another detector's simulation or on two sampling periods
-fails late or, worse, ends in a poor fit.  Each of these is told by something that no readout
+fails late or, worse, ends in a poor fit.  Such problems appear in quantities that no readout
 changes: energies, counts, sampling, the spread of drift times (a readout delays all pulses
-alike), and current amplitudes (a readout only makes pulses slower).
+equally), and current amplitudes (a readout only makes pulses slower).
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes.schema import Recipe
 
-MIN_N, FEW = 200, 1000  # pulses of a side: below, a fit is refused or knows little
-# Ratios beyond which the detector is another one, by more than a calibration of it finds
+MIN_N, FEW = 200, 1000  # pulses per side needed for a fit, and for a precise one
+# Ratios beyond which the detectors differ by more than a calibration can correct
 SPREAD_RATIO, SHARPER = 1.2, 1.08
-# Differences that rounding to a sampling period and, in standard deviations, chance make; these
-# are told by so many parts of the pulses.
+# Differences due to rounding, in sampling periods, and to chance, in standard deviations; and
+# number of parts of the pulses from which the latter are estimated.
 ROUNDING, SURE, PARTS = 2.0, 4.0, 8
-LOST = 0.1  # share of the selected pulses that are left out for one reason
-LOOKED_AT = 2000  # pulses of a side
-RISES = (0.1, 0.5)  # of the height: a readout delays the time between by the same for all
-OFF_LINE = 1.5  # keV
+LOST = 0.1  # share of the selected pulses left out for one reason that causes a warning
+LOOKED_AT = 2000  # maximum number of pulses per side for shapes
+RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
+OFF_LINE = 1.5  # keV, maximum deviation of a line
 DPI = 150
 
 
@@ -58,12 +58,12 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was looked at.
+    """Result of a check.
 
     Parameters
     ----------
     what
-        In two words.
+        What was checked, in two words.
     level
         How bad it is.
     text
@@ -83,7 +83,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Findings, and the pulses that they are of, if those could be prepared."""
+    """Findings, and the prepared pulses of both sides if these could be read."""
 
     findings: list[Finding]
     sides: dict[str, InputSet] = field(default_factory=dict)
@@ -95,7 +95,7 @@ class Checked:
 
     @property
     def level(self) -> Level:
-        """The worst."""
+        """Level of the worst finding."""
         levels = {finding.level for finding in self.findings}
         return max(levels, key=list(Level).index, default=Level.FINE)
 
@@ -103,16 +103,16 @@ class Checked:
 def check(
     sim: InputFile, data: InputFile, recipe: Recipe, peak: str, monitor: Monitor
 ) -> Checked:
-    """Look at both sides as a training would read them.
+    """Read both sides as in a training, and check them.
 
     Parameters
     ----------
     sim, data
         Simulated and measured pulses.
     recipe
-        How they are prepared and cut.
+        Recipe with preparation and cuts.
     peak
-        Energies, as of a training.
+        Energies, as for a training.
     monitor
         Receiver of the progress.
 
@@ -142,14 +142,14 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
     Raises
     ------
     CpunetError
-        If the picture exists, or is of no known format.
+        If the picture exists or has an unknown format.
     """
     from cpunet.analysis.sides_figure import sides_figure
 
     if picture.suffix.lower() not in PICTURE_FORMATS:
         raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
     refuse_existing(picture, force=force)
-    names = {"data": "data", "raw": "sim"}  # of the figures' sides, the measured one first
+    names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
     sides = {name: checked.sides[side] for name, side in names.items()}
     figure = sides_figure(
         {name: _of_height_one(one) for name, one in sides.items()},
@@ -164,27 +164,27 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
 
 
 class _ProgressOnly(Monitor):
-    """Tells of progress; what is to be noted becomes a finding."""
+    """Passes on progress but not notes, since problems become findings."""
 
     def __init__(self, monitor: Monitor) -> None:
         self._monitor = monitor
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """As told to another."""
+        """Pass on a stage."""
         with self._monitor.stage(title, total) as advance:
             yield advance
 
 
 def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[Finding]:
-    """What two prepared sets have in common, and what not."""
+    """Compare two prepared sets."""
     findings = [*_required(sim, data, selection)]
     if any(finding.level == Level.ERROR for finding in findings):
         return findings
     for one, side in ((sim, "simulated"), (data, "measured")):
         findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
     if min(len(sim.prepared), len(data.prepared)) < MIN_N:
-        return findings  # the shapes of so few say nothing
+        return findings  # too few to compare shapes
     findings.append(_spread(sim, data))
     findings.append(_amplitude(sim, data))
     return findings
@@ -196,7 +196,7 @@ def _refusal(side: str, message: str) -> Finding:
 
 
 def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
-    """What a training refuses."""
+    """Check the conditions without which a training raises an error."""
     asked: tuple[tuple[str, Callable[[], object]], ...] = (
         ("sampling", lambda: require_same_sampling(sim, data)),
         ("energies", lambda: require_both_sides(sim, data, selection)),
@@ -206,7 +206,9 @@ def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iter
             require()
         except CpunetError as error:
             yield replace(_refusal("", str(error)), what=what)
-    yield Finding("sampling", Level.FINE, f"every {data.dt_ns:g} ns")
+        else:
+            if what == "sampling":
+                yield Finding(what, Level.FINE, f"every {data.dt_ns:g} ns")
 
 
 def _count(one: InputSet, side: str) -> Finding:
@@ -236,7 +238,7 @@ REMEDIES = {
 
 
 def _left_out(one: InputSet, side: str) -> Iterator[Finding]:
-    """Reasons that take away a good part of the selected pulses."""
+    """Warn of reasons for which a large share of the selected pulses is left out."""
     counts = dict(one.prepared.rejections)
     for reason in (Rejection.ENERGY_OUTSIDE_SELECTION, Rejection.ENERGY_UNKNOWN):
         counts.pop(reason.label, None)
@@ -249,8 +251,8 @@ def _left_out(one: InputSet, side: str) -> Iterator[Finding]:
 
 
 def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
-    """Whether a line is where it should be."""
-    # the highest one has no others beside it
+    """Check the position of the highest gamma line."""
+    # the highest line has no neighbours
     highest = sorted(selection.peaks.items(), key=lambda item: item[1].energy_kev)[-1:]
     for name, line in highest:
         found = line_near(one.energies_kev, line.energy_kev)
@@ -271,7 +273,7 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
-    """Drift times: how far apart the fast and the slow pulses are."""
+    """Compare the spreads of the drift times."""
     rises = [_rise_ns(one) for one in (sim, data)]
     ranges = [_range(rise) for rise in rises]
     errors = [
@@ -292,7 +294,7 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
 
 
 def _amplitude(sim: InputSet, data: InputSet) -> Finding:
-    """Current amplitudes: a readout makes no pulse sharper."""
+    """Compare the current amplitudes, which no readout increases."""
     highest = [float(np.nanquantile(_amplitudes(one), 0.9)) for one in (sim, data)]
     ratio = highest[1] / highest[0]
     text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
@@ -313,7 +315,7 @@ def _some(one: InputSet) -> Pulses:
 
 
 def _of_height_one(one: InputSet) -> FloatArray:
-    """Some pulses: where decays are prepared to end below one, both sides are as high."""
+    """Some pulses scaled to height 1, whatever the level of their prepared tails."""
     waveforms = _some(one).waveforms
     return np.asarray(waveforms / waveforms.max(axis=1, keepdims=True), np.float32)
 
@@ -323,17 +325,18 @@ def _amplitudes(one: InputSet) -> Values:
 
 
 def _rise_ns(one: InputSet) -> Values:
-    """Time between two fractions of the height, of the first crossings from below."""
+    """Time between the last samples below two fractions of the height before the maximum."""
     waveforms = _of_height_one(one)
     begin, end = (_last_below(waveforms, fraction) for fraction in RISES)
     return np.asarray((end - begin) * one.dt_ns, float)
 
 
 def _last_below(waveforms: FloatArray, level: float) -> Values:
-    """Sample after which each pulse stays above a level until its maximum."""
+    """Last sample below a level before each pulse's maximum; the first if there is none."""
     last = waveforms.argmax(axis=1)
     below = (waveforms < level) & (np.arange(waveforms.shape[1]) < last[:, np.newaxis])
-    return np.asarray(waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1), float)
+    at = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    return np.where(below.any(axis=1), at, 0).astype(float)
 
 
 def _range(values: Values) -> float:

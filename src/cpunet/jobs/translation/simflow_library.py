@@ -1,4 +1,4 @@
-"""A library of ideal charge pulses in, the realistic one of currents that reboost reads out.
+"""Translate libraries of ideal charge pulses to realistic ones of currents for reboost.
 
 The layout is that of LEGEND's production (legend-simflow): per detector a ``struct{r, z, dt,
 t0, waveform_000_deg, drift_time_000_deg, ...}`` of currents in units of the most frequent A/E.
@@ -45,9 +45,9 @@ from cpunet.translation.ring_padding import RINGS, continued, with_rings
 from cpunet.translation.translator import REN
 
 QUIET = Monitor()
-ROWS = 16  # of r that are translated at once
-STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of the step of charge that tells the chain's delay
-# A template of charge ends near its highest value; one of current, or aligned at it, does not.
+ROWS = 16  # rows of r translated at a time
+STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
+# Templates of charge end near their maximum; templates of current do not.
 MIN_END = 0.5
 
 Floats = npt.NDArray[np.float32]
@@ -65,14 +65,13 @@ def translate_for_simflow(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Translate libraries of ideal charge pulses into what LEGEND's production reads.
+    """Translate libraries of ideal charge pulses to the format of LEGEND's production.
 
-    Each template is put behind the learned electronics without noise, differentiated, averaged
-    three times over 48 ns and moved to have its maximum at sample 1,000 of 4,001; all are
-    divided by the mode of A/E over the library, written as float32, with the times of the
-    maxima, less the delay of the electronics alone, as ``drift_time_*_deg``.  Around the
-    crystal stand rings of nodes: their currents are means of their neighbours', drift times go
-    on as they did before.
+    Each template is translated without noise, differentiated, averaged three times over 48 ns
+    and shifted so that its maximum is at sample 1,000 of 4,001.  All are divided by the mode of
+    A/E of the library and written as float32.  ``drift_time_*_deg`` are the times of the maxima
+    minus that of a step of charge at time 0.  The grid is padded around the crystal: currents
+    there are means of their neighbours, and drift times are extrapolated linearly.
 
     Parameters
     ----------
@@ -83,27 +82,28 @@ def translate_for_simflow(
     out
         LH5 file to write.
     detectors
-        Names of the libraries to translate; by default the one of the detector that the run
-        was trained with, or all if the run does not tell it.
+        Names of the libraries to translate; by default that of the detector that the run was
+        trained with, or all if this is unknown.
     rings
-        Of nodes beyond the crystal.
+        Number of rings of padding around the crystal.
     rank
-        Write this many components and the coefficients of each node in place of templates; see
-        `cpunet.jobs.translation.simflow_files.read_library`.
+        Number of components to write, with the coefficients of each grid point, instead of
+        templates; see `cpunet.jobs.translation.simflow_files.read_library`.
     device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
-        By name of the library ``templates`` (places times angles), ``translated``,
-        ``padded``, ``healed`` (single places inside the crystal that had none),
-        ``mode_per_ns`` (A/E that currents are divided by), and ``loss`` of the components.
+        By name of the library: ``templates`` (grid points times angles), ``translated``,
+        ``padded``, ``healed`` (filled grid points inside the crystal that had no template),
+        ``mode_per_ns`` (A/E by which currents are divided), and ``loss`` of the components.
 
     Raises
     ------
     CpunetError
-        If the file holds no such library, or it is damaged, of another detector or sampling.
+        If the file contains no such library, or it is damaged, of another detector or
+        sampling period.
     """
     refuse_existing(out, run, source, force=force)
     if not 0 <= rings <= 100:
@@ -117,11 +117,12 @@ def translate_for_simflow(
         require_whole(given, source, set())
         names = chosen_libraries(given, source, detectors, known_detector(run, info))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
-        total = sum(n_templates(given, one.path, source) for one in ideal)
+        for library in ideal:
+            n_templates(given, library.path, source)  # raises an error if damaged
         made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
-                looked = _look(ren, library, given[library.path], source, total, monitor)
+                looked = _look(ren, library, given[library.path], source, monitor)
                 group = made.h5.create_group(library.path)
                 job = _Writing(looked, library, rings, rank)
                 told[library.path] = job.write(given[library.path], group, made_from, monitor)
@@ -130,7 +131,7 @@ def translate_for_simflow(
 
 @dataclass(eq=False)
 class _Looked:
-    """What was seen of all templates of a library, and the means to translate them."""
+    """Results of a first pass over all templates of a library, and their translator."""
 
     translate: TemplateTranslator
     delay_ns: float
@@ -144,16 +145,15 @@ def _look(
     library: IdealLibrary,
     given: h5py.Group,
     source: Path,
-    total: int,
     monitor: Monitor,
 ) -> _Looked:
-    """Translate all for their A/E alone: its mode is wanted before any is written."""
+    """First pass over all templates, to find the mode of A/E before any is written."""
     translate = TemplateTranslator(ren, library.dt_ns)
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
     _, delay = currents_about_peak(translate(step)[0])
     rng = np.random.default_rng(0)
-    share = min(1.0, 2 * MOST / max(total, 1))
+    share = min(1.0, 2 * MOST / max(library.n_templates, 1))
     amplitudes, kept, inside = [], [], {}
     moving = not_ending = 0
     with monitor.stage(f"A/E of {library.path}", library.n_templates) as advance:
@@ -196,7 +196,7 @@ def _look(
 
 @dataclass(frozen=True, eq=False)
 class _Writing:
-    """How one library is written."""
+    """Second pass, which writes one library."""
 
     looked: _Looked
     library: IdealLibrary
@@ -248,7 +248,7 @@ class _Writing:
         rings, looked = self.rings, self.looked
         for first in range(0, n_r + rings, ROWS):
             last = min(first + ROWS, n_r + rings)
-            # what a node becomes depends on rows no further away than the rings
+            # a padded grid point depends only on rows at most `rings` away
             low, high = max(0, first - rings), min(last + rings, n_r)
             shape = (last + rings - low, n_z + 2 * rings)
             currents = np.full((*shape, LENGTH), np.nan, np.float32)
@@ -268,7 +268,7 @@ class _Writing:
 def _blocks(
     given: h5py.Dataset, library: IdealLibrary, source: Path
 ) -> Iterator[tuple[int, Floats]]:
-    """Rows of templates of charge; refuses those of which a part is NaN."""
+    """Rows of charge templates; raise an error if only a part of a template is NaN."""
     for first in range(0, given.shape[0], ROWS):
         values = np.asarray(given[first : first + ROWS], np.float32)
         bad = np.isnan(values)
@@ -285,14 +285,14 @@ def _blocks(
 
 
 def _charge(values: npt.NDArray[Any]) -> Floats:
-    """Templates as float32; those of nothing but zeros are none."""
+    """Templates as float32; those of only zeros become NaN."""
     charge = np.array(values, np.float32)
     charge[~charge.any(axis=2)] = np.nan
     return charge
 
 
 def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Places that have others on all four sides of them, however far."""
+    """Mask of grid points between others on all four sides, at any distance."""
     sides = [
         np.logical_or.accumulate(np.flip(mask, axis) if back else mask, axis)
         for axis in (0, 1)

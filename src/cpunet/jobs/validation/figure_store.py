@@ -33,6 +33,8 @@ def made_of(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) ->
         "truth": None if how.truth is None else source_print(InputFile(how.truth)),
         "rivals": how.baselines,
         "seed": how.seed,
+        "most": how.most,
+        "ae_range_kev": None if how.ae_range_kev is None else list(how.ae_range_kev),
     }
 
 
