@@ -74,7 +74,7 @@ def judged(case: Case, outcome: Outcome, before: dict, after: dict) -> list[str]
         faults.append("wrong success")
     if status and case.must_succeed:
         faults.append("wrong failure")
-    # what is gone on with is of the command's own making
+    # what is resumed is of the command's own making
     own = case.words[case.words.index("--out") + 1] if "--resume" in case.words else None
     changed = [name for name in before if after.get(name) != before[name]]
     changed = [name for name in changed if own is None or not name.startswith(own.rstrip("/"))]

@@ -1,4 +1,4 @@
-"""Many seeds of a recipe on one stand, a file of scores each: may be stopped and gone on with.
+"""Many seeds of a recipe on one stand, a file of scores each: can be stopped and resumed.
 
 Run with ``python benchmarks/seeds.py STAND FOLDER --recipe small --seeds 20``; a stand is a
 folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and perhaps truth.npz.  Seeds whose

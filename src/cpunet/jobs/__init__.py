@@ -1,1 +1,1 @@
-"""One function per command: files in, files out; by what is done with them."""
+"""One function per command, from input files to output files."""

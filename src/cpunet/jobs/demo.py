@@ -1,4 +1,4 @@
-"""The whole story on a stand with a known answer: stand, training, validation, report."""
+"""Demonstration on a test stand with known truth: stand, training, validation, report."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.simulation.geometry import Detector
 
 QUIET = Monitor()
-_PEAK = "FEP"  # to train on
-_HALF_WINDOW_KEV = 0.5  # of deposited energy about each line
+_PEAK = "FEP"  # peak of the training
+_HALF_WINDOW_KEV = 0.5  # half-width of the deposited energies around each line
 
 
 def demonstrate(
@@ -45,29 +45,29 @@ def demonstrate(
     Parameters
     ----------
     electronics, detector, kind
-        Of the stand, as for `cpunet.jobs.simulation.stand.make_stand`.
+        See `cpunet.jobs.simulation.stand.make_stand`.
     recipe
-        Of the training.
+        Recipe of the training.
     events
-        Wanted on either side, by line.
+        Number of events per side, by line.
     out
-        Folder of ``stand``, ``run`` and ``report``. Parts that are there from an
-        interrupted demonstration of the same options are kept.
+        Folder of ``stand``, ``run`` and ``report``. Parts of an interrupted demonstration
+        with the same options are kept.
     force
-        Make all parts anew.
+        Whether to make all parts again.
     seed, device, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
-        The content of the report's ``metrics.json``.
+        Content of the report's ``metrics.json``.
 
     Raises
     ------
     CpunetError
-        If the report exists, a part that is there was made with other options, a step
-        fails, or, with `force`, something else is in the place of a part.
+        If the report exists, an existing part was made with other options, a step fails, or,
+        with `force`, something else is in the place of a part.
     """
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is no folder; give another --out")
@@ -81,7 +81,7 @@ def demonstrate(
     if force:
         remove_parts(out, monitor.note)
     require_same_parts(out, plan, recipe, _PEAK)
-    # a folder of a part that is not there holds files of others only, which are kept
+    # the folder of a missing part can contain files of others, which are kept
     if not is_there(out, "stand"):
         write_stand(plan, stand, force=stand.exists(), monitor=monitor)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
@@ -95,7 +95,7 @@ def demonstrate(
                 _PEAK,
                 seed,
                 device,
-                # what was begun and not ended goes on, but for --force
+                # an unfinished training is resumed, except with --force
                 resume=isinstance(recipe.training, TrainingConfig) and not force,
                 force=force or run.exists(),
             ),

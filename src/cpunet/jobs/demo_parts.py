@@ -1,4 +1,4 @@
-"""Parts of an earlier demonstration: kept only if they are what would be made now."""
+"""Parts of an earlier demonstration, kept only if the current options agree with theirs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
 from cpunet.yaml_files import json_mapping
 
-# in the order they are made; and the file that each has when it is whole
+# parts in the order of creation, each with a file that exists when it is complete
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
 _WAY_OUT = "give --force to make all parts anew, or another --out"
 _NONE = "none"
@@ -24,22 +24,22 @@ _KINDS = {"stand": STAND, "run": RUN, "report": REPORT}
 
 
 def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) -> None:
-    """Refuse what was made otherwise, so that no report mixes two sets of options.
+    """Raise an error if a part was made with other options, so that no report mixes them.
 
     Parameters
     ----------
     out
-        Folder of the parts, of which any may be missing.
+        Folder of the parts; any of them may be missing.
     plan
-        Of the stand.
+        Plan of the stand.
     recipe, peak
-        Of the training; its seed is the stand's.
+        Recipe and peak of the training; its seed is that of the stand.
 
     Raises
     ------
     CpunetError
-        If a part was made otherwise (it names the first difference) or cannot be read,
-        or if the run's stand is gone.
+        If a part was made with other options (the message names the first difference) or
+        cannot be read, or if the run's stand is missing.
     """
     stand, run, _ = (out / part for part in PARTS)
     if is_there(out, "stand"):
@@ -58,25 +58,25 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
 
 
 def is_there(out: Path, part: str) -> bool:
-    """Whether a part is there, other than a folder of files that the program did not write."""
+    """Whether a part exists; a folder with only files of others does not count."""
     folder, kind = out / part, _KINDS[part]
     emptied = made_here(folder, kind) and not (folder / kind.known_by).exists()
     return folder.exists() and not emptied
 
 
 def remove_parts(out: Path, note: Note) -> None:
-    """Remove all parts, or none if anything else is in the place of one.
+    """Remove all parts, or none if something else is in the place of one.
 
-    What the program did not write there is kept, and told.
+    Files that the program did not write are kept and reported.
 
     Raises
     ------
     CpunetError
-        If a part's place holds something else, or a part cannot be removed.
+        If something else is in the place of a part, or a part cannot be removed.
     """
     for part, kind in _KINDS.items():
         require_replaceable(out / part, kind)
-    # the stand last: interrupted, no run is left without its stand
+    # the stand last, so that an interruption leaves no run without its stand
     for part in reversed(PARTS):
         folder = out / part
         try:
@@ -105,9 +105,9 @@ def _require_same(part: Path, made: Mapping[str, Any], wanted: Mapping[str, Any]
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values of a nest, as JSON writes them: ``noise.rms_kev``, ``2.5``."""
+    """Names and JSON values of nested mappings: ``noise.rms_kev``, ``2.5``."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{prefix}{name}.")
-        elif name != "description":  # which changes nothing
+        elif name != "description":  # has no effect
             yield f"{prefix}{name}", json.dumps(value, ensure_ascii=False)

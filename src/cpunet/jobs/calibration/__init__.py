@@ -1,1 +1,1 @@
-"""Joint calibration of detector and electronics, which gives a run and its detector."""
+"""Joint calibration of detector and electronics; its result is a run and a detector."""

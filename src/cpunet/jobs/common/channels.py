@@ -1,4 +1,4 @@
-"""The channels of a file one after another, each with an output of its own."""
+"""Process the channels of a file one by one, each with its own output."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Pair = tuple[InputFile, InputFile]
 
 
 def channel_names(tables: list[str]) -> dict[str, str]:
-    """Short name of each table: its path without what all have in common at their ends.
+    """Short name of each table: its path without the parts that all paths share at either end.
 
     Examples
     --------
@@ -73,8 +73,8 @@ def channels_of(file: InputFile) -> dict[str, InputFile]:
 def paired(sim: InputFile, data: InputFile) -> dict[str, Pair | CpunetError]:
     """The simulation and the data of each channel of the data.
 
-    One table of simulated pulses serves all channels; where ``"all"`` is given for it too,
-    channels of the same name belong together, and one without its simulation has the reason.
+    A single table of simulated pulses is used for all channels.  If its table is ``"all"`` too,
+    channels are matched by name; a channel without a simulation has an error instead.
     """
     measured = channels_of(data)
     if sim.table != ALL:
@@ -91,13 +91,13 @@ def paired(sim: InputFile, data: InputFile) -> dict[str, Pair | CpunetError]:
 
 @dataclass(frozen=True)
 class Outcome(Generic[R]):
-    """What became of each channel: a result, or the reason why there is none."""
+    """Outcome of each channel: a result, or the reason why there is none."""
 
     done: dict[str, R] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
 
     def require_all(self, out: Path) -> None:
-        """Raise a `CpunetError` that counts the channels that failed, if any did."""
+        """Raise a `CpunetError` with the number of failed channels, if any failed."""
         if not self.failed:
             return
         n = len(self.done) + len(self.failed)
@@ -115,21 +115,20 @@ def one_by_one(
     note: Callable[[str], None],
     ends: type[CpunetError] | tuple[type[CpunetError], ...] = (),
 ) -> Outcome[R]:
-    """Do something for each channel; one that fails does not keep the others from being done.
+    """Process each channel; a failed channel does not stop the others.
 
     Parameters
     ----------
     channels
         Result of `paired`.
     out
-        Folder of the outputs, made if it is not there; each is in a folder (or file) with the
-        name of its channel.
+        Folder of the outputs; each is a folder (or file) named after its channel.
     do
-        Takes the name of a channel, its two files and the path of its output.
+        Function called with the name of a channel, its two files and the path of its output.
     note
-        Told which channel is begun, and why one failed.
+        Receiver of the names of the channels and the reasons of failures.
     ends
-        Errors that end everything, such as a request to stop.
+        Errors that end the loop, such as a request to stop.
 
     Raises
     ------
@@ -157,7 +156,7 @@ def one_by_one(
 
 
 def own_folder(folder: Path, name: str, file: str) -> Path:
-    """The folder of a channel inside `folder`, if that is the folder of several.
+    """`folder` itself if it is the folder of a run, else the folder of the channel inside it.
 
     Parameters
     ----------
@@ -166,6 +165,6 @@ def own_folder(folder: Path, name: str, file: str) -> Path:
     name
         Short name of the channel.
     file
-        File by which the folder of a run is known, such as ``run.json``.
+        File that identifies the folder of a run, such as ``run.json``.
     """
     return folder if (folder / file).is_file() else folder / name

@@ -30,12 +30,12 @@ def enough_memory(remedy: str) -> Iterator[None]:
     Parameters
     ----------
     remedy
-        What to try.
+        Advice for the user.
     """
     try:
         yield
     except (torch.cuda.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        # the CPU allocator has no exception class of its own
+        # the CPU allocator has no exception class
         known = isinstance(error, torch.cuda.OutOfMemoryError | MemoryError)
         if not (known or "DefaultCPUAllocator" in str(error)):
             raise

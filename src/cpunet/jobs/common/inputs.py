@@ -95,7 +95,7 @@ class InputSet:
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `InputFile.options`; ``detector`` the name of the
-    simulated one, if the file contains it.
+    simulated detector, if the file contains it.
     """
 
     prepared: Prepared
@@ -248,7 +248,7 @@ def _load(
 
 
 def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:
-    """Range of the energies in the file, as a hint if none of them is selected."""
+    """Hint on the range of energies in the file if none of them is selected."""
     energies = np.concatenate(seen) if seen else np.empty(0)
     if not len(energies) or selection.select(energies).any():
         return ""
@@ -266,7 +266,7 @@ def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str
 
 
 def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
-    """The calibration suggested by lines in the amplitudes, if no energy is known."""
+    """Hint on the calibration from lines in the amplitudes, if no energy is known."""
     if any(map(len, seen)):
         return ""
     found = suggested_calibration(

@@ -1,8 +1,8 @@
-"""Threads of matrix products and decompositions, which NumPy and SciPy leave to OpenBLAS.
+"""Limit the OpenBLAS threads of matrix products and decompositions in NumPy and SciPy.
 
-Its threads wait for each other in busy loops.  Ours are small matrices, for which a second
-thread brings nothing on a free machine; where something else runs, too, the thread that is
-waited for has no core, and scores took twelve times as long.
+OpenBLAS threads wait for each other in busy loops.  The matrices here are small: a second
+thread brings no gain on idle cores.  On busy cores the other threads wait for one that has no
+core; this made scores take twelve times as long.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from threadpoolctl import ThreadpoolController
 @contextmanager
 def one_thread_for_matrices() -> Iterator[None]:
     """Let matrix products and decompositions use one thread; also a decorator of jobs."""
-    import scipy.linalg  # noqa: F401 - brings an OpenBLAS of its own, which is to be limited
+    import scipy.linalg  # noqa: F401 - loads its own OpenBLAS, to be limited as well
 
-    # other libraries may be torch's own, whose products of a network are large
+    # OpenBLAS only: torch can have its own library, and the matrices of networks are large
     with ThreadpoolController().select(internal_api="openblas").limit(limits=1):
         yield

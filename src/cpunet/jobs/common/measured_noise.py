@@ -32,7 +32,7 @@ def measured_noise(
     config
         Preparation of the pulses.
     remains
-        Remains of earlier pulses under the traces; baselines with remains are left out.
+        Remains of earlier pulses in the traces; baselines with remains are left out.
 
     Returns
     -------

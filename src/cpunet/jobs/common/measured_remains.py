@@ -17,7 +17,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
 
 BLOCK = 4096  # traces per block
-LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is kept
+LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
 MAX_BLOCKS = 16  # blocks searched for traces that passed the cuts
 
 
@@ -27,9 +27,9 @@ class FoundRemains(NamedTuple):
     Parameters
     ----------
     measured
-        Remains under its traces; None if they cannot be estimated.
+        Remains in its traces; None if they cannot be estimated.
     drawn
-        Distribution to be drawn from, if there certainly are any.
+        Distribution to draw from; None if the existence of remains is not certain.
     told
         Entry of ``run.json``; None if they were not looked for.
     """
@@ -51,7 +51,7 @@ def find_remains(
     config
         Preparation of the pulses.
     monitor
-        Told of the rate, or why there is none.
+        Receiver of a note on the rate, or on why it is unknown.
     """
     found, reason = measured_remains(data_file, config)
     if found is None:
@@ -74,7 +74,7 @@ def find_remains(
 def measured_remains(
     data_file: InputFile, config: PreparationConfig
 ) -> tuple[Remains | None, str | None]:
-    """Measure the remains under the traces of a file.
+    """Measure the remains in the traces of a file.
 
     Returns
     -------

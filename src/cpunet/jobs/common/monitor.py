@@ -24,7 +24,7 @@ class Monitor:
 
 
 class Relay(Monitor):
-    """Pass steps and notes on to whoever has entered the stage, such as a parent process.
+    """Pass steps and notes on to given functions, such as those of a parent process.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class Link:
         self._steps, self._told = 0, 0.0
 
     def advance(self, steps: int) -> None:
-        """Report completed steps, soon."""
+        """Report completed steps, at most every `TELL_EVERY_S` seconds."""
         self._steps += steps
         if time.monotonic() - self._told >= TELL_EVERY_S:
             self.flush()
@@ -73,7 +73,11 @@ class Link:
 
     @contextmanager
     def stoppable(self) -> Iterator[Callable[[], bool]]:
-        """Yield a function that tells whether to stop; once called, it alone stops the work."""
+        """Yield a function that returns whether to stop.
+
+        Once it has been called, a first SIGTERM does not end the process at once: the function
+        returns true, and the process ends after the ``with`` block.
+        """
 
         def stop() -> bool:
             self._asked = True

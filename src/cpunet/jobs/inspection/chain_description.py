@@ -94,7 +94,7 @@ def describe_responses(
     force
         Whether to replace an existing folder.
     monitor
-        Receiver of notes about files kept from it.
+        Receiver of notes about files kept from a replaced folder.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def describe_responses(
         Content of ``response.json``.  ``runs``: for each run its ``values`` by name, with the
         unit as suffix (shares of the full charge have none), ``errors`` of the fitted
         quantities and of the noise, all ``parameters`` with their ``parameter_errors``, and
-        ``doubts``, why these are not those of a readout alone.
+        ``doubts``, reasons why these do not describe a readout alone.
         ``mean`` and ``spread`` (standard deviation) of several runs.  ``truth``: the same
         ``values`` of the true chain, the ``difference`` of the run or of the mean of the runs
         from it, and ``sigma``, the difference divided by the error or the spread, whichever
@@ -146,12 +146,12 @@ def describe_responses(
 
 
 def chain_of(run: Path) -> Chain:
-    """The readout chain that a training has learned, with its noise.
+    """The readout chain fitted by a training, with its noise.
 
     Raises
     ------
     CpunetError
-        If the run holds no response in closed form.
+        If the run has no response in closed form.
     """
     return _read_run(run).chain
 
@@ -253,7 +253,7 @@ def _told(run: _Learned) -> dict[str, Any]:
 
 
 def _doubts(run: _Learned) -> list[str]:
-    """Why the numbers of a run are not those of a readout alone."""
+    """Reasons why the numbers of a run do not describe a readout alone."""
     causes = run.fit.get("causes")
     found = beyond(run.parameters)
     if isinstance(causes, list) and causes:

@@ -16,7 +16,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
 
 _MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
-_FOREVER_US = 1e9  # instead of a decay
+_FOREVER_US = 1e9  # decay time of a chain without decay
 
 
 def learned_chain(response: ElectronicsResponse, name: str) -> Chain:

@@ -1,4 +1,4 @@
-"""Whether hits lie in a crystal, and the frame in which they would."""
+"""Check whether hits lie in a crystal, and find a frame in which they do."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import Transform
 from cpunet.simulation.hits import Hits
 
-MOST = 50_000  # hits that are looked at
-FITS = 0.999  # share inside above which the frame is right but for rounding at the surface
+MOST = 50_000  # maximum number of hits used
+FITS = 0.999  # share inside above which the frame is right, but for rounding at the surface
 BETTER = 0.02  # share by which another frame must be better than that of the file
 CELL_R_MM, CELL_Z_MM = 4.0, 8.0  # cells in which hits are counted
-EXPECTED, VOID = 20.0, 0.05  # hits of a cell that can be void; share below which it is
+EXPECTED, VOID = 20.0, 0.05  # expected hits needed to test a cell; share below which it is void
 AS_GIVEN = Transform()
 
 
 def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
-    """Tell how many hits lie in a crystal, and which frame would have more of them inside.
+    """Count the hits inside a crystal, and find a frame with more of them inside.
 
-    A frame in which a part of the crystal has no hits, such as germanium where the hits leave
-    out a bore, does not fit, however many hits are inside.
+    A frame does not fit, however many hits are inside, if a part of the crystal has no hits,
+    for example where the bore in the hits lies in germanium.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
     }
     if as_given > FITS:
         return told
-    # of equally good frames, the first: that of the file, not flipped
+    # equally good frames keep this order: first the file's own origin and orientation
     shares = {frame: inside(frame) for frame in _frames(position, detector)}
     better = [frame for frame in shares if shares[frame] >= as_given + BETTER]
     better.sort(key=lambda frame: -shares[frame])
@@ -85,7 +85,7 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
 
 
 def _frames(position: np.ndarray[Any, Any], detector: Detector) -> Iterator[Transform]:
-    """Frames with the hits about the axis and one of their ends at one of the crystal's."""
+    """Candidate frames: hits around the axis, with ends or middle at those of the crystal."""
     low, high = position.min(axis=0), position.max(axis=0)
     centres = [(0.0, 0.0), tuple((low[:2] + high[:2]) / 2)]
     for flip in (False, True):
@@ -97,7 +97,7 @@ def _frames(position: np.ndarray[Any, Any], detector: Detector) -> Iterator[Tran
 
 
 def _has_void(position: np.ndarray[Any, Any], detector: Detector) -> bool:
-    """Whether a part of the crystal has no hits where others of the same height have many."""
+    """Whether a part of the crystal has no hits while others at the same height have many."""
     x, y, z = position.T
     r_edges = np.arange(0, detector.crystal_radius + CELL_R_MM, CELL_R_MM)
     z_edges = np.arange(0, detector.crystal_length + CELL_Z_MM, CELL_Z_MM)

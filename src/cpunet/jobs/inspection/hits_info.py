@@ -1,4 +1,4 @@
-"""What is in a file of hits."""
+"""Describe the content of a file of hits."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def describe_hits(
     crystal
         Crystal in which the hits should lie.
     units
-        Units of lengths and energies, where the file names none.
+        Units of lengths and energies, if the file names none.
 
     Returns
     -------
     dict
-        ``kind`` (``"hits"``), ``path``, and ``detectors``: by name (``""`` where a file names
+        ``kind`` (``"hits"``), ``path``, and ``detectors``: by name (``""`` if the file names
         none) ``events``, ``hits``, ``energy_kev`` (lowest and highest of an event), ``x_mm``,
         ``y_mm``, ``z_mm``, ``r_mm`` (lowest and highest, in the frame of the file less a known
         origin), ``peaks`` and, with `crystal`, ``crystal`` (result of `describe_frame`); or
-        why they cannot be read.
+        the reason why the hits cannot be read.
     """
     names: list[str | None] = [*hit_detectors(path)] if detector is None else [detector]
     return {

@@ -56,20 +56,20 @@ def describe(
 ) -> dict[str, Any]:
     """Describe the content of a file of pulses or of the folder of a training run.
 
-    A file is read once, in blocks, so memory does not grow with its size but for its energies.
+    A file is read in blocks; only energies or amplitudes of all pulses are held in memory.
 
     Parameters
     ----------
     path
         File of pulses, or folder with ``run.json``.
     table, energy, kev_per_adc, dt_ns
-        See `cpunet.pulses.reading.open_pulses`. With ``"all"`` as table each is described.
+        See `cpunet.pulses.reading.open_pulses`. With ``"all"`` as table all are described.
     recipe
-        Its gamma lines are counted, and with its preparation measured traces are described.
+        Recipe with the gamma lines to count and the preparation to describe measured traces.
     detector
         Crystal in which hits should lie.
     hit_units
-        Units of lengths and energies of hits, where the file names none.
+        Units of lengths and energies of hits, if the file names none.
     without_remains
         LH5 file to write: the traces after subtraction of their remains, with columns
         ``remains_kev`` and ``remains_error_kev``.
@@ -82,8 +82,8 @@ def describe(
     -------
     dict
         For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``.
-        For a file of hits, what `describe_hits` gives.
-        For a file with several tables of which none was chosen, ``kind`` (``"tables"``),
+        For a file of hits, the result of `describe_hits`.
+        For a file with several tables, none of them chosen, ``kind`` (``"tables"``),
         ``path`` and ``tables``: the result of `PulseSource.describe` by name, or the reason
         why a table cannot be read.
         For all tables of a file, ``kind`` (``"channels"``), ``path`` and ``channels``: the
@@ -135,7 +135,7 @@ def describe(
 def _of_file(
     file: InputFile, recipe: Recipe | None, without_remains: Path | None, *, force: bool
 ) -> tuple[dict[str, Any], Spectra]:
-    """Describe a file of pulses; give the spectrum of each of its tables that was read."""
+    """Describe a file of pulses; also return the spectrum of each table that was read."""
     if file.table == ALL and without_remains is None:
         channels: dict[str, Any] = {}
         spectra: Spectra = {}
@@ -160,7 +160,7 @@ def _of_pulses(
     *,
     force: bool = False,
 ) -> tuple[dict[str, Any], Spectrum]:
-    """Describe the pulses of one table; give their spectrum."""
+    """Describe the pulses of one table; also return their spectrum."""
     path, source = file.path, file.open()
     peaks = recipe.peaks if recipe else {}
     counts = _Counts(dict.fromkeys(peaks, 0))
@@ -211,7 +211,7 @@ def _side(source: PulseSource) -> Kind | None:
     if found is None:
         first = next(iter(source.blocks(LOOKED_AT)), None)
         found = None if first is None else apparent_side(first.waveforms)
-    # translated windows look measured, but have no raw traces
+    # translated windows look measured, but are not raw traces
     return None if found is None or "translated" in found.why else found.side
 
 

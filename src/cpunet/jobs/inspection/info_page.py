@@ -1,4 +1,4 @@
-"""What is in a file, as a page."""
+"""Write the description of a file as an HTML page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.inspection.info_words import in_words
 from cpunet.pulses.spectrum import CAESIUM, LINE_KEV, SOURCES
 
-Spectra = dict[str, Spectrum]  # by channel; "" for a file of one
+Spectra = dict[str, Spectrum]  # by channel; "" for a file with one
 
 
 def write_info_page(out: Path, told: Mapping[str, Any], spectra: Spectra) -> None:

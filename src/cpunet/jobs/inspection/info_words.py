@@ -1,4 +1,4 @@
-"""What `describe` found, as names and words for a screen or a page."""
+"""Names and texts of the results of `describe`, for a screen or a page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 Lines = list[tuple[str, str]]
 NOTHING = "–"
-PARTS = 8  # deviating parts of a fit, at most
+PARTS = 8  # maximum number of deviating parts of a fit
 UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
 _OFF = 3.0  # standard deviations
 
@@ -50,7 +50,7 @@ def _energy(told: Mapping[str, Any]) -> str:
 
 
 def _odd(told: Mapping[str, Any]) -> str:
-    """Traces that are no pulses, if there are any."""
+    """Numbers of traces that are not pulses, if any."""
     counts = {"not finite": told["n_not_finite"], "constant": told["n_constant"]}
     return "".join(f"; {n} traces {what}" for what, n in counts.items() if n)
 
@@ -153,7 +153,7 @@ def _run(told: Mapping[str, Any]) -> Lines:
     noise = _mapping(fit, "noise")
     if "rms" in noise:
         of = f" (RMS, {noise.get('baselines')} baselines)"
-        # loads matplotlib, which a command's help does without
+        # loads matplotlib, which the help of a command does not need
         from cpunet.analysis.nested_tables import with_std
 
         value = with_std(noise["rms"], noise.get("rms_error"))

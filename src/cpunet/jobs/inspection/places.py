@@ -19,12 +19,12 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import Signals, hit_signals
 
 QUIET = Monitor()
-# Energy of each deposit, that of a double-escape event; it matters only for self-repulsion.
+# Energy of each deposit, that of a double-escape event; matters only for self-repulsion.
 ENERGY_KEV = 1592.5
 IN_CONTACT = "in a contact or its dead layer"
 NO_FIELD = "in germanium without a field"
 NOT_COLLECTED = "charge not collected within the record"
-_AREA_POINTS = 400  # along the longer side
+_AREA_POINTS = 400  # grid points along the longer side, to measure the area
 
 
 @dataclass(frozen=True, eq=False)

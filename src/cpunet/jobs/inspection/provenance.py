@@ -19,7 +19,7 @@ from cpunet.pulses.side import (
 )
 from cpunet.yaml_files import plain_json
 
-# options of a translation as they are unless given
+# default values of the options of a translation
 _PLAIN = {"noise": True, "remains": "none"}
 
 
@@ -29,7 +29,7 @@ def provenance(source: PulseSource) -> dict[str, str]:
     Returns
     -------
     dict
-        Text by name, as ``made by``, ``detector``, ``hits`` and ``translated``; empty for
+        Text by name, such as ``made by``, ``detector``, ``hits`` and ``translated``; empty for
         files of other programs.
     """
     told = recorded_attributes(source)
@@ -73,7 +73,7 @@ def _of_simulation(made: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _of_events(made: Mapping[str, Any]) -> str:
-    """Numbers of events and the seed; a stand's file has them in its ``stand.json``."""
+    """Numbers of events and the seed; a stand records them in its ``stand.json``."""
     if "events" not in made:
         return ""
     lost = made.get("events_without_signal")

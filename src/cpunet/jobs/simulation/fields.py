@@ -1,4 +1,4 @@
-"""A detector in; its numbers and a picture of its fields out."""
+"""Describe the fields of a detector in numbers and a picture."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ def describe_fields(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, str]:
-    """Solve for the fields (or take them from the cache), and draw them if asked to.
+    """Solve for the fields (or take them from the cache), and draw them if requested.
 
     Parameters
     ----------
     detector
         Geometry, impurities and bias.
     picture
-        File to make, ``.png``, ``.pdf`` or ``.svg``; None for none.
+        File to write, ``.png``, ``.pdf`` or ``.svg``; None for none.
     impurity_from
         ``"depletion"`` scales the impurities so that the detector depletes at its
         ``measured_depletion_V``.
     paths
-        Draw drift paths.
+        Whether to draw drift paths.
     force
-        Replace an existing picture.
+        Whether to replace an existing picture.
     monitor
         Receiver of the progress.
 
@@ -57,8 +57,8 @@ def describe_fields(
     Raises
     ------
     CpunetError
-        If the detector is not depleted, or the picture exists, cannot be written or is of
-        no known format.
+        If the detector is not depleted, or the picture exists, cannot be written or has an
+        unknown format.
     """
     if picture is not None:
         if picture.suffix.lower() not in PICTURE_FORMATS:
@@ -67,7 +67,7 @@ def describe_fields(
     detector, fields = solved(detector, impurity_from, monitor)
     told = _told(detector, fields)
     if picture is not None:
-        # matplotlib and the compiled drift are needed for the picture alone
+        # matplotlib and the compiled drift are needed only for the picture
         from cpunet.analysis.detector_figure import detector_figure
 
         with monitor.stage("Picture"):
@@ -80,7 +80,7 @@ def describe_fields(
 
 def _told(detector: Detector, fields: FieldMaps) -> dict[str, str]:
     strength = np.hypot(fields.e_r_V_per_cm, fields.e_z_V_per_cm)
-    # beside contacts and the ditch one-sided differences stand for the field
+    # next to contacts and the ditch the field is only a one-sided difference
     bulk = fields.point_type > LI_CONTACT
     bulk &= fields.point_type < DITCH_EDGE
     bulk &= fields.point_type != CONTACT_EDGE

@@ -13,14 +13,14 @@ import numpy.typing as npt
 
 
 class GrowingArchive:
-    """Rows appended to one float32 array of an ``.npz``; other arrays join at the end.
+    """Appends rows to one float32 array of an ``.npz``; other arrays are added at the end.
 
     Parameters
     ----------
     path
-        The archive; beside it a ``.rows`` file lives until `close`.
+        The archive; until `close` the rows are in a ``.rows`` file beside it.
     name, columns
-        Of the array that grows.
+        Name and number of columns of the growing array.
     """
 
     def __init__(self, path: Path, name: str, columns: int) -> None:

@@ -1,4 +1,4 @@
-"""The arrays of a translated pulse-shape library, filled row by row of r."""
+"""Datasets of a translated pulse-shape library, filled row by row in r."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from cpunet.translation.library_mode import AFTER_NS, BEFORE_NS, aligned_current
 
 @dataclass(frozen=True)
 class Arrays:
-    """Where templates go, and for currents the times of the highest ones."""
+    """Datasets for templates and, for currents, for the times of their maxima."""
 
     waveforms: h5py.Dataset
     times: h5py.Dataset | None = None
 
     def put(self, rows: slice, charge: FloatArray, dt_ns: float) -> None:
-        """Write translated templates, shape (places, samples), of rows of r."""
+        """Write translated templates, shape (grid points, samples), of rows of r."""
         values = charge
         if self.times is not None:
             values, times_ns = aligned_currents(charge, dt_ns)
@@ -31,7 +31,7 @@ class Arrays:
 
 
 def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
-    """Store a number or an array with LH5's attributes."""
+    """Store a number or an array with LH5 attributes."""
     group[name] = values
     dimensions = group[name].ndim
     kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
@@ -39,7 +39,7 @@ def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) 
 
 
 def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
-    """An array of the same type, shape, chunks, filters and attributes."""
+    """Create a dataset of the same type, shape, chunks, filters and attributes."""
     plain = given.id
     name = f"waveform_{angle}".encode()
     new = h5py.h5d.create(
@@ -49,7 +49,7 @@ def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
 
 
 def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
-    """An array of currents, and one of the times of their highest samples in ns."""
+    """Create datasets for currents and for the times of their maxima in ns."""
     dt = given.parent["dt"]
     dt_ns = float(dt[()]) * TIME_UNITS[dt.attrs["units"]]
     samples = round(BEFORE_NS / dt_ns) + round(AFTER_NS / dt_ns)
@@ -69,7 +69,7 @@ def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
 
 
 def add_t0(dt: h5py.Dataset, made: h5py.Group, before_ns: float) -> None:
-    """Put the first sample at `before_ns` before time 0, in the units of dt."""
+    """Add ``t0``, `before_ns` before time 0, in the units of ``dt``."""
     ns_per_unit = TIME_UNITS[dt.attrs["units"]]
     dt_ns = float(dt[()]) * ns_per_unit
     t0 = -round(before_ns / dt_ns) * dt_ns / ns_per_unit

@@ -1,4 +1,4 @@
-"""A detector in, a library of pulse shapes out, as production simulations read it."""
+"""Simulate a library of pulse shapes in the format of production simulations."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import Signals, hit_signals
 
 QUIET = Monitor()
-# As SolidStateDetectors.jl's libraries are sampled: reboost's surface model wants 1 ns.
+# Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
 DT_NS, LENGTH_NS = 1.0, 5000.0
-ENERGY_KEV = 1000.0  # of each hit; it matters with self-repulsion only
-ANGLES_DEG = (0, 45)  # <100> and <110>: what reboost interpolates between
+ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
+ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
 def write_library(
@@ -37,14 +37,14 @@ def write_library(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Simulate the charge pulse of every place of a grid and write them as a library.
+    """Simulate the charge pulses of all points of a grid and write them as a library.
 
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
     under the detector's name: r and z in mm from the centre of the point contact, times in
-    ns from when the charge is set free, pulses of unit charge as float32 arrays of shape
-    (r, z, samples).  What the format calls drift times are the collection times of all
-    charge, `Signals.collection_time_ns`.  Places that give no signal, and those whose charge
-    is not collected within the record, are NaN.
+    ns after the charge is created, pulses of unit charge as float32 arrays of shape
+    (r, z, samples).  The drift times of the format are the collection times of all charge,
+    `Signals.collection_time_ns`.  Grid points without a signal, and those whose charge is not
+    collected within the record, are NaN.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def write_library(
     out
         LH5 file to write.
     settings
-        Of the simulation; by default with 5000 samples of 1 ns.
+        Settings of the simulation; by default with 5000 samples of 1 ns.
     grid_mm
         Spacing in r and z.
     angles_deg
@@ -62,7 +62,7 @@ def write_library(
     Returns
     -------
     dict
-        ``templates`` (places times angles), ``written``, ``outside`` (no signal there) and
+        ``templates`` (grid points times angles), ``written``, ``outside`` (no signal) and
         ``late`` (not collected within the record).
 
     Raises
@@ -99,7 +99,7 @@ def write_library(
 
 
 def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:
-    """Multiples of the grid's spacing within the axis."""
+    """Multiples of the grid spacing within the axis."""
     return np.asarray(np.arange(int(axis_mm[-1] / grid_mm + 1e-6) + 1) * grid_mm)
 
 
@@ -111,7 +111,7 @@ def _fill(
     counts: dict[str, int],
     advance: Advance,
 ) -> None:
-    """Simulate the places of one azimuth, row by row of r."""
+    """Simulate the grid points of one azimuth, row by row in r."""
     r_mm, z_mm = library["r"][()], library["z"][()]
     shape = (len(r_mm), len(z_mm))
     waveforms = _array(library, f"waveform_{angle_deg:03d}_deg", shape, settings.n_samples)
@@ -138,7 +138,7 @@ def _kept(signals: Signals, good: np.ndarray[Any, np.dtype[np.bool_]]) -> Any:
 def _array(
     library: h5py.Group, name: str, shape: tuple[int, int], *samples: int
 ) -> h5py.Dataset:
-    """An empty array of NaN with LH5's attributes, in chunks of whole templates."""
+    """Create a dataset of NaN with LH5 attributes, in chunks of whole templates."""
     whole = (*shape, *samples)
     made = library.create_dataset(
         name,

@@ -1,4 +1,4 @@
-"""A detector and hits in, a file of pulses out: the simulated side of a training."""
+"""Simulate the pulses of hits in a detector, for the simulated side of a training."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUIET = Monitor()
 Mode = Literal["exact", "library", "auto"]
 ImpurityFrom = Literal["file", "depletion"]
 
-# Building the library takes as long as drifting so many hits. From there on it is faster,
+# Building the library takes as long as drifting this many hits. For more hits it is faster,
 # but its pulses deviate by up to `library_tolerance`.
 LIBRARY_FROM_HITS = 200_000
 
@@ -70,39 +70,39 @@ def simulate_file(
 ) -> Summary:
     """Simulate the pulses of a detector and write them, with their hits, to an LH5 file.
 
-    The table ``geds/sim`` is what `cpunet.jobs.training.train.train_run` reads: ``waveform`` in
-    units of the collected charge, ``energy`` (keV) collected, ``event_number``; beside
-    them ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, with trapping
-    ``trapped_energy`` (keV, deposited elsewhere but not collected) and with a resolution
-    ``true_energy``.  Its attribute ``simulation`` tells in JSON how the file
-    was made.  ``geds/hits`` holds the hits of the pulses, in the crystal's frame.
+    The table ``geds/sim`` is the input of `cpunet.jobs.training.train.train_run`: ``waveform``
+    in units of the collected charge, collected ``energy`` (keV), ``event_number``,
+    ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, with trapping
+    ``trapped_energy`` (keV, deposited elsewhere but not collected), and with a resolution
+    ``true_energy``.  Its attribute ``simulation`` is the provenance in JSON.  ``geds/hits``
+    contains the hits of the pulses in the frame of the crystal.
 
     Parameters
     ----------
     detector
         Geometry, impurities, bias and temperature.
     source
-        Of the hits.
+        Source of the hits.
     out
-        LH5 file to write; it appears when all is done.
+        LH5 file to write; it appears when it is complete.
     settings
-        Of the drift and the pulses.
+        Settings of the drift and the pulses.
     windows
-        In which the summary counts pulses.
+        Energy windows in which the summary counts pulses.
     impurity_from
         ``"depletion"`` scales the detector's impurities so that it depletes at its
         ``measured_depletion_V``.
     mode
         ``"exact"`` drifts every hit, ``"library"`` interpolates between pre-computed
-        pulses; ``"auto"`` takes the library from `LIBRARY_FROM_HITS` hits on.
+        pulses; ``"auto"`` uses the library for `LIBRARY_FROM_HITS` hits or more.
     cluster_mm
-        Hits nearer than this to each other are merged; 0 merges none.
+        Distance in mm below which hits are merged; 0 merges none.
     resolution
-        Of the energies written; the pulses stay as they are.
+        Resolution of the written energies; the pulses are unchanged.
     seed
-        Of the resolution (the Monte Carlo has its own).
+        Seed of the resolution (the Monte Carlo has its own).
     force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def simulate_file(
 
 
 def _check(cluster_mm: float, resolution: Resolution | None) -> None:
-    """Refuse, before any work is done, what would fail later."""
+    """Check the options before any work is done."""
     cluster_hits(Hits.of([], [], [0]), cluster_mm)
     if resolution is not None:
         resolution.smear(np.zeros(0), seed=0)
@@ -159,7 +159,7 @@ def _check(cluster_mm: float, resolution: Resolution | None) -> None:
 def solved(
     detector: Detector, impurity_from: ImpurityFrom, monitor: Monitor
 ) -> tuple[Detector, FieldMaps]:
-    """The detector with the impurities wanted, and its fields."""
+    """The detector with the requested impurities, and its fields."""
     with monitor.stage(f"Fields of {detector.name}"):
         if impurity_from == "depletion":
             detector = scaled_to_depletion(detector)
@@ -203,7 +203,7 @@ def _simulate(
 
 
 def _steps_of(advance: Advance) -> Callable[[int, int], None]:
-    """From the number done so far, as the simulation tells it, to the steps a stage takes."""
+    """Convert the number done so far, as the simulation reports it, to steps of a stage."""
     before = 0
 
     def progress(done: int, _total: int) -> None:
@@ -232,7 +232,7 @@ def _append(
         columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
     if resolution is not None:
         columns["true_energy"] = (pulses.energy_kev, "keV")
-        # each block draws anew, from where in the file it begins
+        # each block has its own seed, from the number of pulses before it in the file
         block_seed = int(np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)[0])
         pulses = replace(pulses, energy_kev=resolution.smear(pulses.energy_kev, block_seed))
     writer.append(pulses, columns)
@@ -248,7 +248,7 @@ def _made(
     seed: int,
     summary: Summary,
 ) -> dict[str, Any]:
-    """How the file was made, to be kept in it."""
+    """Provenance of the file, to be stored in it."""
     return {
         "cpunet": cpunet.__version__,
         "detector": detector.model_dump(mode="json"),

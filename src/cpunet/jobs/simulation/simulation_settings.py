@@ -1,4 +1,4 @@
-"""Settings of a simulation from a YAML file and from single values on top."""
+"""Read settings of a simulation from a YAML file and single values that override it."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields
 def load_settings(
     path: Path | None = None, values: Mapping[str, Any] | None = None
 ) -> SimulationSettings:
-    """Read settings; what neither the file nor `values` gives keeps its default.
+    """Read settings; fields in neither the file nor `values` keep their defaults.
 
     Parameters
     ----------
     path
         YAML file with fields of `SimulationSettings`.
     values
-        Fields that go before those of the file; None leaves a field as it is.
+        Fields that override those of the file; None leaves a field unchanged.
 
     Raises
     ------
@@ -52,12 +52,12 @@ def load_settings(
 
 
 def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]]:
-    """Of ``KEY=VALUE`` words, those of the detector, and values of settings by their key.
+    """Split ``KEY=VALUE`` words into those of the detector, and values of settings by key.
 
     Raises
     ------
     CpunetError
-        If a setting's value is no plain one.
+        If the value of a setting cannot be parsed.
 
     Examples
     --------

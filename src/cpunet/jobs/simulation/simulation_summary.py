@@ -1,4 +1,4 @@
-"""What a simulation made, and where its time went."""
+"""Counts of a simulation, and the time spent on each of its steps."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Summary:
     """Counts over all events; hits are counted as merged, energies in keV.
 
     ``lines`` counts, by window, the pulses whose collected energy is still in it;
-    ``not_collected`` the hits whose charge did not all arrive within the record;
-    ``seconds`` is by what they were spent on.
+    ``not_collected`` the hits whose charge was not all collected within the record;
+    ``seconds`` is the time spent on each step.
     """
 
     mode: str = ""
@@ -40,7 +40,7 @@ class Summary:
 
     @property
     def without_signal(self) -> int:
-        """Events that were not written, as none of their hits gives a signal."""
+        """Number of events that were not written because none of their hits gives a signal."""
         return self.n_events - self.n_written
 
     def add(
@@ -71,14 +71,14 @@ class Summary:
 
 
 class Clock:
-    """Seconds by what they were spent on."""
+    """Time spent on each step, in seconds."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
-        """Book the time since the last lap, or the start, under a name."""
+        """Add the time since the last lap, or the start, to that of a step."""
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now

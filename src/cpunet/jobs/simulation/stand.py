@@ -1,4 +1,4 @@
-"""A test stand: simulated pulses, and "measured" ones of other events with a known answer."""
+"""Virtual test stands: simulated pulses, "measured" ones of other events, and their truth."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ STAND = FolderKind(
     known_by=MARKER,
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
-# Events of a side from which on building a library of pulses (20 s on two cores) takes less
-# time than drifting their hits, some 20 each.
+# Events per side from which building a library of pulses (20 s on two cores) takes less time
+# than drifting their hits, about 20 each.
 _LIBRARY_FROM_EVENTS = 20_000
-# What is known of a measured trace besides its line, and its name in ``data_labels.npz``.
+# Truth about each measured trace besides its line, and its name in ``data_labels.npz``.
 OF_DATA = {
     "flags": "flag",
     "remains_kev": "remains_kev",
@@ -63,7 +63,7 @@ OF_DATA = {
 
 @dataclass
 class StandSummary:
-    """What a stand holds: pulses by line, and the disturbed traces, by side."""
+    """Content of a stand: pulses by line for each side, and disturbed traces."""
 
     n_sim: int = 0
     n_data: int = 0
@@ -90,40 +90,40 @@ def make_stand(
 ) -> StandSummary:
     """Make a stand of two independent sets of Tl-208 events.
 
-    The folder holds ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
+    The folder contains ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
     digitiser's period; ``geds/hits``: their hits; the attribute ``simulation`` of the
-    former: detector and settings, as `cpunet.jobs.simulation.simulate` keeps them),
+    former: detector and settings, as in files of `cpunet.jobs.simulation.simulate`),
     ``data.lh5`` (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the
     noise-free trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
     ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
     included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
     baseline, 2 pile-up, 4 saturated; ``remains_kev``, ``n_piled``, ``piled_kev``,
-    ``piled_ns``, see `cpunet.electronics.other_pulses`) and ``stand.json``, which tells how
-    it was made.
+    ``piled_ns``, see `cpunet.electronics.other_pulses`) and ``stand.json``, its provenance.
 
     Parameters
     ----------
     electronics
-        The chain of the data, and of the truth.
+        Readout chain of the data and of the truth.
     detector
-        As simulated; of a ``"shifted"`` stand the data's differs by `shift`,
-        while the truth remains the chain's response to the simulated pulses.
+        Simulated detector. In a ``"shifted"`` stand that of the data differs by `shift`; the
+        truth is still the response of the chain to the simulated pulses.
     windows, events
-        Windows of deposited energy, and the events wanted in each, for either side.
+        Windows of deposited energy, and the number of events in each, per side.
     out
-        The folder; it appears when all is done.
+        Output folder; it appears when it is complete.
     kind
         ``"matched"`` or ``"shifted"``.
     shift
-        Of a ``"shifted"`` stand; `Shift.default` if None.
+        Deviations in a ``"shifted"`` stand; `Shift.default` if None.
     settings
-        Of the simulated pulses, but for the period; the data's differ by the shift.
+        Settings of the simulated pulses, without the period; those of the data differ by the
+        shift.
     height_mm, radius_mm
-        Of the source, a disc above the crystal.
+        Height and radius of the source, a disc above the crystal.
     seed
-        Of everything random; the sides draw independently.
+        Seed of all random numbers; the sides are independent.
     force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def make_stand(
 def write_stand(
     plan: StandPlan, out: Path, *, force: bool = False, monitor: Monitor = QUIET
 ) -> StandSummary:
-    """Make a planned stand; the rest is as for `make_stand`."""
+    """Make a planned stand, see `make_stand`."""
     many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
     summary = StandSummary()
     with folder_written_aside(out, STAND, force=force, note=monitor.note) as folder:
@@ -232,7 +232,7 @@ def _write_data(
 
 
 def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
-    """How the pulses of a side were made; those of `dt_ns` are means of the fine ones."""
+    """Provenance of the pulses of a side after averaging to the period `dt_ns`."""
     return {
         "cpunet": cpunet.__version__,
         "detector": side.detector.model_dump(mode="json"),
@@ -256,7 +256,7 @@ def _block_means(pulses: Pulses, per_sample: int) -> Pulses:
 
 
 def _as_pulses(traces: RawTraces) -> Pulses:
-    # the writer stores samples as they are: integers stay what a digitiser gives
+    # the writer stores samples unchanged: the integers of a digitiser stay integers
     return Pulses(
         waveforms=cast(FloatArray, traces.waveforms),
         dt_ns=traces.dt_ns,

@@ -1,4 +1,4 @@
-"""What a test stand is to be: two sides of independent events, and what each is made of."""
+"""Plan of a test stand: two sides of independent events, and the inputs of each."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ Labels = npt.NDArray[np.int64]
 
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
 OTHER = 3
-# Period of the simulated pulses that pass the chain; at 4 ns they are those of the library.
+# Period of the simulated pulses at the input of the chain; same as that of the library.
 _FINE_NS = 4.0
-# As `cpunet simulate` merges hits.
+# Default of `cpunet simulate`.
 CLUSTER_MM = 0.05
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a stand: its detector, how it is simulated, its events."""
+    """One side of a stand: its detector, settings of the simulation, and source of events."""
 
     detector: Detector
     settings: SimulationSettings
@@ -52,10 +52,10 @@ class Side:
     def blocks(
         self, title: str, library: Library | None, monitor: Monitor
     ) -> Iterator[tuple[Pulses, Labels, Hits]]:
-        """Its pulses, finely sampled, their lines and their hits, block by block.
+        """Finely sampled pulses, their lines and their hits, block by block.
 
-        The energies are calibrated, as a measurement's are: where charge is trapped, a
-        factor brings the median of the first block's lines to what it was before.
+        Energies are calibrated as in a measurement: a factor, determined from the lines in the
+        first block, corrects the median loss by charge trapping.
         """
         with monitor.stage(f"Fields of {self.detector.name}"):
             fields = compute_fields(self.detector)
@@ -79,20 +79,20 @@ class Side:
 
 @dataclass(frozen=True)
 class StandPlan:
-    """Everything that a stand follows from.
+    """All inputs of a stand.
 
     Parameters
     ----------
     electronics
-        The chain of the data, and of the truth.
+        Readout chain of the data and of the truth.
     kind, shift
-        ``"shifted"``, and by what the data's detector differs, or ``"matched"`` and None.
+        ``"shifted"`` and the deviations of the data's detector, or ``"matched"`` and None.
     sim, data
         The two sides.
     seed
         Seed of all random numbers.
     readout_seed
-        Of the noise and what else the readout adds, drawn from `seed`.
+        Seed of the noise and other effects of the readout, derived from `seed`.
     """
 
     electronics: Electronics
@@ -123,8 +123,8 @@ class StandPlan:
         Raises
         ------
         CpunetError
-            If a window has no events, the chain's period is no multiple of the pulses', the
-            settings give a period, or there can be no detector shifted so.
+            If a window has no events, the chain's period is not a multiple of that of the
+            pulses, the settings have another period, or the shifted detector is not valid.
         """
         for window, number in zip(windows, events, strict=True):
             if number < 1:
@@ -134,7 +134,7 @@ class StandPlan:
             shift = shift or Shift.default()
         elif shift is not None:
             raise CpunetError("--shift: a matched stand has none; give --kind shifted")
-        # seeds of the events of both sides and of the readout's blocks
+        # seeds of the events of both sides and of the readout
         sim_seed, data_seed, readout_seed = map(
             int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
         )
@@ -169,17 +169,17 @@ class StandPlan:
 
 
 def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
-    """0 DEP, 1 SEP, 2 FEP, 3 other, by which window the collected energies (keV) are in."""
+    """Labels by energy window: 0 DEP, 1 SEP, 2 FEP, 3 other; collected energies in keV."""
     labels = np.full(len(energy_kev), OTHER)
     for window in windows:
-        # deposits add up to a line only within rounding
+        # sums of deposits are rounded
         inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
         labels[inside] = LABELS.get(window.name, OTHER)
     return labels
 
 
 def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
-    """The median of those in a line, or of all if none is."""
+    """Median over the pulses in lines, or over all if none is in a line."""
     of_lines = labels != OTHER
     return float(np.median(share[of_lines] if of_lines.any() else share))
 

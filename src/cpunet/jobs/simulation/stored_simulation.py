@@ -1,4 +1,4 @@
-"""What a file of simulated pulses keeps of how they were made: enough to make them again."""
+"""Read detector, settings and hits of simulated pulses, to simulate them again."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class StoredSimulation:
     Parameters
     ----------
     detector, settings
-        As simulated; the period is that of the file's pulses.
+        Detector and settings of the simulation, with the period of the pulses in the file.
     hits
-        One event per pulse, in the order of the pulses; merged already.
+        Merged hits, one event per pulse, in the order of the pulses.
     """
 
     detector: Detector
@@ -46,7 +46,7 @@ class StoredSimulation:
         Raises
         ------
         CpunetError
-            If the file cannot be read, does not tell how it was made, or lacks the hits of
+            If the file cannot be read, does not record how it was made, or lacks the hits of
             a pulse.
         """
         file = Path(path)
@@ -74,7 +74,7 @@ class StoredSimulation:
 
 
 def _record(path: Path) -> tuple[dict[str, Any], Any]:
-    """How the pulses were made, and the numbers of their events."""
+    """Provenance of the pulses, and their event numbers."""
     with opened(path) as file:
         text = file[_PULSES].attrs.get("simulation") if _PULSES in file else None
         if text is None or HIT_TABLE not in file:

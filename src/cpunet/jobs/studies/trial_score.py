@@ -34,9 +34,9 @@ from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 
-SHARE = 0.3  # of the pulses of each side
+SHARE = 0.3  # share of the pulses of each side that is held out
 MIN_N = 20  # minimum per side for a distribution
-MAX_LOST = 0.01  # of the translations: losing bad pulses would improve the score of the rest
+MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
 REPORTS = 8  # intermediate scores of a CycleGAN
 
 Report = Callable[[int, float], None]  # iterations done, score
@@ -94,7 +94,7 @@ class HeldOut:
         return cls(fit, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
-        r"""Distance of the translated held-out pulses from the data; 1 is that of data to data.
+        r"""Distance of translated held-out pulses from data; 1 for two samples of the data.
 
         .. math:: \frac{1}{n} \sum_{p=1}^{n} \frac{W_1(p)}{\langle W_1(p) \rangle_0}
 

@@ -67,7 +67,7 @@ def open_study(folder: Path, recipe: Recipe) -> Study:
         _ = study.trials
     except OSError:
         raise
-    except Exception as error:  # optuna does as each line says, unchecked
+    except Exception as error:  # optuna executes the lines of a journal unchecked
         raise CpunetError(
             f"{journal}: is damaged ({type(error).__name__}); remove its damaged lines, or "
             "begin again with --force"

@@ -1,4 +1,4 @@
-"""A response, its noise and its inverse from prepared pulses of both sides."""
+"""Fit a response, its noise and its inverse to prepared pulses of both sides."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from cpunet.training.run_folder import load_network, read_recipe
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Prepared pulses of both sides, the file of the measured ones, and what was read of it.
+    """Prepared pulses of both sides, the file of the measured ones, and its prepared set.
 
     Without the latter, `data_set`, remains of earlier pulses are not looked for.
     """
@@ -41,7 +41,7 @@ class Sides:
 
 
 def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
-    """The recipe with the configuration of a response: it may have begun to ring."""
+    """The recipe with the configuration of a fitted response, which can include ringing."""
     if not isinstance(recipe.generator, ResponseConfig):
         return recipe
     own = {name: getattr(response, name) for name in ResponseConfig.model_fields}
@@ -50,12 +50,12 @@ def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
 
 
 def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
-    """The response of a run, to start from.
+    """The response of a run, as a starting point.
 
     Raises
     ------
     CpunetError
-        If the run has none.
+        If the run has no response.
     """
     recipe, part = read_recipe(run), "ren"
     if recipe.chain is not None:
@@ -83,23 +83,23 @@ def match(
     Parameters
     ----------
     sides
-        What to fit to.
+        Pulses to fit.
     recipe
-        With a response to be matched.
+        Recipe with a response to fit.
     seed
         Seed of all random numbers.
     listen
-        Called with step and chi-square.
+        Function called with step and chi-square.
     monitor
         Receiver of notes.
     known
-        A response to start from.
+        Response to start from, if any.
 
     Returns
     -------
     tuple
-        A module with ``ren`` and ``iren``, what ``run.json`` is to say of the fit, and the
-        recipe of the response as it was fitted.
+        Module with ``ren`` and ``iren``, the entry on the fit for ``run.json``, and the recipe
+        of the response as fitted.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def match(
         )
         if not kept.kept:
             monitor.note("the residual does not help held-out pulses and is left out")
-        # beside the chain, not in it: what reads chains finds it where it always is
+        # stored beside the chain, which stays in its usual place for readers of chains
         ren, parts, more = (
             HybridGenerator(chain, residual),
             {"residual": residual},
@@ -184,7 +184,7 @@ def match(
 
 
 def remains_of_sides(sides: Sides, recipe: Recipe, monitor: Monitor) -> FoundRemains:
-    """Remains under the data; nothing if these are not to be looked at."""
+    """Remains of earlier pulses in the data; not looked for without `data_set`."""
     if sides.data_set is None:
         return FoundRemains(None, None, None)
     return find_remains(sides.data_file, sides.data_set, recipe.preparation, monitor)

@@ -1,4 +1,4 @@
-"""Training of a CycleGAN: resumable, and by several processes if torchrun started them."""
+"""Training of a CycleGAN: resumable, also by several processes started by torchrun."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import read_losses, weights_sha256
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
-# settings of logs and checkpoints, which change no weight
+# settings of logs and checkpoints, which do not affect the weights
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 
 
@@ -39,7 +39,7 @@ class CycleGanTrainer:
         self.steps = self.config.iterations
 
     def require_shareable(self, group: ProcessGroup) -> None:
-        """Refuse processes that cannot share the batches, or would all match a chain first."""
+        """Raise an error if processes cannot share the batches, or the recipe has a chain."""
         if self.recipe.chain is not None:
             raise CpunetError(
                 f"recipe {self.recipe.name}: takes minutes in one process, its chain being "
@@ -64,7 +64,7 @@ class CycleGanTrainer:
         return unfinished_folder(out, *read, resume=resume, force=force, note=note)
 
     def train(self, job: TrainingJob) -> Trained | None:
-        """Train or resume; return None in a process that does not lead."""
+        """Train or resume; return None in processes other than the leader."""
         fingerprint = _fingerprint(job)
         require_same_everywhere(job.group, fingerprint)
         if not job.group.leads:
@@ -113,7 +113,7 @@ class CycleGanTrainer:
         hooks: CheckpointHooks,
         listener: Listener | None,
     ) -> tuple[nn.Module, Kept | None]:
-        """Train; behind a chain, see whether that helps pulses that were held back."""
+        """Train; with a chain, also check whether the network improves held-out pulses."""
         sim, data = job.sim.prepared.pulses, job.data.prepared.pulses
         surroundings, recipe, gate = start.surroundings, start.recipe, None
         windows = sim.waveforms, data.waveforms
@@ -138,9 +138,9 @@ class CycleGanTrainer:
 
 
 def _fingerprint(job: TrainingJob) -> dict[str, Any]:
-    """All that determines the weights."""
+    """Everything that determines the weights."""
     recipe = job.recipe.model_dump(mode="json")
-    del recipe["search"]  # what may be tuned changes no weight
+    del recipe["search"]  # the search space does not affect the weights
     training = recipe["training"]
     recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
     told = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
@@ -155,7 +155,7 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
 
 
 def _environment(job: TrainingJob) -> dict[str, Any]:
-    """What the last bits depend on."""
+    """Environment that affects the last bits of the weights."""
     return {
         "device": job.options.device,
         "processes": job.group.size,

@@ -1,4 +1,4 @@
-"""Published weights become a run, published lists of pulses an LH5 file."""
+"""Import published weights as a run, and published lists of pulses as an LH5 file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cpunet.translation.published import read_discriminator, read_generator
 QUIET = Monitor()
 BLOCK = 1024
 TABLE = "geds/raw"
-# What a report says of the training; the pulses are not part of what was published.
+# Entries on the training for a report; its pulses were not published.
 UNKNOWN = {"file": "not published with the weights", "used": "an unknown number of"}
 
 
@@ -44,35 +44,35 @@ def import_weights(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Make a run folder of published state dicts, which `REN.load` and `IREN.load` take.
+    """Make a run folder for `REN.load` and `IREN.load` from published state dicts.
 
     Parameters
     ----------
     out
-        Folder to make.
+        Folder to create.
     ren, iren
-        Generators: ``fep_REN.pt`` (simulation to data), ``fep_IREN.pt``; one at least.
+        Generators: ``fep_REN.pt`` (simulation to data), ``fep_IREN.pt``; at least one.
     discriminator_data, discriminator_sim
-        ``fep_netD_A.pth`` and ``fep_netD_B.pth``, kept for the record.
+        ``fep_netD_A.pth`` and ``fep_netD_B.pth``, only stored.
     dt_ns
-        Sampling period of the pulses they were trained on in ns.
+        Sampling period in ns of the pulses of the training.
     peak
-        What they were trained on.
+        Energies of the training.
     force
-        Replace an existing run folder.
+        Whether to replace an existing run folder.
     monitor
-        Receiver of notes on what is kept.
+        Receiver of notes on files kept from a replaced folder.
 
     Returns
     -------
     dict
-        What is in ``run.json``.
+        Content of ``run.json``.
 
     Raises
     ------
     CpunetError
-        If no generator is given, a file is no plain state dict or of another architecture,
-        the two generators differ in width, or `out` may not be written.
+        If no generator is given, a file is not a plain state dict or has another
+        architecture, the two generators differ in width, or `out` cannot be written.
     """
     given = {
         "ren": ren,
@@ -136,10 +136,10 @@ def import_pulses(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Convert a pickled list of pulses to LH5, executing nothing of the pickle.
+    """Convert a pickled list of pulses to LH5 without executing code of the pickle.
 
     Pulses are dictionaries ``{wf, tp0, energy[, event]}``, pickled one after the other in
-    one file (streamed) or in lists (held one list at a time).
+    one file (streamed) or in lists (one list in memory at a time).
 
     Parameters
     ----------
@@ -148,11 +148,11 @@ def import_pulses(
     out
         LH5 file to write: ``waveform``, ``energy`` (keV), ``event_number``, ``tp0``.
     dt_ns
-        Sampling period in ns; the pickles do not tell.
+        Sampling period in ns, which the pickles do not contain.
     table, units
-        Where in the LH5 file the pulses go, and the units of their samples.
+        Table of the LH5 file for the pulses, and the units of their samples.
     force
-        Replace an existing file.
+        Whether to replace an existing file.
     monitor
         Receiver of the progress.
 
@@ -165,7 +165,7 @@ def import_pulses(
     Raises
     ------
     CpunetError
-        If the pickle asks for more than arrays and plain containers, or holds no pulse.
+        If the pickle needs more than arrays and plain containers, or contains no pulse.
     """
     refuse_existing(out, source, force=force)
     counts: Counter[str] = Counter()
@@ -202,7 +202,7 @@ def import_pulses(
 
 
 def _entries(source: Path, ended: list[str]) -> Iterator[Any]:
-    """Entries of all lists and single ones; where the file breaks off, `ended` says why."""
+    """Single entries and those of lists; if the file is truncated, `ended` has the reason."""
     try:
         yield from entries(source)
     except TruncatedError as error:
@@ -210,7 +210,7 @@ def _entries(source: Path, ended: list[str]) -> Iterator[Any]:
 
 
 def _blocks(found: Iterator[Any], counts: Counter[str]) -> Iterator[list[PickledPulse]]:
-    """Pulses, many at a time; what is none is counted by reason."""
+    """Blocks of pulses; entries that are not pulses are counted by reason."""
     block: list[PickledPulse] = []
     for entry in found:
         number = counts["read"]

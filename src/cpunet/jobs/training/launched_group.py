@@ -1,4 +1,4 @@
-"""One training by the processes that torchrun starts: who may, and on which device each."""
+"""Process group of a training started by torchrun, and the device of each process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cpunet.training.process_group import ALONE, Launch, ProcessGroup, launch, m
 
 @contextmanager
 def group_for(trainer: Trainer, device: str) -> Iterator[tuple[ProcessGroup, str]]:
-    """Join the processes of torchrun, if it started any; give the group and the device.
+    """Join the process group of torchrun, if there is one; yield group and device.
 
     An error inside ends all processes and is reported by one of them, see
     `cpunet.training.process_group.meeting`.
@@ -25,14 +25,14 @@ def group_for(trainer: Trainer, device: str) -> Iterator[tuple[ProcessGroup, str
     trainer
         Method of the training.
     device
-        As for `cpunet.jobs.training.train.train_run`; each process has the GPU of its local
+        See `cpunet.jobs.training.train.train_run`; each process uses the GPU of its local
         rank.
 
     Raises
     ------
     CpunetError
-        If the device is not there, the recipe is not trained by several processes, the batch
-        cannot be shared, or the processes do not find together.
+        If the device is missing, the recipe cannot be trained by several processes, the batch
+        cannot be shared, or the processes cannot connect to each other.
     """
     launched = launch()
     if launched is None:

@@ -1,4 +1,4 @@
-"""What a CycleGAN is given beside its pulses, and what it starts from."""
+"""Inputs of a CycleGAN besides its pulses: noise, chain, teacher and first weights."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from cpunet.training.surroundings import MatchedChain, Surroundings
 
 
 class NetworkStart(NamedTuple):
-    """All that a CycleGAN starts with.
+    """Inputs of a CycleGAN besides its pulses.
 
     Parameters
     ----------
     surroundings
         Noise, chain, teacher.
     fill
-        Fills the networks with the weights of another run; None if there is none.
+        Function that fills the networks with the weights of another run, or None.
     recipe
-        With the chain as it was matched, which may ring.
+        Recipe with the chain as fitted, which can include ringing.
     told
-        What ``run.json`` is to say of the chain.
+        Entry on the chain for ``run.json``.
     """
 
     surroundings: Surroundings
@@ -53,25 +53,26 @@ class NetworkStart(NamedTuple):
 def network_start(
     sides: Sides, recipe: Recipe, seed: int, init: Path | None, monitor: Monitor
 ) -> NetworkStart:
-    """Measure noise and match a chain, as the recipe asks for, and see what `init` gives.
+    """Measure noise and fit a chain, if the recipe requires them, and read `init`.
 
     Parameters
     ----------
     sides
         Prepared pulses, and the file of the measured ones.
     recipe
-        Of a CycleGAN.
+        Recipe of a CycleGAN.
     seed
-        Of the chain's fit.
+        Seed of the fit of the chain.
     init
-        A run to start from: of the same networks, or matched, which then makes pairs.
+        Run to start from: of the same networks, or of a fitted chain. The latter is the
+        teacher, or the starting point for the chain of the recipe.
     monitor
         Receiver of notes on the fit.
 
     Raises
     ------
     CpunetError
-        If `init` does not fit the recipe, or there are no baselines to take noise from.
+        If `init` does not fit the recipe, or there are no baselines to draw noise from.
     """
     matched = init is not None and isinstance(read_recipe(init).generator, ResponseConfig)
     fill = None
@@ -127,7 +128,7 @@ def _matched_chain(
 
 
 def _teacher(init: Path, sides: Sides, recipe: Recipe) -> tuple[ResponseGenerator, Outside]:
-    """The chain of a matched run, with its own noise."""
+    """The fitted chain of a run, with its own noise."""
     config, dt_ns = read_recipe(init).matching.generator, float(read_info(init)["dt_ns"])
     generator = ResponseGenerator(config, dt_ns)
     load_network(init, "ren", generator)
@@ -136,7 +137,7 @@ def _teacher(init: Path, sides: Sides, recipe: Recipe) -> tuple[ResponseGenerato
 
 
 def _require_same_windows(init: Path, recipe: Recipe) -> None:
-    """Raise a `CpunetError` if the networks of a run have seen other windows."""
+    """Raise a `CpunetError` if the networks of a run were trained on other windows."""
     other = read_recipe(init)
     if not isinstance(other.generator, PunetConfig):
         return

@@ -1,4 +1,4 @@
-"""Training by a fit: a readout chain matched to data."""
+"""Training by a fit of a readout chain to data."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from cpunet.training.run_folder import RUN, append_losses
 class ResponseTrainer:
     """Fits a readout chain; see `cpunet.jobs.training.trainers.Trainer`."""
 
-    steps = 1  # their number is not known beforehand
+    steps = 1  # the number of steps is not known beforehand
     resumable = False
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
 
     def require_shareable(self, group: ProcessGroup) -> None:
-        """Refuse several processes: a fit has one."""
+        """Raise an error, since a fit runs in one process."""
         del group
         raise CpunetError(
             f"recipe {self.recipe.name}: takes a minute in one process; "
@@ -61,13 +61,13 @@ class ResponseTrainer:
         job: TrainingJob,
         known: ElectronicsResponse | None = None,
     ) -> Trained:
-        """Fit a readout chain, from a known one or that of ``init`` if there is one."""
+        """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
         started, clock = datetime.now(UTC), time.perf_counter()
         if job.options.init is not None:
             known = known_response(job.options.init, job.data.dt_ns)
         with (
             losses_shown(job.folder, wanted=job.options.tensorboard) as show,
-            # most fits need fewer steps than one start may take
+            # upper limit for one start; most fits need fewer steps
             job.monitor.stage("Matching", self.recipe.matching.training.steps) as advance,
         ):
 

@@ -1,4 +1,4 @@
-"""Two files in, a run folder with trained networks out."""
+"""Train on two files of pulses and write a run folder."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ def train_run(
     sim, data
         Simulated and measured pulses.
     out
-        The run folder; it appears when the training is done. A CycleGAN works in
-        ``OUT.unfinished`` until then, see `cpunet.training.unfinished`.
+        Run folder; it appears when it is complete. Until then a CycleGAN writes to
+        ``OUT.unfinished``, see `cpunet.training.unfinished`.
     stop
-        Asked after each iteration of a CycleGAN whether to store its state and stop.
+        Called after each iteration of a CycleGAN; returns whether to store its state and stop.
     monitor
         Receiver of the progress.
 
     Returns
     -------
     dict
-        The content of ``run.json``; empty in a process that did not write it.
+        Content of ``run.json``; empty in a process that did not write it.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def train_run(
         If the input cannot be used, the folder exists, there is an unfinished training of
         another kind, memory does not suffice, the training diverges or another process fails.
     StoppedError
-        If `stop` asked for it.
+        If `stop` returned true.
     """
     keep_freed_memory()
     trainer = trainer_for(recipe)
@@ -105,7 +105,7 @@ def train_run(
 
 
 def _require_sampling(init: Path, data: InputSet) -> None:
-    """Raise a `CpunetError` if the run to start from had another sampling."""
+    """Raise a `CpunetError` if the run to start from has another sampling period."""
     known_ns = float(read_info(init)["dt_ns"])
     if not np.isclose(known_ns, data.dt_ns):
         kinds = f"trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns"

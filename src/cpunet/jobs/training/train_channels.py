@@ -1,4 +1,4 @@
-"""Train on each channel of a file of data."""
+"""Train a run for each channel of a data file."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ def train_channels(
     Parameters
     ----------
     sim, data
-        Files; the table of the data is ``"all"``, that of the simulation may be.
+        Input files; the table of the data is ``"all"``, that of the simulation can be.
     out
         Folder of the run folders.
     options
-        The run to start from may be the folder of a run for each channel. To resume keeps the
-        runs that are there, and goes on with those that are unfinished.
+        ``init`` can be a folder of runs by channel. ``resume`` keeps finished runs and resumes
+        unfinished ones.
     stop
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     Outcome
-        The content of each ``run.json``, and the reasons why channels have none.
+        Content of each ``run.json``, and the reasons why channels have none.
 
     Raises
     ------
     CpunetError
         If the files cannot be read, or `out` is a run itself.
     StoppedError
-        If it was asked to stop.
+        If `stop` returned true.
     """
 
     def train(name: str, pair: Pair, folder: Path) -> dict[str, Any]:

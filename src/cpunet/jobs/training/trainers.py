@@ -1,4 +1,4 @@
-"""The methods of training, each with one class."""
+"""Training methods, one class each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cpunet.training.process_group import ProcessGroup
 
 
 class Trainer(Protocol):
-    """A method of training, for a recipe.
+    """A training method for a recipe.
 
     Attributes
     ----------
@@ -45,11 +45,11 @@ class Trainer(Protocol):
         """Context of the folder to write to; see `cpunet.jobs.training.train.train_run`."""
 
     def train(self, job: TrainingJob) -> Trained | None:
-        """Train or resume; return None in a process that leaves writing to another one."""
+        """Train or resume; return None in a process that does not write."""
 
 
 def trainer_for(recipe: Recipe) -> Trainer:
-    """Return the method of a recipe."""
+    """Return the training method of a recipe."""
     if isinstance(recipe.training, MatchingConfig):
         return ResponseTrainer(recipe)
     return CycleGanTrainer(recipe)

@@ -1,4 +1,4 @@
-"""A training: its recipe, its pulses, and where it happens."""
+"""A training: its recipe, pulses, options and folder."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Trained(NamedTuple):
     info
         Content of ``run.json``.
     recipe
-        The recipe as it was trained: a chain may have turned out to ring.
+        Recipe as trained; ringing may have been added to its chain.
     """
 
     model: nn.Module
@@ -52,16 +52,16 @@ class TrainOptions:
     seed
         Seed of all random numbers.
     device
-        ``"cpu"``, ``"cuda"`` (a GPU each), or ``"auto"`` for the GPU if there is one.
+        ``"cpu"``, ``"cuda"`` (one GPU per process), or ``"auto"`` for a GPU if there is one.
     init
-        Folder of a run to start from, as of another detector or period: of the same kind, or
-        a matched one, which makes pairs for networks to learn first.
+        Folder of a run to start from, e.g. of another detector or period: of the same kind, or
+        a fitted chain, whose pulse pairs the networks learn first.
     resume
-        Resume an unfinished training, if there is one; all else must be unchanged.
+        Whether to resume an unfinished training, if any; all else must be unchanged.
     force
-        Replace an existing folder and, without `resume`, an unfinished training.
+        Whether to replace an existing folder and, without `resume`, an unfinished training.
     tensorboard
-        Write TensorBoard logs beside the losses (needs the extra ``tensorboard``).
+        Whether to write TensorBoard logs (needs the extra ``tensorboard``).
     """
 
     peak: str = "FEP"
@@ -75,12 +75,12 @@ class TrainOptions:
 
 @dataclass(frozen=True, eq=False)
 class TrainingJob:
-    """What is trained, on which pulses and where.
+    """All inputs of a training.
 
     Parameters
     ----------
     options
-        The device is resolved.
+        Options with a resolved device.
     group
         Processes that train together.
     sim, data, data_file
@@ -88,7 +88,7 @@ class TrainingJob:
     folder
         Folder to write to.
     stop
-        Asked after each iteration of a CycleGAN whether to store its state and stop.
+        Called after each iteration of a CycleGAN; returns whether to store its state and stop.
     """
 
     recipe: Recipe
@@ -131,11 +131,11 @@ class TrainingJob:
 
 @contextmanager
 def losses_shown(folder: Path, *, wanted: bool) -> Iterator[Callable[[list[Record]], None]]:
-    """Yield a function that sends records to TensorBoard, if wanted, after those of the log."""
+    """Yield a function that sends records to TensorBoard, if wanted; send logged ones first."""
     if not wanted:
         yield lambda _records: None
         return
-    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of iterations done again
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # has repeated iterations
     board = LossBoard(folder)
     try:
         board.add(read_losses(folder))

@@ -1,4 +1,4 @@
-"""A run in; its graph for other tools, its noise, and a card that says what they are, out."""
+"""Export a run: its graph for other software, its noise, and a card that describes them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _LANGUAGES = {
 
 @dataclass(frozen=True)
 class Exported:
-    """Files that were written, and the largest difference of a sample from the run."""
+    """Exported files, and the largest difference of a sample from the run."""
 
     graph: Path
     card: Path
@@ -58,11 +58,11 @@ def export_run(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> Exported:
-    """Write a run's deterministic part for other tools, checked against the run.
+    """Export the deterministic part of a run for other software, and check it against the run.
 
-    Beside ``NAME.onnx`` (or whatever `out` is called) stand ``NAME.card.md``, which says what
-    was trained on what, what goes in and comes out and how noise is added, and for a readout
-    chain ``NAME.noise.npz`` with its noise spectrum.
+    Beside ``NAME.onnx`` (or another name of `out`) it writes ``NAME.card.md``, which describes
+    the training, inputs and outputs, and how to add noise.  If the run adds electronic noise,
+    ``NAME.noise.npz`` contains its spectrum.
 
     Parameters
     ----------
@@ -73,11 +73,11 @@ def export_run(
     form
         ``"onnx"``, ``"torchscript"`` or ``"torch-export"``.
     inverse
-        Export IREN instead of REN.
+        Whether to export IREN instead of REN.
     report
-        Folder of a report on this run, whose scores go into the card.
+        Folder of a report on this run, whose scores are copied to the card.
     force
-        Replace existing files.
+        Whether to replace existing files.
     monitor
         Receiver of the progress.
 
@@ -107,7 +107,7 @@ def export_run(
 
 
 def _kept_noise(backend: Backend) -> BaselineNoise | None:
-    """What a translator adds beside its graph, if anything."""
+    """Noise that a translator adds outside of its graph, if any."""
     if isinstance(backend, ResponseBackend):
         return backend.chain.noise
     return backend.noise.noise if isinstance(backend, NoisyNetworkBackend) else None
@@ -188,7 +188,7 @@ def _origin(run: Path, translator: Translator, info: Mapping[str, Any]) -> list[
 
 
 def _fitted(run: Path, translator: Translator) -> list[str]:
-    """What was found of a readout chain; of a network, what it was made as."""
+    """Fitted parameters of a readout chain, or settings of a network."""
     generator = translator.recipe.generator
     if not isinstance(generator, ResponseConfig):
         return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]

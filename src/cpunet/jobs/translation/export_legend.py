@@ -1,4 +1,4 @@
-"""A run in; what it has learned as parameters of LEGEND's simulation chain out.
+"""Export a run as parameters of LEGEND's simulation chain.
 
 The files are those of legend-simflow: electronics (``elecmod``), the mean of A/E against energy
 (``aoemeanmod``) and its resolution (``aoeresmod``), each under the detector's name.
@@ -47,9 +47,9 @@ LEGEND_PARS = FolderKind(
     known_by=WHOLE,
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
 )
-TEMPLATES = 2000  # of a library, on which the two-number kernel is tried
-EVERY_DETECTOR = "default"  # the name under which production looks for what has none
-SAME = ("recipe", "peak", "seed")  # of a report and its run
+TEMPLATES = 2000  # approximate number of templates of a library to test the kernel on
+EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
+SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
 
 def export_legend_pars(
@@ -62,39 +62,39 @@ def export_legend_pars(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Write a folder of parameters as LEGEND's simulation chain reads them.
+    """Write a folder of parameters for LEGEND's simulation chain.
 
     ``elecmod.yaml`` holds sigma and tau of the nearest Gaussian ⊗ exponential, in ns;
     ``aoemeanmod.yaml`` the translation's mean of A/E against energy in keV, 1 at 1592.5 keV;
     ``aoeresmod.yaml`` the data's resolution of A/E; ``cpunet.yaml`` the whole chain with its
-    errors, the error that two numbers make, and delays by which drift times are counted.
+    errors, the error of this two-parameter kernel, and the delay to subtract for drift times.
 
     Parameters
     ----------
     run
         Folder of a training run with a readout chain.
     out
-        Folder to make.
+        Folder to create.
     detector
         Name of the entries; by default that of the detector that the run was trained with,
         or else ``default``.
     report
-        Folder of a report on this run: A/E is taken from there.  Without, its two files are
-        not written.
+        Folder of a report on this run, as source of A/E.  Without it, the two files on A/E
+        are not written.
     library
-        Library of ideal charge pulses, on which the error of two numbers is measured.
+        Library of ideal charge pulses on which the error of the kernel is determined.
     force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
-        The content of ``cpunet.yaml``, under the detector's name.
+        Content of ``cpunet.yaml``, under the detector's name.
 
     Raises
     ------
     CpunetError
-        If the run has no readout chain, or the report is of another run or has no A/E.
+        If the run has no readout chain, or the report belongs to another run or has no A/E.
     """
     given = (run, report, library)
     refuse_existing(out, *given, force=force)
@@ -145,7 +145,7 @@ def _write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Plain Python all through; YAML knows no other numbers."""
+    """Convert nested values to plain Python types, for YAML."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -155,7 +155,7 @@ def _plain(value: Any) -> Any:
 
 def _chain(run: Path) -> Any:
     backend = REN.load(run).backend
-    assert isinstance(backend, ResponseBackend)  # or it had no response to describe
+    assert isinstance(backend, ResponseBackend)  # or `describe_responses` would have raised
     chain: ResponseGenerator = backend.chain
     return learned_chain(chain.response, run.name)
 
@@ -181,7 +181,7 @@ def _against_energy(report: Path, info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _ae_pars(ae: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries of production for A/E: the mean of the translation, the width of the data."""
+    """Production entries for A/E: mean of the translation and width of the data."""
     mean = ae["methods"]["ren"]["mean"]
     width = ae["methods"]["data"]["resolution"]
     return {
@@ -202,7 +202,7 @@ def _of_library(
     undecayed: Exponentials,
     nearest: Equivalent,
 ) -> dict[str, Any]:
-    """What two numbers do to A/E of a detector's places, against the chain."""
+    """Errors of A/E by the kernel, relative to the chain, for templates of a detector."""
     with opened(source) as file:
         require_whole(file, source, set())
         held = chosen_libraries(file, source, wanted, known)
@@ -215,7 +215,7 @@ def _of_library(
     share = rng.random((len(charge), 1), np.float32)
     two_sites = share * charge + (1 - share) * charge[rng.permutation(len(charge))]
     alone = ae_ratios(charge, undecayed, nearest)
-    usual = float(np.median(alone))  # taken off, as A/E is calibrated
+    usual = float(np.median(alone))  # divided out, since A/E is calibrated
     return {"library": library.path, "templates": len(charge)} | {
         name: {"rms_percent": float(apart.std()), "largest_percent": float(np.abs(apart).max())}
         for name, apart in (
@@ -226,7 +226,7 @@ def _of_library(
 
 
 def _some(values: Any) -> npt.NDArray[np.float32]:
-    """Templates of every few rows of r, not more than some thousand."""
+    """Templates of regularly spaced rows of r, a few thousand at most."""
     n_r, n_z, _ = values.shape
     step = max(1, n_r * n_z // TEMPLATES)
     rows = [np.asarray(values[i], np.float32) for i in range(0, n_r, step)]

@@ -1,4 +1,4 @@
-"""What a pulse-shape library must be before anything is done with it."""
+"""Check and copy pulse-shape libraries in files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 
 
 def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
-    """Refuse links that lead nowhere or in circles, and arrays that are mere claims."""
+    """Raise an error for broken or repeated links, and for arrays without stored values."""
     info = h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
         raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
@@ -58,7 +58,7 @@ def libraries(file: h5py.File, source: Path) -> list[str]:
 
 
 def n_templates(file: h5py.File, path: str, source: Path) -> int:
-    """Number of templates; refuses a library that is not of the schema."""
+    """Number of templates; raise an error if the library does not follow the schema."""
     library = file[path or "/"]
     where = f"{source}: {path or '/'}"
     if missing := sorted({"r", "z", "dt"} - set(library)):
@@ -103,8 +103,8 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
 
 
 def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
-    """Copy a dataset by its values: on damaged ones the HDF5 library's own copy crashes."""
-    if not isinstance(item, h5py.Dataset):  # an array whose shape is lost looks like a type
+    """Copy a dataset by value, since HDF5's own copy crashes on damaged datasets."""
+    if not isinstance(item, h5py.Dataset):  # an array without its shape looks like a type
         raise CpunetError(f"{item.file.filename}: '{name}' is no array; write it again")
     require_memory(item.nbytes, f"{item.file.filename}: '{name}'", "give a smaller library")
     try:
@@ -114,7 +114,7 @@ def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
         raise CpunetError(
             f"{item.file.filename}: '{name}' cannot be read ({said}); write it again"
         ) from error
-    stored = item.id.get_create_plist()  # with its filters, whichever plugins they are of
+    stored = item.id.get_create_plist()  # includes the filters, also those of plugins
     if stored.get_external_count() or item.is_virtual:
         copy = made.create_dataset(name, data=values)
     else:
@@ -127,7 +127,7 @@ def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
 
 
 def copy_group(given: h5py.Group, made: h5py.Group) -> None:
-    """Copy a group with all below it by its values; see `copy_values`."""
+    """Copy a group and everything in it by value; see `copy_values`."""
     for key, value in given.attrs.items():
         made.attrs[key] = value
     for name, item in given.items():

@@ -1,4 +1,4 @@
-"""What a lithium layer collects, and when, as a file for reboost's surface model."""
+"""Tables of the charge collected from a lithium layer, for reboost's surface model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.simulation.lithium import LithiumLayer, arrived
 
-LENGTH_NS, STEP_MM = 10_000, 0.01  # as reboost tabulates
+LENGTH_NS, STEP_MM = 10_000, 0.01  # as in the tables of reboost
 
 
 def write_lithium_library(
@@ -27,32 +27,31 @@ def write_lithium_library(
     step_mm: float = STEP_MM,
     force: bool = False,
 ) -> dict[str, float]:
-    """Tabulate the charge that arrives from the depths of a layer.
+    """Tabulate the charge that arrives from a lithium layer by depth and time.
 
-    The LH5 file holds ``struct{depth, dt, t0, arrived, activeness}``: depths in mm from the
-    surface, shares of the charge that have arrived after each nanosecond, shape (times,
-    depths) as `reboost.hpge.psd.make_convolved_surface_library` takes them, and those at the
-    end.
+    The LH5 file contains ``struct{depth, dt, t0, arrived, activeness}``: depths in mm from the
+    surface, shares of the charge that have arrived at each nanosecond, shape (times, depths)
+    as `reboost.hpge.psd.make_convolved_surface_library` takes them, and the final shares.
 
     Parameters
     ----------
     layer
-        Its numbers.
+        Lithium layer.
     step_mm
-        From depth to depth.
+        Spacing of the depths in mm.
     force
-        Replace an existing file.
+        Whether to replace an existing file.
 
     Returns
     -------
     dict
-        ``dead_mm``, the depth at which half of the charge arrives, and ``half_ns``, by when a
-        charge from there has delivered half of what it will.
+        ``dead_mm``, the depth from which half of the charge arrives, and ``half_ns``, the time
+        after which half of that has arrived.
 
     Raises
     ------
     CpunetError
-        If the step is no part of the layer, or the file cannot be written.
+        If the step exceeds the thickness of the layer, or the file cannot be written.
     """
     refuse_existing(out, force=force)
     if not (math.isfinite(step_mm) and 0 < step_mm <= layer.thickness_mm):

@@ -1,4 +1,4 @@
-"""Which libraries of a file are translated for production, and why one cannot be."""
+"""Choose and check the libraries of a file to be translated for production."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from cpunet.translation.ring_padding import padded_axis
 from cpunet.yaml_files import MAX_BYTES, parsed, plain_json
 
 PERIOD_NS = 1.0
-PULSES = "geds/sim"  # of an output of `cpunet simulate`, which tells how it was made
+PULSES = "geds/sim"  # table of `cpunet simulate` with its provenance
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-LARGEST_MM = 500.0  # of any crystal
+LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class IdealLibrary:
-    """Where the templates of a detector stand.
+    """Location of the templates of a detector in a file.
 
     Attributes
     ----------
     path
-        Of the group, the detector's name.
+        Path of the group, the detector's name.
     r_mm, z_mm, dt_ns
-        Nodes and sampling period.
+        Grid points and sampling period.
     angles
-        Such as ``"000_deg"``, ascending.
+        Azimuths such as ``"000_deg"``, ascending.
     """
 
     path: str
@@ -58,7 +58,7 @@ class IdealLibrary:
         Raises
         ------
         CpunetError
-            If these are no nodes, or templates are not sampled every nanosecond.
+            If the axes are not valid, or the templates are not sampled every nanosecond.
         """
         where = f"{source}: {path or '/'}"
         if not path:
@@ -81,11 +81,11 @@ class IdealLibrary:
 
     @property
     def n_templates(self) -> int:
-        """Places times angles."""
+        """Number of grid points times angles."""
         return len(self.r_mm) * len(self.z_mm) * len(self.angles)
 
     def padded_axes(self, rings: int) -> tuple[Values, Values]:
-        """Nodes with rings about them: none at a negative radius."""
+        """Axes with padding on all sides except at negative radii."""
         return padded_axis(self.r_mm, 0, rings), padded_axis(self.z_mm, rings, rings)
 
 
@@ -118,14 +118,14 @@ def chosen_libraries(
     file, source
         The file and its name.
     wanted
-        Names that the user gives; empty for no choice.
+        Names given by the user, or an empty sequence.
     known
-        The detector that the run was trained with, if it tells.
+        Detector that the run was trained with, if known.
 
     Raises
     ------
     CpunetError
-        If one is not there, or none is of the run's detector.
+        If a named library is missing, or none belongs to the detector of the run.
     """
     there = libraries(file, source)
     held = ", ".join(path or "/" for path in there)
@@ -146,7 +146,7 @@ def chosen_libraries(
 
 
 def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
-    """Name of the detector whose simulation a run was trained with, if that can be found."""
+    """Name of the detector whose simulation a run was trained with; None if unknown."""
     try:
         described = parsed(read_text(Path(run) / "detector.yaml", MAX_BYTES))
         name = described.get("name") if isinstance(described, dict) else None
@@ -171,7 +171,7 @@ def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
 def require_complete(
     inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary, source: Path
 ) -> None:
-    """Refuse a library that lacks whole rows of places between others.
+    """Raise an error if a library lacks whole rows of grid points between others.
 
     Raises
     ------

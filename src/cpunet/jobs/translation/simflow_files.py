@@ -1,4 +1,4 @@
-"""Realistic libraries as files: written, read, merged, and components made whole again."""
+"""Write, read and merge realistic libraries, and expand components to templates."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _PACKED: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1, "shu
 
 @dataclass(frozen=True, eq=False)
 class AngleArrays:
-    """Where currents and drift times of one azimuth go."""
+    """Datasets for currents and drift times of one azimuth."""
 
     values: h5py.Dataset
     times: h5py.Dataset
     basis: Floats | None
 
     def put(self, rows: slice, currents: Floats, loss: Loss) -> None:
-        """Write rows of r: currents (rows, z, samples), as they are or as coefficients."""
+        """Write rows of r: currents (rows, z, samples), as templates or as coefficients."""
         if self.basis is None:
             self.values[rows] = currents
             return
@@ -51,7 +51,7 @@ class AngleArrays:
         self.values[rows] = coefficients
 
     def put_times(self, times_ns: Floats | Values) -> None:
-        """Write the drift times of all places."""
+        """Write the drift times of all grid points."""
         self.times[...] = times_ns
 
 
@@ -91,11 +91,11 @@ class Made:
 
 
 def describe(group: h5py.Group, told: str) -> None:
-    """Finish a library: LH5's attribute, and how it was made."""
+    """Add LH5 attributes and the provenance to a complete library."""
     group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
     group.attrs[TOLD] = told
     parent = group.parent
-    while parent.name != "/":  # LH5 wants every level to say what it holds
+    while parent.name != "/":  # LH5 requires this attribute on every level
         parent.attrs["datatype"] = f"struct{{{','.join(sorted(parent))}}}"
         parent = parent.parent
 
@@ -107,15 +107,15 @@ class RealisticLibrary:
     Attributes
     ----------
     detector
-        Its name in the file.
+        Name of the detector in the file.
     r_mm, z_mm
-        Nodes.
+        Grid points.
     dt_ns, t0_ns
-        Sampling period, and time of the first sample before the maximum.
+        Sampling period, and time of the first sample relative to the maximum.
     drift_time_ns
-        By azimuth in degrees, shape (r, z); NaN where there is no template.
+        Drift times by azimuth in degrees, shape (r, z); NaN where there is no template.
     told
-        How the library was made.
+        Provenance of the library.
     """
 
     detector: str
@@ -134,7 +134,7 @@ class RealisticLibrary:
         return None if self._basis is None else len(self._basis)
 
     def template(self, r_mm: float, z_mm: float, angle: int = 0) -> Floats:
-        """The current of the node next to a place, shape (samples,)."""
+        """The current of the grid point nearest to a position, shape (samples,)."""
         i = int(np.abs(self.r_mm - r_mm).argmin())
         j = int(np.abs(self.z_mm - z_mm).argmin())
         stored = self._stored[angle][i, j]
@@ -146,7 +146,7 @@ class RealisticLibrary:
         return stored if self._basis is None else np.asarray(stored @ self._basis)
 
     def for_reboost(self, angle: int = 0) -> Any:
-        """As `reboost.hpge.psd.maximum_current` takes it, 0 where there is no template.
+        """Library for `reboost.hpge.psd.maximum_current`, 0 where there is no template.
 
         Raises
         ------
@@ -173,7 +173,7 @@ def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
     path
         LH5 file that `cpunet library translate --format simflow` or `merge` made.
     detector
-        Name of the library; may be left out if the file has one.
+        Name of the library; can be left out if the file has only one.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def _is_realistic(group: h5py.Group) -> bool:
 
 
 def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) -> list[str]:
-    """Copy realistic libraries of several detectors into one file, as production has it.
+    """Copy realistic libraries of several detectors into one file, as in production.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
     out
         File to write.
     force
-        Replace an existing file.
+        Whether to replace an existing file.
 
     Returns
     -------
@@ -260,8 +260,8 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
     Raises
     ------
     CpunetError
-        If a file holds no realistic library, two are of one detector, or their time axes
-        differ.
+        If a file contains no realistic library, two libraries belong to one detector, or their
+        time axes differ.
     """
     refuse_existing(out, *sources, force=force)
     first: dict[str, tuple[Path, tuple[float, float, int]]] = {}
@@ -311,12 +311,12 @@ def _require_new(
 
 
 def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]:
-    """Make whole templates of components, so that reboost can read the file.
+    """Expand components to whole templates, so that reboost can read the file.
 
     Raises
     ------
     CpunetError
-        If the file holds no library of components.
+        If the file contains no library of components.
     """
     refuse_existing(out, source, force=force)
     done: list[str] = []

@@ -1,4 +1,4 @@
-"""A file of pulses in, the translated file out, row by row."""
+"""Translate the pulses of a file row by row."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
 
 QUIET, DEFAULTS = Monitor(), TranslateOptions()
-BLOCK_SIZE = 4096  # pulses read at a time, fewer of long traces
+BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 
 
@@ -57,12 +57,12 @@ class FileTranslation:
     options
         How to translate.
     device
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Raises
     ------
     CpunetError
-        If the run cannot be used, or does not say what the output in ADC needs.
+        If the run cannot be used, or lacks information for output in ADC counts.
     """
 
     def __init__(self, run: Path, options: TranslateOptions, device: str = "auto") -> None:
@@ -74,7 +74,7 @@ class FileTranslation:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of the output."""
+        """Notes on the output for the user."""
         if isinstance(self.form, AdcForm) and self.form.fills_in:
             window = self.form.config.length
             return [
@@ -98,8 +98,8 @@ class FileTranslation:
         Parameters
         ----------
         noise_key
-            Name that the noise depends on besides the seed, so that files differ; None for
-            noise as from Python.
+            Name that is combined with the seed, so that the noise of files differs; None for
+            the noise of `cpunet.translation.translator.Translator.translate`.
         """
         refuse_inputs(out, self.run, *source.files)
         with only_writer(out):
@@ -127,7 +127,7 @@ class FileTranslation:
         Raises
         ------
         CpunetError
-            If it cannot be read, is sampled otherwise or is of the other side.
+            If it cannot be read, has another sampling period or is of the other side.
         """
         pulses = source.open()
         self._require_sampling(source, pulses)
@@ -137,7 +137,7 @@ class FileTranslation:
     def blocks(
         self, pulses: Iterable[Pulses], noise_key: str | None = None
     ) -> Iterator[Formed]:
-        """Translate pulses that come in blocks; the noise depends on their order alone."""
+        """Translate pulses in blocks of any size; the noise depends only on their order."""
         for number, block in enumerate(regrouped(pulses, NOISE_ROWS)):
             yield self._formed(block, number, noise_key)
 
@@ -160,7 +160,7 @@ class FileTranslation:
             )
 
     def _remedy(self, pulses: PulseSource) -> str:
-        """What to do with pulses of the other side."""
+        """Advice for pulses of the other side."""
         found = recorded_side(pulses)
         if found is not None and "translated" in found.why:
             return f"translate the {self.kind.takes} ones that they were made of"
@@ -229,8 +229,8 @@ def translate_file(
 ) -> dict[str, Any]:
     """Translate all pulses of a file, block by block, keeping their rows and other columns.
 
-    Pulses that cannot be translated stay as rows of NaN (of 0 in ADC); the column
-    ``rejection`` says why (0: translated), and the counts are returned.
+    Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
+    ``rejection`` contains the reason (0: translated), and the counts are returned.
 
     Parameters
     ----------
@@ -239,15 +239,15 @@ def translate_file(
     source
         Simulated pulses, or measured ones for the inverse.
     resume
-        Leave an output as it is that was made of this source with this run and these options.
+        Whether to keep an output that was made from this source with this run and options.
     device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
     dict
         ``read``, ``translated`` and ``rejections`` (counts of rows by reason); in ADC also
-        ``saturated``, and ``skipped`` for an output that was there.
+        ``saturated``, and ``skipped`` for an output that was kept.
 
     Raises
     ------

@@ -29,18 +29,18 @@ def translate_channels(
     Parameters
     ----------
     runs
-        Folder of the runs by channel; or one run, with which all are translated.
+        Folder of runs by channel, or one run for all channels.
     source
         File whose table is ``"all"``.
     out
         Folder of the LH5 files.
     options, how
-        As for `cpunet.jobs.translation.translate.translate_file`.
+        See `cpunet.jobs.translation.translate.translate_file`.
 
     Returns
     -------
     Outcome
-        The counts of each file, and the reasons why channels have none.
+        Counts of each file, and the reasons why channels have none.
 
     Raises
     ------

@@ -47,9 +47,8 @@ def translate_files(
 ) -> Told:
     """Translate files into files of the same names in a folder.
 
-    What comes out depends on the seed and on a file's name, neither on the number of processes
-    nor on the other files.  A file that cannot be translated does not keep the others from
-    being.
+    The output depends on the seed and the name of a file, not on the number of processes or on
+    the other files.  A file that cannot be translated does not stop the others.
 
     Parameters
     ----------
@@ -58,17 +57,17 @@ def translate_files(
     sources
         Files of pulses.
     out
-        Folder; made if it is not there.
+        Output folder; created if missing.
     options
         How to translate, see `cpunet.jobs.translation.translate.translate_file`.
     jobs
-        Number of processes, with a thread each.
+        Number of processes, with one thread each.
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     resume
-        Skip files whose outputs are there, made of the same sources in the same way.
+        Whether to skip files whose outputs exist, made from the same sources in the same way.
     force
-        Replace outputs that are there.
+        Whether to replace existing outputs.
     monitor
         Receiver of the progress.
 
@@ -80,8 +79,8 @@ def translate_files(
     Raises
     ------
     CpunetError
-        Before anything is read, if the run cannot be used, or outputs are there (without
-        `resume` and `force`) or would have the same names; in the end, if files failed.
+        Before the translation, if the run cannot be used, or outputs exist (without `resume`
+        or `force`) or would have the same names; at the end, if files failed.
     """
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
     read = [run, *(given for source in sources for given in source.files)]
@@ -117,12 +116,12 @@ def translate_files(
 
 
 def expanded(names: Sequence[Path]) -> list[Path]:
-    """File names, those with ``*``, ``?`` or ``[`` replaced by the files that fit them.
+    """File names, with patterns (``*``, ``?``, ``[``) replaced by the matching files.
 
     Raises
     ------
     CpunetError
-        If no file fits.
+        If no file matches a pattern.
     """
     found: list[Path] = []
     for name in names:
@@ -151,7 +150,7 @@ class _Maker:
 
     def work(self, monitor: Monitor) -> Callable[[_Task], Told]:
         """Return a function that translates a file."""
-        # a network's last bits depend on the number of threads, and processes share the cores
+        # the last bits of a network depend on the number of threads, and processes share cores
         torch.set_num_threads(1)
         translation = FileTranslation(self.run, self.options, self.device)
 
@@ -215,13 +214,13 @@ def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None
 
 
 def _rows(sources: Sequence[InputFile]) -> int | None:
-    """Pulses of all files; None if one does not tell."""
+    """Number of pulses in all files; None if that of one file is unknown."""
     total = 0
     for source in sources:
         try:
             n = source.open().n_pulses
         except CpunetError:
-            n = 0  # it will fail in its turn
+            n = 0  # its error is reported when it is translated
         if n is None:
             return None
         total += n
@@ -229,7 +228,7 @@ def _rows(sources: Sequence[InputFile]) -> int | None:
 
 
 def _naming(task: _Task, text: str) -> str:
-    """The error, with the file that it belongs to."""
+    """The error message, with the name of the file."""
     named = str(task.source.path) in text or str(task.out) in text
     return text if named else f"{task.source.path}: {text}"
 

@@ -1,4 +1,4 @@
-"""A pulse-shape library in, the same library behind the learned electronics out."""
+"""Translate the templates of pulse-shape libraries."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from cpunet.translation.translator import REN
 QUIET = Monitor()
 TEMPLATES_AT_A_TIME = 1024
 KEPT = 256  # templates to measure the linearity with
-# A template of charge ends near its highest value; one of current, or aligned at it, does not.
+# Templates of charge end near their maximum; templates of current do not.
 MIN_END = 0.5
 
 
 @dataclass
 class _Tally:
-    """What became of the templates, and some of them."""
+    """Counts of the templates by outcome, and a sample of them."""
 
     counts: Counter[str] = field(default_factory=Counter)
     libraries: list[str] = field(default_factory=list)
@@ -79,15 +79,14 @@ def translate_library(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
-    """Translate every template of a library without noise; all else is copied as it is.
+    """Translate every template of a library without noise, and copy everything else unchanged.
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
     `cpunet.jobs.simulation.pulse_shape_library.write_library` make them; a file may hold
-    several, at any depth.  Names, units, shapes, types and the time axis stay; a missing
-    ``t0``, without which reboost cannot read a library, becomes 0.  Templates with NaN stay
-    as they are.
-    Files are streamed.
+    several, at any depth.  Names, units, shapes, types and the time axis are unchanged; a
+    missing ``t0``, without which reboost cannot read a library, becomes 0.  Templates with NaN
+    are unchanged.  Files are streamed.
 
     Parameters
     ----------
@@ -98,12 +97,12 @@ def translate_library(
     out
         LH5 file to write.
     currents
-        Write currents instead, as `reboost.hpge.psd.maximum_current` takes them: in 1/ns,
-        averaged as for a current amplitude, the highest sample at time 0, which ``t0`` then
-        counts from; ``drift_time_*_deg`` become the times of that sample, so that a template
-        shifted by its own stands where its pulse was.
+        Whether to write currents for `reboost.hpge.psd.maximum_current` instead: in 1/ns,
+        averaged as for the current amplitude, with the maximum at time 0 (``t0`` is negative);
+        ``drift_time_*_deg`` become the times of the maxima, by which a template must be
+        shifted to be in its original position.
     device, force, monitor
-        As for `cpunet.jobs.training.train.train_run`.
+        See `cpunet.jobs.training.train.train_run`.
 
     Returns
     -------
@@ -115,7 +114,7 @@ def translate_library(
     Raises
     ------
     CpunetError
-        If the file holds no library of charge templates, or the run cannot translate it.
+        If the file contains no library of charge templates, or the run cannot translate it.
     """
     refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))
@@ -151,7 +150,7 @@ class _Job:
 
 
 def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
-    """Copy a group with all below it, translating the templates of libraries."""
+    """Copy a group and everything in it, and translate the templates of libraries."""
     for key, value in given.attrs.items():
         made.attrs[key] = value
     angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
@@ -185,7 +184,7 @@ def _translate(given: h5py.Dataset, made: Arrays, job: _Job) -> None:
         rows = slice(first, min(first + step, n_r))
         templates = given[rows].reshape(-1, n_samples)
         results, codes = translate(templates)
-        # what holds NaN is outside the crystal, and stays as it is
+        # templates with NaN are outside the crystal and remain unchanged
         unknown = codes == Rejection.NAN
         results[unknown] = templates[unknown]
         made.put(rows, results, translate.dt_ns)

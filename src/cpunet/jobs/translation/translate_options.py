@@ -1,4 +1,4 @@
-"""How to translate a file."""
+"""Options of the translation of a file."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ class TranslateOptions:
     Parameters
     ----------
     inverse
-        Apply IREN (data → simulation-like) instead of REN.
+        Whether to apply IREN (data → simulation-like) instead of REN.
     noise, seed
-        Add noise, drawn with this seed, or none.
+        Whether to add noise, and its seed.
     table
-        Where in the LH5 file to put the pulses; ``geds/ren`` or ``geds/iren`` if None.
+        Table for the pulses in the LH5 file; ``geds/ren`` or ``geds/iren`` if None.
     append_column
         Copy the file and add the pulses to the table that was read, as a column of this name.
     realisations
-        Number of noise draws for each pulse: its row is repeated, and the column
-        ``realisation`` counts.
+        Number of noise draws for each pulse. Each draw is a row, numbered in the column
+        ``realisation``.
     adc
         Raw traces in ADC counts instead of normalised windows.
     remains
         Remains of earlier pulses, with the column ``remains_kev``: ``"learned"`` (in windows as
-        behind the data's quality cuts), ``"none"``, or a rate in kHz.
+        after the quality cuts of the data), ``"none"``, or a rate in kHz.
     pile_up_khz
         Rate in kHz of second pulses within a trace, with the columns ``n_piled``,
         ``piled_kev`` and ``piled_ns``: their number, and energy and time (relative to the

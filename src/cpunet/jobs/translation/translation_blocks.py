@@ -1,4 +1,4 @@
-"""Blocks of pulses of a fixed size, each with noise of its own, and what became of them."""
+"""Blocks of pulses of a fixed size, each with its own noise seed, and counts of the results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection
 from cpunet.translation.output_form import Formed
 
-NOISE_ROWS = 512  # noise is seeded anew for so many pulses, however many are read at a time
+NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 
 
 def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> int:
@@ -21,14 +21,14 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
     Parameters
     ----------
     seed
-        Of the whole.
+        Seed of the translation.
     key
-        Name of the file; None for a file on its own, whose first block then has `seed`
-        itself, as `cpunet.translation.translator.Translator.translate` would.
+        Name of the file; None for a single file, whose first block then has `seed` itself, as
+        in `cpunet.translation.translator.Translator.translate`.
     block
-        Its number in the file.
+        Number of the block in the file.
     realisation
-        How many times its noise was drawn before.
+        Number of times that its noise was drawn before.
     """
     if key is None and block == realisation == 0:
         return seed
@@ -85,7 +85,7 @@ def interleaved(realisations: list[Formed]) -> Formed:
 
 
 class Counts:
-    """How many rows were written, and why some of them hold no pulse."""
+    """Numbers of written rows, with the reasons why some contain no pulse."""
 
     def __init__(self) -> None:
         self.codes = np.zeros(256, np.int64)
@@ -98,22 +98,22 @@ class Counts:
 
     @property
     def read(self) -> int:
-        """All rows."""
+        """Number of all rows."""
         return int(self.codes.sum())
 
     @property
     def translated(self) -> int:
-        """Those that hold a pulse."""
+        """Number of rows with a pulse."""
         return int(self.codes[Rejection.ACCEPTED])
 
     @property
     def rejections(self) -> dict[str, int]:
-        """Counts by reason of those that do not."""
+        """Numbers of rows without a pulse, by reason."""
         rejected = [code for code in np.flatnonzero(self.codes) if code]
         return {Rejection(int(code)).label: int(self.codes[code]) for code in rejected}
 
     def told(self, *, adc: bool) -> dict[str, Any]:
-        """As a dictionary, in ADC with the number of saturated rows."""
+        """Counts as a dictionary, in ADC with the number of saturated rows."""
         told = {
             "read": self.read,
             "translated": self.translated,

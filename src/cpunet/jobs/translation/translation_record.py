@@ -1,4 +1,4 @@
-"""What a translated file says of how it was made, and whether it is the one that is wanted."""
+"""Provenance of a translated file, to decide whether it is the requested one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Record = dict[str, Any]
 
 
 class Stamped(Protocol):
-    """A file in the making."""
+    """A file that is being written."""
 
     def stamp(self, name: str, text: str) -> None:
         """Set an attribute of the file."""
@@ -27,12 +27,12 @@ class Stamped(Protocol):
 
 
 def source_print(source: InputFile) -> Record:
-    """Sizes and times of change of the files that are read.
+    """Names, sizes and modification times of the input files, and how they are read.
 
     Raises
     ------
     CpunetError
-        If one is not there.
+        If a file does not exist.
     """
     paths = [source.path]
     elsewhere = (source.energy or "").rpartition(":")[0]
@@ -74,7 +74,7 @@ def run_print(run: Path) -> str:
 
 
 def finished(out: Path, wanted: Record) -> dict[str, Any]:
-    """Counts of an output that is there already and was made as wanted.
+    """Counts of an existing output that was made as requested.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If it says nothing of how it was made, or was made of another source, with another
+        If it does not record how it was made, or was made from another source, with another
         run or with other options.
     """
     found = _read(out)
@@ -108,7 +108,7 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
 
 
 def _counted(counts: Mapping[str, Any]) -> list[Any]:
-    """What must be whole numbers among the counts of a translation."""
+    """Counts of a translation that must be whole numbers."""
     rejections = counts.get("rejections", {})
     reasons = rejections.values() if isinstance(rejections, dict) else [None]
     optional = [counts[name] for name in ("saturated",) if name in counts]
@@ -120,7 +120,7 @@ def _is_count(value: Any) -> bool:
 
 
 def stamp(file: Stamped, record: Record) -> None:
-    """Write into a file how it was made."""
+    """Write the provenance into a file."""
     file.stamp(TRANSLATION, json.dumps(record))
 
 

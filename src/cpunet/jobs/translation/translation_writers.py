@@ -1,4 +1,4 @@
-"""Where translated pulses go: a table of their own, or a column beside the others."""
+"""Writers of translated pulses, as a new table or as an additional column."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def writer_of(
     *,
     force: bool,
 ) -> Writer:
-    """Make what writes the output; its file is made on entering it.
+    """Make the writer of the output; entering its context creates the file.
 
     Parameters
     ----------
@@ -41,16 +41,16 @@ def writer_of(
     form
         Type, units and start of the samples.
     options
-        Name the table or the column.
+        Options with the name of the table or the column.
     attrs
-        Of the table or the column.
+        Attributes of the table or the column.
     force
-        Replace an existing file.
+        Whether to replace an existing file.
 
     Raises
     ------
     CpunetError
-        If `out` exists, or a column is to be appended to a file that is none of LH5.
+        If `out` exists, or a column is to be appended to a file that is not LH5 or HDF5.
     """
     if options.append_column is None:
         return PulseWriter(

@@ -99,7 +99,7 @@ def _metrics_file(report: Path) -> Path:
 def _names(reports: Sequence[Path]) -> list[str]:
     """Name each report by its folder, with as many parent folders as make it unique.
 
-    Folders at the end that all reports share, as ``report``, are left out.
+    Folders at the end that all reports share, such as ``report``, are left out.
     """
     given = [report.resolve() for report in reports]
     parts = [(path if path.is_dir() else path.parent).parts for path in given]

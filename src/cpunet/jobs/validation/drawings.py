@@ -226,7 +226,7 @@ def _plane(details: PeakDetails, name: str) -> Drawing:
 
 
 def _forward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
-    """Ten simulated pulses there and back again."""
+    """Simulated pulses translated by REN and back by IREN."""
     sim = peak.raw.waveforms[:SHOWN]
     like_data = ren.apply(sim, noise=False)
     titles = ("Simulation", "REN (simulation)", "IREN (REN (simulation))")
@@ -234,7 +234,7 @@ def _forward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
 
 
 def _backward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
-    """Ten measured pulses there and back again."""
+    """Measured pulses translated by IREN and back by REN."""
     data = peak.data.waveforms[:SHOWN]
     like_sim = iren.apply(data, noise=False)
     titles = ("Data", "IREN (data)", "REN (IREN (data))")

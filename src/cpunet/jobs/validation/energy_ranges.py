@@ -76,9 +76,9 @@ def range_survivals(
 def ae_against_energy(
     sim: InputSet, data: InputSet, amplitudes: Mapping[str, Values], recipe: Recipe
 ) -> dict[str, Any]:
-    """Place and width of A/E's single-site peak against energy, of data and translation.
+    """Position and width of the single-site A/E peak against energy, for data and translation.
 
-    All energies that were read take part, see `cpunet.analysis.ae_energy.against_energy`.
+    All energies that were read are used, see `cpunet.analysis.ae_energy.against_energy`.
     """
     return against_energy(
         {method: amplitudes[method] for method in ("data", "ren")},

@@ -43,10 +43,10 @@ from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
 from cpunet.translation.translator import IREN, REN
 
-PAIRS = 200  # of pulses in the test of linearity
-MOST_PULSES = 50_000  # of a side: scores are then certain to some 0.3 percent points
-# Windows that are kept of each pair of pulses: both sides, the rivals' translations, and what
-# is made of them on the way.
+PAIRS = 200  # pairs of pulses in the test of linearity
+MOST_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
+# Windows in memory per pair of pulses: both sides, translations by all methods, and temporary
+# arrays.
 _WINDOWS = 12
 
 
@@ -81,7 +81,7 @@ class Evaluation:
     metrics: dict[str, Any]
 
     def forget_noisy(self) -> None:
-        """Free the translated windows with noise: half of the memory, and only for scores."""
+        """Free translated windows with noise: half of the memory, needed only for scores."""
         for peak in self.sets:
             peak.made.noisy.clear()
 
@@ -101,7 +101,7 @@ class ValidateOptions:
     ae_range_kev
         Further energies to read on both sides for A/E against energy, such as 900 to 2350.
     most
-        Largest number of pulses a side that are compared: of more, a random sample.
+        Maximum number of pulses per side; of larger sets, a random sample is compared.
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     """
@@ -215,7 +215,7 @@ def _load_both(
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe, more_kev)
     length = ren.recipe.preparation.samples_before + ren.recipe.preparation.samples_after
-    # a file that does not tell its number may hold all that are wanted
+    # a file with an unknown number of pulses can contain the maximum
     numbers = [file.open().n_pulses for file in (sim, data)]
     pulses = max(most if n is None else min(most, n) for n in numbers)
     require_memory(
@@ -271,7 +271,7 @@ def period_of(path: Path) -> str | None:
 
 
 def _short(path: Path) -> str:
-    """Name of a file and its folder: the same scores wherever a study lies."""
+    """Name of a file and its folder, which do not depend on where a study is stored."""
     return "/".join(path.absolute().parts[-2:])
 
 

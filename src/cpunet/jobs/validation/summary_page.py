@@ -34,8 +34,8 @@ def summarise_reports(
     ----------
     reports
         Folders of `cpunet validate`, as ``DETECTOR/PERIOD/report`` or ``DETECTOR/PERIOD``.
-        Where not all of them record detector (or channel) and period, each pair once, the
-        folder names identify these.
+        If some do not record detector (or channel) and period, or two record the same, the
+        folder names are used instead.
     out
         Page to write, with links to the reports.
     names
@@ -91,7 +91,7 @@ def detector_and_period(report: Path) -> tuple[str, str]:
     >>> detector_and_period(Path("results/V01/p03"))
     ('V01', 'p03')
     """
-    # not resolved: the name of a link counts
+    # not resolved, since the name of a link counts
     folders = Path(os.path.abspath(report)).parts  # noqa: PTH100 (takes out "..", too)
     if folders[-1] == REPORT:
         folders = folders[:-1]

@@ -1,8 +1,8 @@
 """Translate all simulated pulses by every method once, with and without noise.
 
-Of noise-free pulses a validation needs only a few numbers each, and the samples of about
-twenty events.  These events are translated again for display; keeping all samples would
-double the memory.
+A validation needs only a few numbers per noise-free pulse, and the samples of about twenty
+events.  These events are translated again for display; keeping all samples would double the
+memory.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def translate_all(
     generator = ren.seeded(seed)
     # like the data with which they are compared
     remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
-    # the generators of all methods are alike
+    # the random generators of all methods are in the same state
     noise = None if rivals.noise is None else SameNoise(rivals.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}

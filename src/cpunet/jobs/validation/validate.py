@@ -71,7 +71,7 @@ def validated(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> tuple[Evaluation, dict[str, Drawing]]:
-    """As `validate_run`, with all that was found, and its figures by name; out may be None."""
+    """Like `validate_run`; return all results, and figures by name. `out` can be None."""
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     if out is None:
@@ -96,14 +96,14 @@ def validated(
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
     """All figures of a validation by name."""
-    # matplotlib is not needed while the pulses take most memory
+    # imported late: matplotlib is not needed while the pulses take most memory
     from cpunet.jobs.validation import drawings as figures
 
     return figures.drawings(found)
 
 
 def _of_remains(info: Mapping[str, Any]) -> list[str]:
-    """Remarks on remains of earlier pulses under the data, if they are certain."""
+    """Remarks on remains of earlier pulses in the data, if they are certain."""
     told = (info.get("fit") or {}).get("remains") or {}
     if not told.get("rate_khz"):
         return []

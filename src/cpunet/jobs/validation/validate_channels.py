@@ -1,4 +1,4 @@
-"""Validate the run of each channel of a file of data, and put all on one page."""
+"""Validate the run of each channel of a data file, with a summary page."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def validate_channels(
     Parameters
     ----------
     runs
-        Folder of the runs by channel; or one run, which is validated on all of them.
+        Folder of runs by channel, or one run for all channels.
     sim, data
-        Files; the table of the data is ``"all"``, that of the simulation may be.
+        Input files; the table of the data is ``"all"``, that of the simulation can be.
     out
         Folder of the report folders.
 
     Returns
     -------
     Outcome
-        The content of each ``metrics.json``, and the reasons why channels have none.
+        Content of each ``metrics.json``, and the reasons why channels have none.
 
     Raises
     ------
