@@ -697,6 +697,7 @@ def test_adc_needs_to_be_known(network, tmp_path):
     assert "give --adc-per-kev" in refused()
     assert "give --baseline" in refused(adc_per_kev=5)
     assert "expected a number above 0" in refused(adc_per_kev=0, baseline=5)
+    assert "expected a number that is not negative" in refused(adc_per_kev=5, baseline=-1)
     assert "not within a trace" in refused(adc_per_kev=5, baseline=5, length=100, n_pre=100)
 
 

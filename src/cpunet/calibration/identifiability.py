@@ -1,7 +1,7 @@
 r"""Fisher information of pulses on the physics when the readout chain is free as well.
 
 The derivatives of the compared functions with respect to chain and physics give the information
-of a number of pulses. What the chain can absorb is projected out of the part on the physics.
+of a number of pulses. What the chain can absorb is projected out of the physics part.
 The principal axes of the remainder, in units of the priors, are the directions that the data do
 or do not constrain. Two parameters with the same effect on the pulses are reported as one
 direction, never as two values with small errors.

@@ -251,7 +251,7 @@ class JointProblem:
     def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters).
 
-        If `few` is set, of so many pulses and one draw of noise.
+        If `few` is set, they are of that many pulses and one draw of noise.
         """
         here, steps = self._residuals(vector, self.few), self.parameters.steps
         columns = []
@@ -331,7 +331,7 @@ class JointProblem:
     def _simulated(self, coordinates: Values, most: int | None) -> list[Translated]:
         """Pulses of each band at some coordinates, from the first `most` events.
 
-        The last ones are kept: derivatives of the chain all have the same pulses, whose
+        The last ones are kept: all derivatives of the chain use the same pulses, whose
         preparation and Fourier transform take longer than the chain.
         """
         kept = self._translated.get(most)

@@ -172,7 +172,7 @@ def named(text: str) -> Nuisance:
     Raises
     ------
     CpunetError
-        If there is none of this name.
+        If there is none with this name.
 
     Examples
     --------
@@ -222,7 +222,7 @@ class Physics:
         }
 
     def at(self, coordinates: Values) -> tuple[Detector, SimulationSettings]:
-        """Detector and settings at some coordinates. Fields at 0 are kept bit by bit.
+        """Detector and settings at some coordinates. Fields at coordinate 0 are kept exactly.
 
         Raises
         ------

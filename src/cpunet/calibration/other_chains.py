@@ -1,7 +1,8 @@
 """Other chains, for data that a chain of fixed times does not explain.
 
-What such a chain leaves is not only a larger chi-square. Physics take up part of it: a readout
-with an early decay between the fixed ones looks like more self-repulsion.
+Such a chain does not only leave a larger chi-square. The parameters of the physics absorb part
+of the deviation: a readout with an early decay between the fixed ones looks like more
+self-repulsion.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, with_fr
 STEPS = 12
 # Chi-square beyond chance, in its standard deviations, for which another chain is tried.
 BEYOND_CHANCE = 4.0
-# Decrease of chi-square (five standard deviations) for which a decay gets a time of its own.
+# Decrease of chi-square (five standard deviations) for which the time of a decay is freed.
 NEEDED = 25.0
 
 
@@ -42,9 +43,9 @@ def ringing_chain(
 def decaying_chain(
     problem: JointProblem, sets: PulseSets, training: MatchingConfig
 ) -> ElectronicsResponse | None:
-    """Return a chain whose early decay has a time of its own if the data need it.
+    """Return a chain with one early decay of free time if the data need it.
 
-    The main decay is held to that of the remains, if these are known.
+    The main decay is constrained to that of the remains, if these are known.
     """
     mean, spread = problem.by_chance
     if _cost(problem) < mean + BEYOND_CHANCE * spread:

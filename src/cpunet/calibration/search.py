@@ -40,10 +40,10 @@ FARTHEST, HALVINGS = 1.5, 4
 # Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
 # freed, and maximum number of such parameters.
 NEEDED, MAX_MORE = 25.0, 3
-# Other chains, and the round in which each is first tried: without its ringing no physics
-# explain a readout that rings, but early decays show only when physics are about right.
+# Other chains, and the round in which each is first tried: no physics can replace the ringing
+# of a readout, but early decays are visible only when the physics are about right.
 OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
-# Events with which fixed parameters are looked at.
+# Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
 
 
@@ -226,7 +226,7 @@ class Search:
         return [self._first[i] for i in told]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
-        """Pulses at the moved coordinates, with each move limited to some times its reach."""
+        """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
         nuisances = self.simulator.physics.nuisances
         farthest = FARTHEST * np.array([nuisance.reach for nuisance in nuisances])
         move = np.clip(moved, -farthest, farthest)
@@ -248,7 +248,7 @@ class Search:
     def _other_chain(
         self, problem: JointProblem, kinds: dict[OtherChain, int], number: int, *, settled: bool
     ) -> ElectronicsResponse | None:
-        """Another chain if the data need one. Each kind is found once, or given up."""
+        """Another chain if the data need one. Each kind is used at most once."""
         _, training = self.recipe.matching
         for kind, first in list(kinds.items()):
             if not settled and number != first:
@@ -340,7 +340,7 @@ class Search:
 
 
 def _scale(problem: JointProblem, chi_square: float) -> float:
-    """Scale errors by the root of chi-square over what chance (two sigmas) may give."""
+    """Scale errors by the root of chi-square over its upper limit by chance (two sigmas)."""
     mean, spread = problem.by_chance
     return float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
 
@@ -351,9 +351,9 @@ def _jacobian(problem: JointProblem) -> Values:
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
-    """Damp moves that change sign, to where they and the previous moves would meet.
+    """Damp moves that change sign, by linear interpolation with the previous moves.
 
-    Where pulses are far from linear, a search oscillates about its end.
+    Where pulses are far from linear, a search oscillates around its solution.
     """
     back = moved * last < 0
     share = np.ones(len(moved))

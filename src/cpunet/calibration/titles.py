@@ -1,4 +1,4 @@
-"""What the parameters of the physics are called on pages, in figures and on the terminal."""
+"""Titles of the parameters of the physics on pages, in figures and on the terminal."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""A readout chain and a Positional U-Net beside it, and the inverse of both.
+"""A readout chain corrected by a Positional U-Net, and the inverse of both.
 
-The chain does what filters can; the U-Net sees each pulse about its half maximum, where its
-positional maps mean something, and says by how many samples each sample comes earlier or later.
-That times the slope is added: where nothing moves nothing is, so that baseline, top and tail
-stay the chain's.  A U-Net that starts at zero starts with the chain's translation.
+The chain does what filters can.  The U-Net sees each pulse around its half maximum, where its
+positional maps are meaningful, and returns a time shift for each sample.  The shift times the
+slope is added to the pulse, so that the flat parts (baseline, top and tail) remain those of the
+chain.  A U-Net that starts at zero starts with the chain's translation.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ MIN_HEIGHT = 1e-3
 
 
 class UNetCorrection(RecordCorrection):
-    """What a residual U-Net adds to records about their half maximum.
+    """Correction that a residual U-Net adds to records around their half maximum.
 
     Parameters
     ----------
     unet
-        Residual, of `before` + `after` samples.
+        Residual U-Net for `before` + `after` samples.
     before, after
         Samples of the stretch on either side of the half maximum.
     tail_level
-        Of prepared pulses: the height at which the U-Net sees the end of its stretch.
+        Tail level of prepared pulses, to which the end of a stretch is scaled for the U-Net.
     """
 
     taper: Tensor
@@ -59,7 +59,7 @@ class UNetCorrection(RecordCorrection):
             inside = stretch(records, sample, -self.before, self.after)
             height = inside[:, -TAIL:].mean(dim=1, keepdim=True) / self.tail_level
             height = height.clamp_min(MIN_HEIGHT)
-        # through the records themselves a cycle's gradient comes back
+        # again, with the gradient of a cycle through the records
         inside = stretch(records, sample, -self.before, self.after) / height
         added = self.added(inside)
         index = sample[:, None] + torch.arange(-self.before, self.after, device=records.device)
@@ -67,8 +67,8 @@ class UNetCorrection(RecordCorrection):
         return records.scatter_add(1, index, added * height), added
 
     def added(self, inside: Tensor) -> Tensor:
-        """What is added to stretches of prepared height, shape (batch, before + after)."""
-        # in evaluation the latent mean: the same record every time
+        """Correction for stretches of prepared height, shape (batch, before + after)."""
+        # in evaluation mode, use the latent mean: the same record every time
         out = self.unet(inside[:, None], mean=not self.training)[:, 0]
         slope = torch.diff(inside, dim=1, prepend=inside[:, :1])
         change: Tensor = (out - inside) * slope * self.taper
@@ -81,9 +81,9 @@ class InverseUNet(nn.Module):
     Parameters
     ----------
     inverse
-        Of the chain.
+        Inverse of the chain.
     unet
-        Residual, of `before` + `after` samples.
+        Residual U-Net for `before` + `after` samples.
     before, after
         Samples on either side of the half maximum of the measured pulse.
     """
@@ -101,7 +101,7 @@ class InverseUNet(nn.Module):
         return pulses
 
     def located(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and the sample of each window from which its stretch begins."""
+        """The same, and the sample of each window at which its stretch begins."""
         sample = self.inverse.half_sample(windows)
         begun = stretch(self.inverse(windows), sample, -self.before, self.after)
         out = self.unet(begun[:, None], mean=not self.training)[:, 0]

@@ -1,9 +1,9 @@
-"""A discriminator of strided convolutions, beside the published GRU.
+"""A discriminator of strided convolutions, as an alternative to the published GRU.
 
-It sees the pulse and its current, halves them layer by layer, and averages over what is left.
-No step waits for another as in a GRU, and it has second derivatives on every device, which a
-gradient penalty needs and cuDNN's GRU lacks.  There is no batch norm: a pulse is judged by
-itself, whatever else is in its batch.
+It sees the pulse and its current, halves their length layer by layer, and averages over the
+remaining samples.  Unlike in a GRU, no step waits for another, and it has second derivatives on
+every device, which a gradient penalty needs and cuDNN's GRU lacks.  There is no batch norm, so
+the result for a pulse does not depend on the rest of its batch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEAK = 0.2
 
 
 class ConvDiscriminator(nn.Module):
-    """Say how measured (or simulated) a pulse looks; `forward` gives logits."""
+    """Rate how measured (or simulated) a pulse looks; `forward` returns logits."""
 
     def __init__(self, config: ConvConfig) -> None:
         super().__init__()
@@ -42,4 +42,4 @@ class ConvDiscriminator(nn.Module):
         return logits[:, 0]  # type: ignore[no-any-return]
 
     def fix_statistics(self) -> None:
-        """Nothing here depends on the batch."""
+        """Do nothing: no statistics of the batch are used."""

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from cpunet.recipes.network_settings import GruConfig
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so
-# that the slope at one value points the way to a far one; with 1 to 16 cycles the
-# generator's edge stayed where it was.
+# that the slope at one value points towards distant ones; with 1 to 16 cycles the
+# generator's edge did not move.
 LOWEST, HIGHEST = 0.1, 2.0
 
 
@@ -45,7 +45,7 @@ class InterpolatedEmbedding(nn.Module):
         code = fraction.clamp(0, 1) * last
         lower = code.detach().floor().clamp(max=last - 1)
         part = (code - lower)[..., None]
-        # NaN is no row: it passes through `part`, for the training to notice
+        # NaN has no row, but `part` passes it on, so that the training notices it
         index = lower.nan_to_num().long()
         below = nn.functional.embedding(index, self.weight)
         above = nn.functional.embedding(index + 1, self.weight)
@@ -53,13 +53,13 @@ class InterpolatedEmbedding(nn.Module):
 
 
 class GruDiscriminator(nn.Module):
-    """Say how measured (or simulated) a pulse looks.
+    """Rate how measured (or simulated) a pulse looks.
 
-    `forward` gives logits: the log of the odds that a pulse is real.
+    `forward` returns logits: the log of the odds that a pulse is real.
 
-    The batch norm on the context uses the statistics of the batch in training
-    mode: give it real and translated pulses in one batch then, or the difference
-    between the two is normalised away.
+    In training mode, the batch norm on the context uses the statistics of the batch.
+    Real and translated pulses must then be in one batch, or the difference between
+    the two is normalised away.
     """
 
     def __init__(self, config: GruConfig) -> None:
@@ -83,14 +83,14 @@ class GruDiscriminator(nn.Module):
         return self.judged(*self.gru(self.read(pulses)))
 
     def read(self, pulses: Tensor) -> Tensor:
-        """What the GRU is given of pulses: shape (batch, steps, features)."""
+        """Input of the GRU for pulses, shape (batch, steps, features)."""
         vectors = self.embedding(self._fraction(pulses[:, 0]))  # (batch, samples, dim)
         return vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)  # type: ignore[no-any-return]
 
     def judged(self, outputs: Tensor, final: Tensor) -> Tensor:
         """Logits, shape (batch,), from the GRU's outputs and last states."""
         final = torch.cat([final[0], final[1]], dim=1)  # (batch, both)
-        # s(t) = softmax[I(t) A F]; the root keeps the softmax from saturating at once
+        # s(t) = softmax[I(t) A F]; the root keeps the softmax from saturating at the start
         query = self.attention(final)[:, :, None]  # (batch, both, 1)
         score = torch.softmax(outputs @ query / math.sqrt(final.shape[1]), dim=1)
         context = (score * outputs).sum(dim=1)  # (batch, both)
@@ -98,7 +98,7 @@ class GruDiscriminator(nn.Module):
         return logits[:, 0]  # type: ignore[no-any-return]
 
     def _fraction(self, x: Tensor) -> Tensor:
-        """Where in the table each value lies, 0…1, shape (batch, samples)."""
+        """Position of each value in the table, 0…1, shape (batch, samples)."""
         if self.value_range is not None:
             low, high = self.value_range
             return (x - low) / (high - low)
@@ -106,5 +106,5 @@ class GruDiscriminator(nn.Module):
         return (x - least) / (most - least).clamp(min=torch.finfo(x.dtype).eps)
 
     def fix_statistics(self) -> None:
-        """Judge by the running statistics until the next ``train()``."""
+        """Use the running statistics until the next ``train()``."""
         self.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation

@@ -1,13 +1,13 @@
 r"""A bidirectional GRU computed faster on CPUs, with the same weights and the same results.
 
-On short batches, what takes the time is not a GRU's arithmetic but the number of operations,
-one after the other, over 800 steps.  Here all steps are one compiled loop, each direction on a
-thread of its own.  With the input's part of all gates known beforehand, a step is
+For small batches, the time is limited not by a GRU's arithmetic but by the number of successive
+operations in 800 steps.  Here all steps are one compiled loop, with a thread for each
+direction.  With the input's contribution to all gates computed beforehand, a step is
 
 .. math:: h' = n + u (h - n), \quad n = \tanh(x_n + r (W_n h + b_n)),
           \quad r, u = \sigma(x_{r, u} + W_{r, u} h + b_{r, u})
 
-in torch's notation, where the new state forgets by the update gate `u`.
+in torch's notation, where the update gate `u` keeps the old state.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from torch import Tensor, nn
 from cpunet.kernels import kernel
 
 _DIRECTIONS = ("", "_reverse")
-_TANH_IS_1 = np.float32(10.0)  # beyond, in float32
+_TANH_IS_1 = np.float32(10.0)  # beyond it, tanh is 1 in float32
 
 
 def walk(gru: nn.GRU, given: Tensor) -> tuple[Tensor, Tensor]:
-    """What a bidirectional GRU of one layer gives for an input.
+    """Run a bidirectional GRU of one layer.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def walk(gru: nn.GRU, given: Tensor) -> tuple[Tensor, Tensor]:
     -------
     outputs, last : Tensor
         The outputs, shape (batch, steps, 2 · hidden), and the last states, (2, batch, hidden),
-        as the GRU itself would give them.  There is no second derivative.
+        as the GRU itself would return them.  There is no second derivative.
     """
 
     def both(name: str) -> list[Tensor]:
@@ -87,7 +87,7 @@ class _Walk(torch.autograd.Function):
             return by_gates, None, None
         hidden = width // 2
         by_product = by_gates.view(steps, batch, 2, 3, hidden).clone()
-        by_product[..., 2, :] *= kept[..., :hidden].permute(1, 2, 0, 3)  # n hears r times it
+        by_product[..., 2, :] *= kept[..., :hidden].permute(1, 2, 0, 3)  # r times it is in n
         by_product = by_product.flatten(-2)  # (steps, batch, 2, 3 · hidden)
         before = torch.zeros_like(states).view(steps, batch, 2, hidden)
         before[1:, :, 0] = states[:-1, :, :hidden]
@@ -102,7 +102,7 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
 
 @contextmanager
 def _threads_of_torch() -> Iterator[None]:
-    """No more threads in compiled loops than in torch's own."""
+    """Use no more threads in compiled loops than torch does."""
     before = numba.get_num_threads()
     numba.set_num_threads(min(before, torch.get_num_threads()))
     try:
@@ -114,7 +114,7 @@ def _threads_of_torch() -> Iterator[None]:
 @kernel(inline="always")
 def _tanh(x: Any) -> Any:  # pragma: no cover - compiled
     """Hyperbolic tangent: Lambert's fraction of an eighth, doubled three times."""
-    x = _TANH_IS_1 if x > _TANH_IS_1 else x  # so written that NaN stays NaN
+    x = _TANH_IS_1 if x > _TANH_IS_1 else x  # written so that NaN stays NaN
     x = -_TANH_IS_1 if x < -_TANH_IS_1 else x
     x *= np.float32(0.125)
     s = x * x
@@ -136,7 +136,7 @@ def _sigmoid(x: Any) -> Any:  # pragma: no cover - compiled
 def _step(  # pragma: no cover - compiled
     product: Any, gates: Any, bias: Any, before: Any, kept: Any, state: Any
 ) -> None:
-    """A pulse's next state; reset, update, new and recalled are kept for the way back."""
+    """A pulse's next state; reset, update, new and recalled are kept for the backward pass."""
     h = len(state)
     for k in range(2 * h):
         kept[k] = _sigmoid(gates[k] + product[k] + bias[k])
@@ -172,7 +172,7 @@ def _forth(  # pragma: no cover - compiled
 def _step_back(  # pragma: no cover - compiled
     slope: Any, kept: Any, before: Any, by_gates: Any, by_product: Any, carried: Any
 ) -> None:
-    """Slopes of a pulse's gates; what goes past the product to the state before is carried."""
+    """Gradients of a pulse's gates; `carried` is the direct part for the previous state."""
     h = len(slope)
     one = np.float32(1)
     for k in range(h):

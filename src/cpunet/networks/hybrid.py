@@ -1,10 +1,10 @@
-"""A readout chain and a small network beside it, which changes the edge of its records.
+"""A readout chain and a small network that corrects the edge of its records.
 
-A chain treats all pulses alike.  Where the simulated physics differ from the detector's, the
-edges of single-site and multi-site pulses are off by different amounts, which no chain can
-follow.  The network sees a short stretch of each record about its half maximum, folded into
-channels, and says by how much each sample comes earlier or later.  That times the slope is
-added: where nothing moves, nothing is, so that baseline, top and tail stay the chain's.
+A chain treats all pulses alike.  If the simulated physics differ from the detector's, the edges
+of single-site and multi-site pulses are off by different amounts, which no chain can describe.
+The network sees a short stretch of each record around its half maximum, folded into channels,
+and returns a time shift for each sample.  The shift times the slope is added to the record, so
+that the flat parts (baseline, top and tail) remain those of the chain.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from cpunet.networks.positional_unet import SLOPE, positional_map
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.network_settings import ResidualConfig
 
-BEFORE, AFTER = 64, 96  # samples about the half maximum; tail slopes are measured later
-FOLD = 8  # samples to a step
+BEFORE, AFTER = 64, 96  # samples around the half maximum; tail slopes are measured later
+FOLD = 8  # samples per step
 KERNEL = 5  # steps
 RAMP = 16  # samples over which the correction goes to zero at either end
 SLOPE_SCALE = 20.0  # steepest slopes are a few hundredths of the height per sample
@@ -28,7 +28,7 @@ class RecordCorrection(nn.Module):
     """A network that changes the records of a chain."""
 
     used: Tensor | bool
-    """Whether it changes any."""
+    """Whether it changes any records."""
 
     def corrected(self, records: Tensor) -> tuple[Tensor, Tensor]:
         """Corrected records of any height, shape (batch, samples), and what was added."""
@@ -36,12 +36,12 @@ class RecordCorrection(nn.Module):
 
 
 class EdgeResidual(RecordCorrection):
-    """A U-Net of two levels whose output is added to records; zero until it is trained.
+    """A U-Net of two levels that corrects records; the correction is zero until trained.
 
     Parameters
     ----------
     config
-        Its width.
+        Settings of the network: its width.
     """
 
     position: Tensor
@@ -90,7 +90,7 @@ class EdgeResidual(RecordCorrection):
         Returns
         -------
         Tensor
-            Of the same shape; the same outside the stretch about the half maximum.
+            Records of the same shape, unchanged outside the stretch around the half maximum.
         """
         if not self.training and not self.used:
             return records
@@ -109,7 +109,7 @@ class EdgeResidual(RecordCorrection):
         return records.scatter_add(1, index, added * height), added
 
     def correction(self, inside: Tensor) -> Tensor:
-        """What to add to stretches of height 1, shape (batch, BEFORE + AFTER).
+        """Correction for stretches of height 1, shape (batch, BEFORE + AFTER).
 
         The network's output is a time in samples.
         """
@@ -128,26 +128,26 @@ class HybridGenerator(ResponseGenerator):
     Parameters
     ----------
     chain
-        Whose response and noise are taken over.
+        Chain whose response and noise are used.
     residual
         The correction.
     """
 
     def __init__(self, chain: ResponseGenerator, residual: RecordCorrection) -> None:
-        nn.Module.__init__(self)  # not the base's: all that it would make is there
+        nn.Module.__init__(self)  # not the base's: everything it would make exists already
         self.response, self.remains = chain.response, chain.remains
         for name, values in chain.named_buffers(recurse=False):
             self.register_buffer(name, values)
         self.residual = residual
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Noise-free records of prepared simulated windows, as `ResponseGenerator`."""
+        """Noise-free records of prepared simulated windows, as from `ResponseGenerator`."""
         records: Tensor = self.residual(self.response(windows))
         return records
 
 
 def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
-    """Last sample below half of each maximum (height and place, (n, 1)) before it, (n,)."""
+    """Last sample below half of each maximum before it, (n,), given its `height` and `at`."""
     index = torch.arange(records.shape[1], device=records.device)
     below = (records < 0.5 * height) & (index < at)
     return ((below * (index + 1)).amax(dim=1) - 1).clamp_min(0)
@@ -155,13 +155,13 @@ def half_sample(records: Tensor, height: Tensor, at: Tensor) -> Tensor:
 
 def _folded(stretches: Tensor) -> Tensor:
     """(batch, samples) → (batch, FOLD, samples / FOLD)."""
-    # not by the number of pulses, which would fix it in an exported graph
+    # without the number of pulses, which would be fixed in an exported graph
     folded: Tensor = stretches.unflatten(1, (-1, FOLD))  # type: ignore[no-untyped-call]
     return folded.transpose(1, 2)
 
 
 def _taper() -> Tensor:
-    """1 but for the ends, where it goes to zero smoothly."""
+    """1 except near the ends, where it goes to zero smoothly."""
     samples = torch.arange(BEFORE + AFTER)
     edge = torch.minimum(samples + 0.5, BEFORE + AFTER - 0.5 - samples)
     return torch.sin(0.5 * torch.pi * (edge / RAMP).clamp(max=1)) ** 2

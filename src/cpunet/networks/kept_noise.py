@@ -1,4 +1,4 @@
-"""Noise of baselines that is saved beside a network's weights, to be drawn from later."""
+"""Baseline noise that is saved with a network's weights, to be drawn from later."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
 
-NOISE_BINS = 4097  # of a spectrum as `BaselineNoise` measures it
+NOISE_BINS = 4097  # in a spectrum as measured by `BaselineNoise`
 
 
 class KeptNoise(nn.Module):
@@ -28,7 +28,7 @@ class KeptNoise(nn.Module):
     def __init__(self, dt_ns: float) -> None:
         super().__init__()
         self._dt_ns = float(dt_ns)
-        # (prepared units x keV)^2, see `BaselineNoise`; kinds that are not there have no share
+        # (prepared units x keV)^2, see `BaselineNoise`; kinds that are absent have a share of 0
         for name in ("noise_continua", "noise_lines"):
             self.register_buffer(name, torch.zeros(KINDS, NOISE_BINS))
         self.register_buffer("noise_shares", torch.zeros(KINDS, dtype=torch.float64))
@@ -40,7 +40,7 @@ class KeptNoise(nn.Module):
         return self._dt_ns
 
     def set_noise(self, noise: BaselineNoise) -> None:
-        """Take over a measured spectrum."""
+        """Store a measured spectrum."""
         one = noise.density_of(2 * (NOISE_BINS - 1))[np.newaxis]
         continua = one if noise.kinds is None else noise.kinds
         lines = np.zeros_like(continua) if noise.lines is None else noise.lines

@@ -1,9 +1,9 @@
 """The inverse of a readout chain as one linear map about the half maximum.
 
 Of all linear functions of a measured pulse it is the one that comes closest to the charge
-pulse on average (the Wiener filter of these pulses in this noise).  Each window is taken in
-whole samples from its half maximum: shifts by fractions of a sample would smooth the steep
-part, and make the map worse.
+pulse on average (the Wiener filter of these pulses in this noise).  Windows are aligned at
+half maximum by whole samples: shifts by fractions of a sample would smooth the steep part, and
+degrade the map.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from cpunet.recipes.training_settings import MatchingConfig
 
-AFTER = 170  # samples from the half maximum: charge and slow response have come by then
-MIN_LEVEL = 1e-3  # what is below is no pulse
+AFTER = 170  # samples from the half maximum until charge and slow response have arrived
+MIN_LEVEL = 1e-3  # below it, there is no pulse
 
 
 class Sizes(NamedTuple):
@@ -29,7 +29,7 @@ class Sizes(NamedTuple):
     before, after
         Samples on either side of the half maximum that are translated.
     baseline, level
-        First sample and stop, from the half maximum, of what is made 0 and 1.
+        First sample and stop, from the half maximum, of the parts that are scaled to 0 and 1.
     """
 
     length: int
@@ -40,7 +40,7 @@ class Sizes(NamedTuple):
 
     @classmethod
     def of(cls, length: int, config: MatchingConfig) -> Self:
-        """Sizes that go with the comparison by which a response was matched."""
+        """Sizes for the comparison by which a response was matched."""
         first, stop = config.baseline
         return cls(
             length=length,
@@ -59,7 +59,7 @@ class LinearInverse(nn.Module):
     Parameters
     ----------
     sizes
-        What of a window is used.
+        Stretches of a window that are used.
     """
 
     half_height: Tensor
@@ -75,13 +75,13 @@ class LinearInverse(nn.Module):
         def buffer(name: str, *shape: int) -> None:
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
-        buffer("half_height")  # of the maximum, the same number for all windows
+        buffer("half_height")  # half of the maximum, the same number for all windows
         buffer("mean_in", n)
         buffer("mean_out", n)
         buffer("weights", n, n)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Translate.
+        """Translate measured windows.
 
         Parameters
         ----------
@@ -91,12 +91,12 @@ class LinearInverse(nn.Module):
         Returns
         -------
         Tensor
-            Float32, shape (n, length): pulses within 0 … 1 where the measured ones were, to
-            be aligned and normalised as simulated ones.  NaN where a window has one.
+            Float32, shape (n, length): pulses within 0 … 1 at the times of the measured ones,
+            to be aligned and normalised like simulated ones.  NaN where a window has NaN.
         """
         sample = self.half_sample(windows)
         inside = self.region(windows, sample) - self.mean_in
-        # charge is within 0 … 1; a ripple beyond would be taken for it when pulses are scaled
+        # charge is within 0 … 1; ripples beyond that would affect the scale of the pulses
         pulses = (self.mean_out + inside @ self.weights.T).clamp(0, 1)
         # 0 before the region and 1 after it: one sample on either side stands for the rest
         pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
@@ -119,28 +119,28 @@ class LinearInverse(nn.Module):
         windows
             Shape (n, length).
         sample
-            Of the half maximum of each.
+            Sample of the half maximum of each.
         """
         base, level = self.base_and_level(windows, sample)
         inside = stretch(windows, sample, -self.sizes.before, self.sizes.after)
         return (inside - base[:, None]) / level.clamp_min(MIN_LEVEL)[:, None]
 
     def base_and_level(self, windows: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean before each pulse, and how far above it the mean of its tail is."""
+        """Mean before each pulse, and mean of its tail above that."""
         base = stretch(windows, sample, *self.sizes.baseline).double().mean(dim=1)
         tail = stretch(windows, sample, *self.sizes.level).double().mean(dim=1)
         return base, tail - base
 
 
 def stretch(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
-    """Samples `first` to `stop` from each pulse's own; edge values beyond its ends.
+    """Samples `first` to `stop`, counted from `sample` of each pulse; edges are repeated.
 
     Parameters
     ----------
     pulses
         Shape (n, samples).
     sample
-        Shape (n,), from which is counted.
+        Sample from which is counted, shape (n,).
     """
     index = sample[:, None] + torch.arange(first, stop, device=pulses.device)
     return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))

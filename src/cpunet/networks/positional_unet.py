@@ -64,10 +64,10 @@ SKIP_KERNEL = 65  # samples; about 1 µs at 16 ns
 
 
 class Skip(nn.Module):
-    """What a residual generator adds its correction to: its input, smoothed, moved, weighted.
+    """Input of a residual generator, smoothed, shifted and scaled, which it corrects.
 
-    ``gain[t] * (kernel * pulse)[t + advance]``, the edge values repeated beyond the
-    ends. It starts as the identity; `set` gives it a better start.
+    ``gain[t] * (kernel * pulse)[t + advance]``, with the edge values repeated beyond the
+    ends. It starts as the identity; `set` provides a better start.
     """
 
     gain: Tensor
@@ -116,7 +116,7 @@ class PositionalUNet(nn.Module):
     Raises
     ------
     ValueError
-        If the length is no multiple of 16.
+        If the length is not a multiple of 16.
     """
 
     def __init__(self, config: PunetConfig, length: int) -> None:

@@ -1,4 +1,4 @@
-"""A readout chain with the noise of its baselines: what turns simulation into data."""
+"""A readout chain with its baseline noise, which turns simulation into data."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class ResponseGenerator(KeptNoise):
     Parameters
     ----------
     config
-        Of the response.
+        Configuration of the response.
     dt_ns
         Sampling period in ns.
     """
 
     remains: DrawnRemains | None = None
-    """Of earlier pulses, that records are given beside the noise."""
+    """Remains of earlier pulses, which are added to records with the noise."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
@@ -30,7 +30,7 @@ class ResponseGenerator(KeptNoise):
 
     @property
     def noise_dt_ns(self) -> float:
-        """Sampling period that the response has now."""
+        """Current sampling period of the response in ns."""
         return float(self.response.dt_ns)
 
     @property
@@ -39,6 +39,6 @@ class ResponseGenerator(KeptNoise):
         return TraceNoise(self.noise, self.remains)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Noise-free records of prepared simulated windows, as `ElectronicsResponse`."""
+        """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
         records: Tensor = self.response(windows)
         return records

@@ -1,7 +1,7 @@
 """The response of a readout chain as a differentiable layer: a few physical parameters.
 
-Charge becomes signal through bandwidth poles, slow parts (or overshoot, their negative), a
-ringing if wanted, and decays.  All act on the current of a pulse in the frequency domain, so
+Charge becomes signal through bandwidth poles, slow components (or overshoot, if negative), an
+optional ringing, and decays.  All act on the current of a pulse in the frequency domain, so
 that a set of pulses costs two Fourier transforms.
 """
 
@@ -15,12 +15,12 @@ from torch import Tensor, nn
 
 from cpunet.recipes.network_settings import ResponseConfig
 
-# Samples of room around a window: what the response delays stays in the record.
+# Padding of a window in samples, so that delayed pulses stay within the record.
 PADDING_BEFORE, PADDING_AFTER = 200, 400
-# Windows are zero before them and constant after them, but a decay outlasts the record: its
-# kernel is cut there, and the transform is long enough for nothing to wrap around.
+# Charge is zero before a window and constant after it, but decays outlast the record: their
+# kernel is cut, and the transform is long enough to avoid wrap-around.
 _MIN_FACTOR = 1.6
-IMAGES = 3  # on either side
+IMAGES = 3  # images of the spectrum on either side
 
 
 class ElectronicsResponse(nn.Module):
@@ -31,7 +31,7 @@ class ElectronicsResponse(nn.Module):
     Parameters
     ----------
     config
-        Number of poles, the times whose weights are free, and what to start from.
+        Number of poles, the times whose weights are free, and initial values.
     dt_ns
         Sampling period of the pulses in ns.
     """
@@ -40,7 +40,7 @@ class ElectronicsResponse(nn.Module):
     slow_ns: Tensor
     fast_decays_us: Tensor
     decay_known: float | None = None
-    """Relative error of the main decay, if baselines have told it."""
+    """Relative error of the main decay, if it is known from baselines."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class ElectronicsResponse(nn.Module):
         self.log_ringing = log(rings)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Respond to prepared simulated pulses.
+        """Apply the response to prepared simulated pulses.
 
         Parameters
         ----------
@@ -94,10 +94,10 @@ class ElectronicsResponse(nn.Module):
     def transfer(self, padded: int) -> Tensor:
         """Response to a step of charge at sample 0, as a spectrum of `padded` samples.
 
-        The samples of a pulse are means over the period, and so is the signal wanted.
-        Between them the charge collected so far is taken as a cubic spline, which puts
-        images of the spectrum beyond half the sampling rate; what the electronics let
-        through of these folds back.
+        The samples of a pulse are means over the sampling period, and so are those of the
+        signal.  Between samples, the collected charge is interpolated by a cubic spline, which
+        causes images of the spectrum above half the sampling rate; the part of them that passes
+        the electronics is aliased back.
         """
         dt_ns = self.dt_ns
         frequency = torch.fft.rfftfreq(padded, d=1.0, dtype=torch.float64).to(dt_ns.device)
@@ -133,7 +133,7 @@ class ElectronicsResponse(nn.Module):
         return transfer * slow
 
     def decay(self, time_us: Tensor) -> Tensor:
-        """The decays alone: a step of 1 at time 0, at times of 0 and later in µs."""
+        """Response of the decays alone to a step of 1 at time 0, at times from 0 on in µs."""
         main = torch.exp(-time_us / self.log_decay_us.exp())
         step = main
         for weight, tau in zip(self.decay_weights, self.fast_times_us, strict=True):
@@ -142,7 +142,7 @@ class ElectronicsResponse(nn.Module):
 
     @torch.no_grad()
     def describe(self) -> dict[str, float]:
-        """Learned numbers by name, the unit at the end of the name."""
+        """Fitted parameters by name, with the unit at the end of the name."""
         poles = sorted(self.log_poles_ns.exp().tolist(), reverse=True)
         return (
             {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
@@ -195,5 +195,5 @@ def padded_length(length: int) -> int:
 
 
 def fast_length(least: int) -> int:
-    """The least even number of `least` or more whose prime factors are 2, 3 and 5."""
+    """Smallest even number of `least` or more with no prime factors except 2, 3 and 5."""
     return 2 * int(scipy.fft.next_fast_len((least + 1) // 2, real=True))

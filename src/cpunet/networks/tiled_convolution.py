@@ -1,8 +1,8 @@
 """One-dimensional convolutions with a third to a fifth of the multiplications.
 
-A stretch of `samples` outputs of a convolution is a short circular one, and that is a product
-of discrete Fourier transforms.  All three steps are products with small constant matrices, so
-that a whole layer runs as matrix products:
+A stretch of `samples` outputs of a convolution is a short circular convolution, which is a
+product of discrete Fourier transforms.  All three steps are products with small constant
+matrices, so that a whole layer runs as matrix products:
 
 ``output = inverse @ (spread(kernel) * forward(input))``
 
@@ -11,8 +11,8 @@ with one product of (pulses, channels in) by (channels in, channels out) for eac
 arithmetic the result is that of `torch.nn.functional.conv1d`; in float32 it differs by
 rounding, by about 1e-6 of the largest value.
 
-Activations are kept time first, shape (samples, batch, channels): a stretch of time is then a
-matrix as it lies in memory, and nothing has to be moved.
+Activations are stored time first, shape (samples, batch, channels): a stretch of time is then a
+contiguous matrix in memory, and nothing has to be copied.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-SHORTEST, LONGEST = 8, 64  # samples of a stretch that are tried
+SHORTEST, LONGEST = 8, 64  # range of the length of a stretch in samples
 
 
 class Tiling(NamedTuple):
@@ -47,7 +47,7 @@ class Tiling(NamedTuple):
 
     @property
     def samples(self) -> int:
-        """Outputs of a stretch."""
+        """Number of outputs of a stretch."""
         return len(self.inverse)
 
 
@@ -55,7 +55,7 @@ class Tiling(NamedTuple):
 def tiling(
     kernel: int, length: int, channels_in: int, channels_out: int, dtype: torch.dtype
 ) -> Tiling:
-    """The stretch with the fewest multiplications for a layer of these sizes."""
+    """Tiling with the fewest multiplications for a layer of these sizes."""
     samples = min(
         range(SHORTEST, max(SHORTEST, min(LONGEST, length)) + 1),
         key=lambda m: _cost(m, kernel, length, channels_in, channels_out),
@@ -195,7 +195,7 @@ class _Convolution(torch.autograd.Function):
 
 
 def _gathered(by_spread: Tensor, tiles: Tiling, length: int) -> Tensor:
-    """The adjoint of `_spread_input`: stretches overlap, and add up."""
+    """The adjoint of `_spread_input`: overlapping stretches are added."""
     size = tiles.forward.shape[1]
     overlap = size - tiles.samples
     count = by_spread.shape[1]

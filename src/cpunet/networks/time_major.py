@@ -1,11 +1,12 @@
 """The Positional U-Net computed faster on CPUs, with the same weights and the same results.
 
-Activations are kept time first, shape (samples, batch, channels), where convolutions need a
-third to a fifth of the multiplications (`cpunet.networks.tiled_convolution`), batch norm and
-1×1 convolutions see plain matrices, and halving, doubling and joining move whole rows.
+Activations are stored time first, shape (samples, batch, channels).  Convolutions then need a
+third to a fifth of the multiplications (`cpunet.networks.tiled_convolution`), batch norms and
+1×1 convolutions act on plain matrices, and pooling, interpolation and concatenation move whole
+rows.
 
-Several batches can go through in one pass: each keeps its own batch statistics, as if it had
-come alone, and the running averages take them up one after the other.
+Several batches can be run in one pass: each has its own batch statistics, as if it were run
+alone, and the running averages are updated with one batch after the other.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from cpunet.networks.tiled_convolution import (
 )
 
 NARROWEST = 16  # width below which plain convolutions are as fast
-BLOCK = 16  # pulses that a frozen network takes at once: larger ones do not stay in caches
+BLOCK = 16  # pulses that a frozen network takes at once: larger blocks do not fit into caches
 
 
 def fast_passes_pay(network: PositionalUNet, device: str) -> bool:
-    """Whether this is faster there; on a GPU, cuDNN is."""
+    """Whether these passes are faster on a device; on a GPU, cuDNN is."""
     return device == "cpu" and network.width >= NARROWEST
 
 
@@ -56,7 +57,7 @@ def translate(
         The translation of each, of the same shape.
     """
     groups = len(batches)
-    # side by side: a group's channels become channels of their own to the batch norms
+    # side by side: each group has its own channels in the batch norms
     pulses = torch.stack(batches, dim=1).flatten(0, 1)
     out = _Pass(network, groups, generator)(pulses)
     return out.view(-1, groups, *out.shape[1:]).unbind(dim=1)
@@ -133,7 +134,7 @@ class FrozenUNet(_Pass):
     def translate(
         self, pulses: Tensor, *, generator: torch.Generator | None = None, mean: bool = False
     ) -> Tensor:
-        """As the network's own ``forward``, with the same draws; gives no gradients."""
+        """Like the network's own ``forward``, with the same draws, but without gradients."""
         self.generator, self.mean = generator, mean
         with torch.no_grad():
             return torch.cat([self(block) for block in torch.split(pulses, BLOCK)])
@@ -193,7 +194,7 @@ def _by_group(norm: nn.BatchNorm1d, x: Tensor, groups: int) -> Tensor:
         norm.weight.repeat(groups),
         norm.bias.repeat(groups),
         training=True,
-        momentum=1.0,  # gives the statistics of this batch
+        momentum=1.0,  # returns the statistics of this batch
         eps=norm.eps,
     )
     assert norm.momentum is not None
@@ -220,7 +221,7 @@ def _convolved(convolution: nn.Module, x: Tensor) -> Tensor:
 
 
 def _pointwise(convolution: nn.Module, x: Tensor) -> Tensor:
-    """A convolution of one sample."""
+    """A convolution with a kernel of one sample."""
     assert isinstance(convolution, nn.Conv1d)
     return functional.linear(x, convolution.weight[:, :, 0], convolution.bias)
 
@@ -232,12 +233,12 @@ def _mapped(position: nn.Module, x: Tensor) -> Tensor:
 
 
 def _halved(x: Tensor) -> Tensor:
-    """The larger of each two samples."""
+    """Maximum of each pair of samples."""
     return torch.maximum(x[0::2], x[1::2])
 
 
 def _joined(skip: Tensor, x: Tensor) -> Tensor:
-    """A skip beside what is interpolated to its length, first on first, last on last sample."""
+    """Concatenate a skip with `x`, interpolated to its length with the end samples aligned."""
     result: Tensor = _Joined.apply(skip, x)  # type: ignore[no-untyped-call]
     return result
 
@@ -271,7 +272,7 @@ class _Joined(torch.autograd.Function):
 
 
 def _shares(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Shares of the sample before and of the one after in the new samples."""
+    """Weights of the sample before in even new samples, and of the one after in odd ones."""
     length = len(x)
     share = torch.arange(1, length, dtype=x.dtype, device=x.device) / (2 * length - 1)
     return share[:, None, None], share.flip(0)[:, None, None]

@@ -77,7 +77,7 @@ def recipe_from(settings: Any, source: str) -> Recipe:
 
 
 def _keys(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    """Where in the YAML an error is: without the kind that pydantic puts after a choice."""
+    """Location of an error in the YAML, without the kind that pydantic adds after a choice."""
     kinds = {
         "generator": ("punet", "response", "hybrid"),
         "discriminator": ("gru", "conv"),

@@ -1,4 +1,4 @@
-"""What all settings share: kinds of numbers, and how a class of settings behaves."""
+"""Base of all settings: types of numbers, and the behaviour of a class of settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 NonNegative = Annotated[float, Field(ge=0, le=1e30)]
 Millimetres = Annotated[float, Field(ge=0, le=1000)]
-# Far beyond what anyone needs, and not yet what no machine can hold or live to see.
+# Upper limits are far above any realistic value, but not beyond memory and computing time.
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Samples = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=4096)]
@@ -18,7 +18,7 @@ Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 class Config(BaseModel):
-    """Base of all settings: unknown keys are refused, numbers finite, values never change."""
+    """Base of all settings: without unknown keys, with finite numbers, immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     switches: ClassVar[tuple[str, ...]] = ()  # numbers that may be given as true and false
@@ -26,7 +26,7 @@ class Config(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _numbers_are_numbers(cls, values: Any) -> Any:
-        """Refuse true and false where a number is meant, which would count as 1 and 0."""
+        """Refuse true and false where a number is expected; they would count as 1 and 0."""
         for name, value in values.items() if isinstance(values, Mapping) else ():
             if isinstance(value, bool) and name in cls.model_fields.keys() - {*cls.switches}:
                 kind = cls.model_fields[name].annotation

@@ -25,11 +25,12 @@ class PunetConfig(Config):
 class ResponseConfig(Config):
     """A differentiable readout chain, see `cpunet.networks.response_layer`.
 
-    ``poles_ns`` and ``decay_us`` are where free times start.  ``slow_ns`` and
+    ``poles_ns`` and ``decay_us`` are initial values of free times.  ``slow_ns`` and
     ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
     times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
-    ``ringing_ns`` are where the frequency and the damping of a ringing start; none if null.
-    With ``free_decays`` the ``fast_decays_us`` are free, too, and start there.
+    ``ringing_ns`` are initial values of the frequency and the damping of a ringing; there is
+    none if ``ringing_mhz`` is null.  With ``free_decays`` the ``fast_decays_us`` are initial
+    values of free times, too.
     """
 
     name: Literal["response"]
@@ -43,14 +44,15 @@ class ResponseConfig(Config):
 
 
 class ResidualConfig(Config):
-    """A small network beside a matched response, see `cpunet.training.residual`.
+    """A small network that corrects a matched response, see `cpunet.training.residual`.
 
-    ``width`` is that of its first layer.  ``iterations`` of ``batch_size`` pulses, with a
-    ``rate`` that falls to zero and a ``weight_decay``; the kept weights are a running average
-    with ``average_decay`` per iteration.  ``roughness_weight`` weighs, against a chi-square per
-    function, the mean square of the second differences of what is added, in thousandths of a
-    pulse's height.  A ``held_out`` part of both sets judges: the chi-square of these must fall
-    by the fraction ``least_fall``, and by more than chance.
+    ``width`` is that of its first layer.  It is trained for ``iterations`` of ``batch_size``
+    pulses, with a learning ``rate`` that falls to zero and a ``weight_decay``; the final
+    weights are a running average with ``average_decay`` per iteration.  The loss is a
+    chi-square per function, plus ``roughness_weight`` times the mean square of the second
+    differences of the correction in thousandths of a pulse's height.  A ``held_out`` part of
+    both sets is the test: its chi-square must fall by the fraction ``least_fall``, and by more
+    than chance.
     """
 
     width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
@@ -65,7 +67,7 @@ class ResidualConfig(Config):
 
 
 class HybridConfig(ResponseConfig):
-    """A readout chain with a small network beside it, see `cpunet.networks.hybrid`."""
+    """A readout chain corrected by a small network, see `cpunet.networks.hybrid`."""
 
     name: Literal["hybrid"]  # type: ignore[assignment]
     residual: ResidualConfig
@@ -74,7 +76,7 @@ class HybridConfig(ResponseConfig):
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
-    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more
+    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more samples
     make it that many times faster, on the same embedded samples.  The table of
     vectors spans ``value_range``, or each pulse's own minimum to maximum (the
     paper's choice, blind to the pulse height) if that is null.
@@ -98,8 +100,8 @@ class ConvConfig(Config):
     """A discriminator of convolutions, see `cpunet.networks.conv_discriminator`.
 
     Each of ``layers`` halves the pulse; the first has ``width`` channels, each further one
-    twice as many, up to eight times ``width``.  ``current_gain`` scales the steps from sample
-    to sample, which are seen beside the pulse.
+    twice as many, up to eight times ``width``.  ``current_gain`` scales the differences between
+    samples, which are a second input.
     """
 
     name: Literal["conv"]

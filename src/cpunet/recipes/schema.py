@@ -1,7 +1,7 @@
-"""Every setting of a run, validated: one small class per room.
+"""Every setting of a run, validated: one small class per part of a recipe.
 
-The numbers live in the YAML files beside this module; a field without a value
-in the recipe that needs it is an error, and so is one that nobody reads.
+The values are in the YAML files next to this module.  A missing field is an error,
+and so is an unknown one.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class PreparationConfig(Config):
     """From raw trace to the window a network sees (paper, section 3.3).
 
     Lengths are in samples of the record.  ``max_padding_before`` and
-    ``max_padding_after`` say how many samples of a *measured* window may lie
-    outside its record, and are filled with the baseline and with the last value;
-    simulated pulses are padded without limit, since nothing but charge moves in
-    them.  ``saturation_run`` equal samples at the top make a trace saturated.
+    ``max_padding_after`` limit how many samples of a *measured* window may lie
+    outside its record; these are filled with the baseline and with the last value.
+    Simulated pulses are padded without limit, since they are constant outside it.
+    A trace with ``saturation_run`` equal samples at its top is saturated.
     """
 
     samples_before: Samples
@@ -68,8 +68,8 @@ class PreparationConfig(Config):
 class CutConfig(Config):
     """Half-widths of the quality cuts, in robust standard deviations of the data.
 
-    Median and MAD of the set itself give the windows, so that no constant of
-    one detector enters.
+    The windows follow from median and MAD of the set itself, so that no constant
+    of a particular detector enters.
     """
 
     decay_sigmas: Positive
@@ -78,11 +78,11 @@ class CutConfig(Config):
 
 
 class ScoreConfig(Config):
-    """Histograms and resampling of the comparison of two distributions.
+    """Histograms and resampling for the comparison of two distributions.
 
-    ``sideband_kev`` are the nearest and farthest distances from a line at which there is
-    nothing but its background, and ``continuum_kev`` named ranges without lines, from and to:
-    the survival of an A/E cut is told for them too.
+    ``sideband_kev`` are the nearest and farthest distances of the sidebands from a line, where
+    there is only background.  ``continuum_kev`` are the limits of named ranges without lines,
+    for which the survival of an A/E cut is also reported.
     """
 
     max_bins: Annotated[int, Field(ge=2, le=100_000)]
@@ -104,8 +104,8 @@ class ScoreConfig(Config):
 class SearchConfig(Config):
     """Values of a setting that ``cpunet tune`` tries.
 
-    Either all from ``low`` to ``high``, on a logarithmic scale if ``log``, or one of
-    ``choices``.  Numbers from a whole to a whole number are whole if the setting is.
+    Either a range from ``low`` to ``high``, on a logarithmic scale if ``log``, or one of
+    ``choices``.  Values are integers if ``low``, ``high`` and the setting are.
     """
 
     low: int | float | None = None
@@ -126,11 +126,11 @@ class SearchConfig(Config):
 
 
 class ChainConfig(Config):
-    """A readout chain that is matched before a CycleGAN is trained, and stands before it.
+    """A readout chain that is matched before a CycleGAN is trained, and precedes its networks.
 
     ``generator`` and ``training`` are those of a recipe for a matched response.  The U-Nets
-    then see pulses from ``training.before`` to ``training.after`` samples about their half
-    maximum, and add what the chain leaves.
+    then see pulses from ``training.before`` to ``training.after`` samples around their half
+    maximum, and correct what the chain leaves.
     """
 
     generator: ResponseConfig
@@ -153,7 +153,7 @@ class MatchingSettings(NamedTuple):
 
 
 class Recipe(Config):
-    """All that determines a run but its files, its seed and its device."""
+    """Everything that determines a run except its files, its seed and its device."""
 
     name: str
     description: str
@@ -176,7 +176,7 @@ class Recipe(Config):
         Raises
         ------
         CpunetError
-            If the recipe trains otherwise.
+            If the recipe does not train a CycleGAN.
         """
         if not (
             isinstance(self.generator, PunetConfig)
@@ -193,7 +193,7 @@ class Recipe(Config):
         Raises
         ------
         CpunetError
-            If the recipe trains otherwise.
+            If the recipe does not match a response.
         """
         if not (
             isinstance(self.generator, ResponseConfig)
@@ -204,7 +204,7 @@ class Recipe(Config):
 
     @property
     def residual(self) -> ResidualConfig:
-        """The settings of a network beside a response.
+        """The settings of a network that corrects a response.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class Recipe(Config):
 
     @property
     def of_chain(self) -> Recipe:
-        """The recipe by which the chain before a CycleGAN is matched.
+        """The recipe for matching the chain before a CycleGAN.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Settings of the two ways of training: a CycleGAN, and a response matched by moments."""
+"""Settings of the two training methods: a CycleGAN, and a response matched by moments."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ class PairsConfig(Config):
 
 
 class TrainingConfig(Config):
-    """The loop: how long, how fast, how often.
+    """Settings of the training loop.
 
-    The generators that are kept are running averages of the trained ones, with
+    The final generators are running averages of the trained ones, with
     ``average_decay`` per iteration (0: the last weights, as in the paper); their
-    batch-norm statistics are taken anew over ``statistics_batches``.
+    batch-norm statistics are computed again over ``statistics_batches``.
     ``instance_noise`` is the RMS of white noise added to all that the discriminators
     see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
-    paper): translations carry no electronic noise, and a discriminator that can tell
+    paper): translations have no electronic noise, and a discriminator that recognises
     them by that alone teaches nothing about the shape.  After every
-    ``checkpoint_interval`` iterations all that a training needs to go on is stored.
-    ``precision`` is that of the generators' passes; ``compiled`` has torch.compile fuse them.
-    With ``noise`` from ``baselines`` it is none of the generators' business: noise drawn from
-    the data's own baselines is added to whatever a judge or a score sees.
-    Behind a chain, a ``held_out`` part of both sets says after the training whether REN's
-    network helps pulses that it has not seen; else it is left out (0: it stays in any case).
+    ``checkpoint_interval`` iterations all that is needed to resume the training is saved.
+    ``precision`` is that of the generators' passes; ``compiled`` fuses them by torch.compile.
+    With ``noise`` from ``baselines``, the generators do not make noise: noise drawn from the
+    data's own baselines is added to all that a discriminator or a score sees.
+    With a chain, a ``held_out`` part of both sets is the test after the training: unless REN's
+    network improves these pulses, which it has not seen, it is left out (0: it is always kept).
     """
 
     method: Literal["cyclegan"]
@@ -87,19 +87,19 @@ class TrainingConfig(Config):
 class MatchingConfig(Config):
     """A response matched to data by moments, see `cpunet.training.moments`.
 
-    Pulses are compared from ``before`` to ``after`` samples about their half maximum, once
-    the mean of ``baseline`` (samples before it, from and to) is 0 and that of the last
-    ``level_samples`` the level of the preparation.  ``segments`` are the edges, in samples
-    from the half maximum, of stretches whose means are compared; ``components`` the principal
-    components of the data that are, the first ``squares`` of them also in their squares;
-    ``amplitude_bins`` the bins of the logarithm of the current amplitude, no narrower than
-    ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard deviations.
-    ``ridge`` is the share of a diagonal matrix added to the correlations of all of these.
-    Valleys are searched with ``search_pulses`` of each side, in fits of at most ``steps``
-    iterations.  A fit that ends in the wrong valley is begun again with the response's poles
-    times the next of ``start_factors``; the best of all is kept.  If it is still poor, a
-    ringing is looked for at ``ringing_mhz``.  In the end all pulses are compared, optimally
-    weighted, with ``noise_sets`` draws of the noise each and the components in
+    Pulses are compared from ``before`` to ``after`` samples around their half maximum, with the
+    mean of ``baseline`` (range of samples before it) shifted to 0 and that of the last
+    ``level_samples`` scaled to the level of the preparation.  ``segments`` are the edges, in
+    samples from the half maximum, of stretches whose means are compared; ``components`` is the
+    number of principal components of the data, and the first ``squares`` of them are also
+    squared; ``amplitude_bins`` is the number of bins of the logarithm of the current amplitude,
+    no narrower than ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard
+    deviations.  ``ridge`` is the fraction of the identity in the correlation matrix of all of
+    these.  The valley is searched for with ``search_pulses`` of each side, in fits of at most
+    ``steps`` iterations.  A fit that ends in the wrong valley is started again with the
+    response's poles times the next of ``start_factors``; the best of all is kept.  If it is
+    still poor, a ringing at one of ``ringing_mhz`` is tried.  Finally, all pulses are compared,
+    optimally weighted, with ``noise_sets`` draws of the noise each and the components in
     ``conditional_bins`` of the current amplitude.
     """
 
@@ -124,7 +124,7 @@ class MatchingConfig(Config):
 
     @property
     def iterations(self) -> int:
-        """The most steps of the training: every start, a ringing, and two last fits."""
+        """Maximum number of steps of the training: all starts, a ringing, and two last fits."""
         return self.steps * (len(self.start_factors) + 3)
 
     @model_validator(mode="after")

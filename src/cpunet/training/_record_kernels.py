@@ -1,7 +1,7 @@
-"""Compiled loops of the comparison: records in; aligned pulses, tail slopes, amplitudes out.
+"""Compiled loops that align records and read their tail slopes and current amplitudes.
 
-The same lines as `cpunet.training.half_maximum_alignment.at_half_maximum`, one record at a
-time and without derivatives, ten times faster.
+They align like `cpunet.training.half_maximum_alignment.at_half_maximum`, but one record at a
+time and without derivatives, which is ten times faster.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from cpunet.kernels import kernel
 
 
 class Window(NamedTuple):
-    """Where a record is read, in the form the compiled loop takes it.
+    """Where a record is read, as passed to the compiled loops.
 
     Parameters
     ----------
     level, last
-        Half of the maximum, and the sample from which its crossing is searched backward.
+        Half of the maximum, and the sample from which its crossing is searched for backward.
     before, after
-        Samples of the aligned window about the crossing.
+        Samples of the aligned window on either side of the crossing.
     base_first, base_stop, level_samples, tail_level
-        Samples before the crossing whose mean becomes 0, those at the window's end whose mean
-        becomes the level.
+        Range of samples before the crossing whose mean becomes 0, number of samples at the
+        window's end whose mean becomes the level, and the level.
     align_before, align_after, align_fraction, fit_samples
-        Of the preparation, for the tail slope.
+        Settings of the preparation, for the tail slope.
     edge
-        Samples to either side of the crossing that hold the steepest point.
+        Samples on either side of the crossing that contain the steepest point.
     """
 
     level: float
@@ -52,7 +52,7 @@ FAST = {"nnan", "nsz", "reassoc", "contract"}  # where all numbers are finite
 
 @kernel(error_model="numpy", fastmath=FAST)
 def _mean(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - compiled
-    """Mean of a stretch; edge values stand for what lies beyond the record."""
+    """Mean over a range of samples; edge values are repeated beyond the record."""
     total, n = 0.0, len(record)
     for i in range(max(first, 0), min(stop, n)):
         total += record[i]
@@ -141,7 +141,7 @@ def _normalise(record: Any, sample: int, w: Window) -> None:  # pragma: no cover
 def _window(
     record: Any, time: float, w: Window, aligned: Any
 ) -> None:  # pragma: no cover - compiled
-    """The record about a time, by straight lines between samples."""
+    """Window of the record around a time, by linear interpolation between samples."""
     start = math.floor(time)
     fraction, n = np.float32(time - start), len(record)
     first = int(start) - w.before
@@ -160,7 +160,7 @@ def _window(
 def read_records(
     records: Any, w: Window, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
 ) -> None:  # pragma: no cover - compiled
-    """Align and read each record; baseline and height of the records are changed.
+    """Align and read each record; the records are normalised in place.
 
     Parameters
     ----------
@@ -169,8 +169,8 @@ def read_records(
     w, weights
         Where to read, and the weights of the current amplitude (phases, samples).
     aligned, slopes, amplitudes
-        To be filled: (pulses, before + after) float32, and two of (pulses,) float64. NaN for a
-        record that holds a NaN.
+        Outputs: (pulses, before + after) float32, and two of (pulses,) float64. NaN for a
+        record that contains NaN.
     """
     tail = np.empty(w.fit_samples, np.float32)
     logs = np.empty(w.fit_samples, np.float32)
@@ -183,8 +183,8 @@ def read_records(
         _normalise(record, sample, w)
         time, again = _crossing(record, w.level, sample + 20)
         if again != sample:
-            # baseline and level belong about the crossing of the normalised record: one sample
-            # off, a decay of 50 us makes that many standard deviations of a mean
+            # baseline and level are taken relative to the crossing of the normalised record:
+            # with a decay of 50 us, one sample off is many standard deviations of a mean
             _normalise(record, again, w)
             time, _ = _crossing(record, w.level, again + 20)
         if not math.isfinite(time):
@@ -206,7 +206,7 @@ def read_records(
 def add_noise(
     records: Any, traces: Any, trace: Any, start: Any, factor: Any, noisy: Any
 ) -> None:  # pragma: no cover - compiled
-    """Records plus a stretch of a trace each: which one, from which sample on, times what."""
+    """Add part of a noise trace to each record: index of the trace, start sample, factor."""
     for row in range(len(records)):
         drawn, first, scale = traces[trace[row]], start[row], factor[row]
         for i in range(records.shape[1]):
@@ -215,7 +215,7 @@ def add_noise(
 
 @kernel(error_model="numpy", fastmath=FAST)
 def project(aligned: Any, matrix: Any, out: Any) -> None:  # pragma: no cover - compiled
-    """Product of aligned pulses and a matrix (samples, columns), without threads of its own."""
+    """Product of aligned pulses and a matrix (samples, columns), in a single thread."""
     columns = matrix.shape[1]
     for row in range(len(aligned)):
         for k in range(columns):

@@ -1,8 +1,9 @@
-"""The passes of a training step behind a matched chain.
+"""Forward passes of a training step with U-Nets that follow a matched chain.
 
-The chain and its inverse are fixed; the U-Nets add what these leave.  Cycles know by how much
-each pulse was moved, so that a pulse is compared with itself sample by sample.  Judges see
-both sides aligned at their half maximum, where noise does not move a pulse by tens of samples.
+The chain and its inverse are fixed; the U-Nets correct what these leave.  Cycles keep track of
+how far each pulse was shifted, so that it is compared with itself sample by sample.  The
+discriminators see both sides aligned at half maximum, where noise does not shift a pulse by
+tens of samples.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ from cpunet.training.compared import Compared, Judged
 from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.outside import MIN_SCALE, Outside, of_height, tolerance
 
-LATEST = 60  # samples after the expected half maximum from which it is searched backward
+LATEST = 60  # samples after the expected half maximum from which it is searched for backward
 
 
 class ChainStep:
-    """All that a step compares, behind a chain.
+    """Compute everything that a step compares if there is a chain.
 
     Parameters
     ----------
     chain, inverse
-        Matched, and its inverse.
+        Matched chain, and its inverse.
     ren, iren
         Residual U-Nets.
     recipe
-        With a chain.
+        Recipe with a chain.
     """
 
     def __init__(
@@ -82,19 +83,19 @@ class ChainStep:
         return records
 
     def pairs(self, sim: Tensor, rows: Tensor, outside: Outside) -> tuple[Tensor, Tensor]:
-        """What IREN makes of translated pulses, and what it should."""
+        """Output of IREN for translated pulses, and its target."""
         fake, start = outside.dress(self._by_chain(sim[:, 0]), rows)
         pulses, began = self.iren.located(fake[:, 0])
         return pulses, self._moved(sim[:, 0], start + began)
 
     def data_view(self, windows: Tensor) -> Tensor:
-        """Measured or translated windows, (batch, 1, samples), as the judge sees them."""
+        """Measured or translated windows, (batch, 1, samples), for the discriminator."""
         level = float(self.inverse.half_height)
         last, tail = self.preparation.samples_before + 1, self.preparation.tail_level
         return at_half_maximum(windows[:, 0], level, last, self.matching, tail)[0][:, None]
 
     def sim_view(self, near: Tensor) -> Tensor:
-        """Charge about its half maximum, (batch, samples), as the judge sees it."""
+        """Charge around its half maximum, (batch, samples), for the discriminator."""
         last = self.matching.before + LATEST
         return at_half_maximum(near, 0.5, last, self.matching, 1.0)[0][:, None]
 
@@ -103,7 +104,7 @@ class ChainStep:
         return of_height(self.chain.response(sim), self.preparation.tail_level)
 
     def _moved(self, sim: Tensor, sample: Tensor) -> Tensor:
-        """Simulated pulses from a sample of their records on."""
+        """Simulated pulses from a given sample of their records on."""
         return stretch(sim, sample - PADDING_BEFORE, 0, self.length)
 
     def _near(self, sim: Tensor) -> Tensor:
@@ -111,7 +112,7 @@ class ChainStep:
         return half_sample(sim, highest, at) - self.matching.before
 
     def _back(self, pulses: Tensor, data_near: Tensor) -> Tensor:
-        """What the chain and REN make of charge, beside the measured pulse it came from."""
+        """Charge translated by chain and REN, scaled to the measured pulse it came from."""
         records: Tensor = self.correction(
             of_height(self.chain.response(pulses), self.preparation.tail_level)
         )

@@ -1,8 +1,8 @@
-"""The state of a training as a file: whole, checked, and without pickle.
+"""Checkpoints: the state of a training as a file, verified and without pickle.
 
-Tensors are safetensors; all else is JSON in their header, beside a SHA-256 of both.  A
-checkpoint is written aside and takes the place of the last one, which is kept as the
-previous one, so that at any moment one of the two is whole.
+Tensors are stored as safetensors, everything else as JSON in their header, with a SHA-256 of
+both.  A checkpoint is written to a temporary file, which then replaces the last one.  The last
+one is kept as the previous one, so that one of the two is complete at any moment.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from cpunet.training.loop import State
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 FORMAT = 1
-_ASIDE = ".checkpoint.partial"  # one name: what a killed process left is overwritten
+_ASIDE = ".checkpoint.partial"  # a fixed name: the file of a killed process is overwritten
 _TENSOR = "tensor"
 _ABSENT = "none"
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A state, and what identifies its training."""
+    """The state of a training, and facts that identify the training."""
 
     state: State
     facts: dict[str, Any]
@@ -56,7 +56,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     Raises
     ------
     OSError
-        If it cannot be written, as on a full disk; what was stored is left as it was.
+        If it cannot be written, for example on a full disk; the last checkpoint is kept.
     """
     tensors: dict[str, Tensor] = {}
     plain = _parted(checkpoint.state, "", tensors)
@@ -69,7 +69,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
             (folder / CHECKPOINT).replace(folder / PREVIOUS)
         aside.replace(folder / CHECKPOINT)
     except OSError:
-        aside.unlink(missing_ok=True)  # on a full disk, others need the room
+        aside.unlink(missing_ok=True)  # free the space on a full disk
         raise
     _sync_folder(folder)
 
@@ -77,14 +77,14 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 def _save_durably(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
     try:
         save_file(tensors, path, metadata)
-    except SafetensorError as error:  # all that can go wrong is the writing
+    except SafetensorError as error:  # only the writing can fail here
         raise OSError(str(error)) from error
     with path.open("r+b") as stream:
         os.fsync(stream.fileno())
 
 
 def read_checkpoints(folder: Path) -> Iterator[Checkpoint | None]:
-    """Read the checkpoints of a folder, the latest first; None for one that is damaged.
+    """Read the checkpoints of a folder, latest first; None for a damaged one.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def _read(path: Path) -> Checkpoint | None:
     try:
         with safe_open(require_file(path), "pt") as file:
             metadata = file.metadata()
-            # copies: what an optimiser goes on with must not be a view of the file
+            # copies: an optimiser must not continue with views of the file
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
         text = metadata["json"]
         if metadata["sha256"] != _digest(text, tensors):
@@ -124,13 +124,13 @@ def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     Parameters
     ----------
     then, now
-        What determines the weights, by kind (``"recipe"``, ``"seed"``, …): values, or
-        nested mappings of such.
+        Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …): values,
+        or nested mappings of values.
 
     Raises
     ------
     CpunetError
-        Naming the first difference.
+        If they differ; the message names the first difference.
     """
     for kind in now:
         for difference in differences(then.get(kind), now[kind]):
@@ -141,8 +141,8 @@ def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 
 
 def differences(then: Any, now: Any) -> Iterator[str]:
-    """Each difference of two JSON-like values, as ``"training.batch_size 32 → 16"``."""
-    # as they come back from a file: no tuples
+    """Each difference between two JSON-like values, as ``"training.batch_size 32 → 16"``."""
+    # as read back from a file: without tuples
     old, new = (dict(_leaves("", json.loads(json.dumps(value)))) for value in (then, now))
     for key in old | new:
         before, after = old.get(key, _ABSENT), new.get(key, _ABSENT)
@@ -195,7 +195,7 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the renames last through a loss of power, where the file system can."""
+    """Make the renames survive a power failure, if the file system supports it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

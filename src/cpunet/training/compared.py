@@ -1,4 +1,4 @@
-"""What a training step compares: pulses with what they should be, and with real ones."""
+"""Pulses that a training step compares: outputs with their targets, and with real pulses."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ Pair = tuple[Tensor, Tensor]
 
 
 class Judged(NamedTuple):
-    """Pulses as a judge sees them, each (batch, 1, samples)."""
+    """Pulses as a discriminator sees them, each (batch, 1, samples)."""
 
     real: Tensor
     fake: Tensor
 
 
 class Compared(NamedTuple):
-    """Of each loss, what was made and what was wanted.
+    """Outputs and targets of each loss.
 
     Parameters
     ----------
     identity_data, identity_sim, cycle_forward, cycle_backward
-        Pulses, and those that they are to be.
+        Output pulses and their targets.
     judged_data, judged_sim
-        Of each side.
+        Real and translated pulses for the discriminator of each side.
     tolerance
-        What of the deviations of ``cycle_backward`` counts for nothing; None for nothing.
+        Part of each deviation of ``cycle_backward`` that is ignored; None to ignore nothing.
     """
 
     identity_data: Pair

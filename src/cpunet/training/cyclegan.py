@@ -50,8 +50,8 @@ Discriminator = GruDiscriminator | ConvDiscriminator
 class CycleGan(nn.Module):
     """REN (sim → data), IREN (data → sim) and a discriminator for each side.
 
-    Beside them is saved, and not trained, what a translation needs: a matched chain and its
-    inverse, or the noise that is added outside the generators.
+    Saved with them for translations, but not trained, are a matched chain and its inverse, or
+    the noise that is added outside the generators.
     """
 
     def __init__(self, recipe: Recipe, surroundings: Surroundings = NONE) -> None:
@@ -82,21 +82,23 @@ def _discriminator(config: GruConfig | ConvConfig) -> Discriminator:
 class Step:
     """One training iteration: generators always, discriminators at their interval.
 
-    The learning rates of all three optimisers follow the iteration, also between
-    the discriminators' updates.
+    The learning rates of all three optimisers follow the iteration number, even between
+    updates of the discriminators.
 
     Parameters
     ----------
     model, config
-        What is trained, and how.
+        Networks to train, and settings of the training.
     fast
-        Whether to take the passes of `cpunet.training.fast_step`; as it pays if None.
+        Whether to use the passes of `cpunet.training.fast_step`; None to use them if they are
+        faster.
     group
-        Who trains, each on its own batches; see also `cpunet.training.group_norm`.
+        Process group, each process with its share of every batch; see also
+        `cpunet.training.group_norm`.
     outside
-        What is added to translations before they are judged; nothing if None.
+        Noise and preparation of translations before a discriminator sees them; None for none.
     chain
-        The passes behind a matched chain, if there is one.
+        Passes with a matched chain, if there is one.
     """
 
     def __init__(
@@ -111,7 +113,8 @@ class Step:
     ) -> None:
         self.model = model
         self.outside, self.chain = outside, chain
-        self.accuracy: dict[str, Tensor] = {}  # of the judges, if this iteration updates them
+        # of the discriminators, if this iteration updates them
+        self.accuracy: dict[str, Tensor] = {}
         self._right = torch.empty(0, dtype=torch.bool)
         self.config = config
         self.group = group
@@ -122,7 +125,7 @@ class Step:
             generator_pass(network, config.precision, compiled=config.compiled)
             for network in (model.ren, model.iren)
         )
-        # fast passes have batch norms of their own, which know no group
+        # fast passes have their own batch norms, which do not support groups
         plain = config.compiled or config.precision != "float32" or group.size > 1
         pays = fast_passes_pay(model.ren, device.type) and not plain
         self.fast = pays if fast is None else fast
@@ -153,10 +156,10 @@ class Step:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of a step of the same settings."""
+        """Restore the state of a step with the same settings."""
         optimisers = (self.generators, *self.discriminators)
         for optimiser, own in zip(optimisers, state["optimisers"], strict=True):
-            # a file knows names only, the optimisers count their parameters
+            # the keys of a file are text, but the optimisers number their parameters
             by_number = {int(number): value for number, value in own["state"].items()}
             optimiser.load_state_dict(own | {"state": by_number})
         for schedule, own in zip(self.schedules, state["schedules"], strict=True):
@@ -172,9 +175,9 @@ class Step:
     ) -> dict[str, Tensor]:
         """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
 
-        With noise outside, `rows` say which pulses the simulated ones are.  Discriminator
-        losses are there only in iterations that update them.  In a group, losses are the means
-        of all processes'.
+        With noise outside the generators, `rows` are the indices of the simulated pulses.
+        Discriminator losses are included only in iterations that update the discriminators.
+        In a group, losses are means over all processes.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
         losses, *judged = self._update_generators(sim, data, rows)
@@ -190,7 +193,7 @@ class Step:
     def generator_losses(
         self, sim: Tensor, data: Tensor, rows: Tensor | None = None
     ) -> tuple[dict[str, Tensor], Judged, Judged]:
-        """Return the six losses of the generators and what each discriminator is shown."""
+        """Return the six losses of the generators and the pulses for each discriminator."""
         model, weights = self.model, self.weights
         done = self._compared(sim, data, rows)
         judged_data = logits(model.discriminator_data, self._noisy(done.judged_data.fake))
@@ -206,7 +209,7 @@ class Step:
         return losses, done.judged_data, done.judged_sim
 
     def _compared(self, sim: Tensor, data: Tensor, rows: Tensor | None) -> Compared:
-        """The passes of the generators, with noise if it is theirs to have."""
+        """Run the generators, and add noise to translations if it is added outside of them."""
         model, outside = self.model, self.outside
         if self.chain is not None and outside is not None and rows is not None:
             return self.chain(sim, data, rows, outside)
@@ -242,7 +245,7 @@ class Step:
     ) -> tuple[dict[str, Tensor], Judged, Judged]:
         model = self.model
         discriminators = (model.discriminator_data, model.discriminator_sim)
-        for network in discriminators:  # judged by fixed judges
+        for network in discriminators:  # they are fixed here
             network.requires_grad_(False)
             network.fix_statistics()
         losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
@@ -266,9 +269,9 @@ class Step:
     ) -> tuple[Tensor, Tensor]:
         """Return the adversarial loss and the gradient penalty."""
         weight = self.config.losses.gradient_penalty
-        # one batch: the norm inside must see both kinds at once
+        # in one batch: the batch norm must see both kinds together
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
-        # neither cuDNN's GRU nor the quick one has a second derivative
+        # neither cuDNN's GRU nor the compiled one has a second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
             found = network(pulses) if weight else logits(network, pulses)
         loss = real_loss(found[: len(real)]) + fake_loss(found[len(real) :])

@@ -1,7 +1,7 @@
-"""Where a poor fit is off, and what the likely causes are.
+"""Find the parts of a pulse that a poor fit does not describe, and the likely causes.
 
-A readout is the same for all pulses and shapes no onset: the parts of a pulse that are off tell
-physics, slow parts, remains of earlier pulses and energies from each other.
+A readout is the same for all pulses and does not shape the onset.  The parts that are off
+therefore distinguish physics, slow components, remains of earlier pulses, and energies.
 """
 
 from __future__ import annotations
@@ -12,28 +12,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-OFF = 4.0  # standard deviations, of the mean square of a part's moments
-AS_MUCH = 0.3  # of the worst part: others are told beside it
-# An onset that is off by so much is not drawn off by a fit of what follows it.
+OFF = 4.0  # minimum root mean square pull of the moments of a part
+AS_MUCH = 0.3  # other parts are reported from this fraction of the worst one
+# An onset that is off by more than this is not just the result of fitting what follows it.
 PHYSICS = 8.0
-# Shares of charge that arrive late; an overshoot makes them negative, by some percent.
+# Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
+# negative.
 MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
-ONSET, TOP, TAIL = -8, 15, 84  # samples from the half maximum at which the parts end or begin
+ONSET, TOP, TAIL = -8, 15, 84  # limits of the parts in samples from the half maximum
 _SAMPLES = re.compile(r"samples (-?\d+) to (-?\d+)")
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the pulses, what shapes it, and how to find out.
+    """A part of the pulses, the likely cause of a deviation, and a test of it.
 
     Parameters
     ----------
     name
-        In words.
+        Name in words.
     cause
-        What most likely makes it differ.
+        Most likely cause of a deviation.
     remedy
-        What tests that.
+        How to test that.
     """
 
     name: str
@@ -73,12 +74,12 @@ PARTS = {
 
 
 def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
-    """Parts of the pulses that are off, worst first, with by how many standard deviations.
+    """Root mean square pulls of the parts that are off: a clearly wrong onset, then the worst.
 
     Parameters
     ----------
     pulls
-        Of the moments, by name, as a fit gives them.
+        Pulls of the moments by name, from a fit.
 
     Examples
     --------
@@ -101,7 +102,7 @@ def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
 
 
 def diagnosis(pulls: Mapping[str, float]) -> list[str]:
-    """A line for each part that is off: how much, why, and what to try."""
+    """One line for each part that is off: by how much, why, and what to try."""
     return [
         f"{PARTS[part].name} is off by {size:.0f} σ: {PARTS[part].cause}; "
         f"try: {PARTS[part].remedy}"
@@ -110,12 +111,12 @@ def diagnosis(pulls: Mapping[str, float]) -> list[str]:
 
 
 def beyond(parameters: Mapping[str, float]) -> list[str]:
-    """What of a chain no readout has.
+    """Properties of a fitted chain that no readout has, in words.
 
     Parameters
     ----------
     parameters
-        As `ElectronicsResponse.describe` gives them.
+        Parameters from `ElectronicsResponse.describe`.
 
     Examples
     --------

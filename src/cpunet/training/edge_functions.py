@@ -1,10 +1,11 @@
-"""What a network beside a chain is judged by: means of many functions of a pulse.
+"""Functions of a pulse whose means are compared to train a network that corrects a chain.
 
-As a chain is fitted, so its network is trained: what is compared are means over events,
-weighted by their covariance (see `cpunet.training.moments`), which tell a thousand pulses a
-side what distances of whole distributions do not.  The functions are those of a fit, and more
-that a network can move and a chain cannot: the slopes of the edge, and shape and slope in bins
-of the current amplitude, which tells single-site from multi-site pulses.  All have gradients.
+The network is trained like the chain is fitted: on means over events, weighted by their
+covariance (see `cpunet.training.moments`).  With a thousand pulses per side these show what
+distances between whole distributions do not.  To the functions of the fit are added some that a
+network can change and a chain cannot: the slopes of the edge, and shape and slope in bins of
+the current amplitude, which separates single-site from multi-site pulses.  All are
+differentiable.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from cpunet.training.moments import EDGE, Moments, Values
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.translated import DELAY
 
-# Samples about the half maximum whose derivative is compared, and its principal components.
+# Samples around the half maximum whose derivative is compared, and number of its components.
 SLOPE_BEFORE, SLOPE_AFTER, SLOPE_COMPONENTS = 60, 90, 16
-# Bins of the current amplitude in which the first components of shape and slope are taken.
+# Number of bins of the current amplitude, and of components of shape and slope in each.
 BINS, BIN_COMPONENTS, BIN_SLOPES = 8, 12, 8
 
 
 class Readings(NamedTuple):
-    """What is read of each pulse.
+    """Quantities read from each pulse.
 
     Parameters
     ----------
@@ -49,14 +50,14 @@ class Readings(NamedTuple):
 
 
 class EdgeFunctions:
-    """Functions of a pulse, drawn up from measured ones.
+    """Functions of a pulse, defined by measured pulses.
 
     Parameters
     ----------
     data
         Prepared measured windows, shape (n, samples).
     recipe
-        With a response to be matched.
+        Recipe that matches a response.
     """
 
     def __init__(self, data: FloatArray, recipe: Recipe) -> None:
@@ -92,11 +93,11 @@ class EdgeFunctions:
         self.wide = _as_bins(edges, np.maximum(widths, self.training.amplitude_width))
 
     def of_windows(self, windows: FloatArray) -> Tensor:
-        """Functions of prepared measured windows that can be read, (pulses, functions)."""
+        """Functions of prepared measured windows that can be aligned, (pulses, functions)."""
         return self._functions(self._read(self._aligned_windows(windows)))
 
     def of_records(self, records: Tensor) -> Tensor:
-        """The same of records with noise, of about the height of prepared ones."""
+        """The same for records with noise, of about the height of prepared pulses."""
         last = PADDING_BEFORE + self.preparation.samples_before + DELAY
         return self._functions(self._read(self._aligned(records, last)))
 
@@ -155,9 +156,9 @@ class EdgeMisfit:
     Parameters
     ----------
     values
-        Functions of the measured pulses that weights are derived from, (pulses, functions).
+        Functions of the measured pulses that define the weights, (pulses, functions).
     ridge
-        Share of a diagonal matrix in their correlations.
+        Fraction of the identity in their correlation matrix.
     """
 
     def __init__(self, values: Tensor, ridge: float) -> None:
@@ -169,7 +170,7 @@ class EdgeMisfit:
         self.whiten = torch.from_numpy(whiten).float()
 
     def __call__(self, made: Tensor, measured: Tensor, pairs: float) -> Tensor:
-        """Of two means, shape (functions,), and the harmonic sum of how many each is of."""
+        """Compare two means, shape (functions,); `pairs` is the harmonic sum of the counts."""
         apart = self.whiten @ (made - measured)
         return pairs * apart.square().mean()
 
@@ -179,5 +180,5 @@ def _as_bins(centres: Values, widths: Values) -> Tensor:
 
 
 def _density(log_amplitude: Tensor, bins: Tensor) -> Tensor:
-    """Smooth bins, shape (pulses, bins)."""
+    """Gaussian bins of the current amplitude, shape (pulses, bins)."""
     return torch.exp(-0.5 * ((log_amplitude[:, None] - bins[0]) / bins[1]) ** 2)

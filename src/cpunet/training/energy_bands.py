@@ -1,9 +1,9 @@
 """Bands of energy in which simulated and measured pulses are compared.
 
-Lines and continua hold different mixtures of single and multiple sites, and noise goes as
-1/energy.  So pulses of one line are compared with those of that line, and a continuum in bands
-that are narrow enough for its mixture to be the same.  Within a band of a continuum the two
-sides may have other spectra; simulated pulses then get weights that make them alike.
+Lines and continua have different mixtures of single-site and multi-site events, and noise
+scales as 1/energy.  Pulses of a line are therefore compared with those of the same line, and a
+continuum is compared in bands narrow enough for a constant mixture.  If the spectra of the two
+sides differ within such a band, the simulated pulses are weighted to match the data.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from cpunet.recipes.schema import PeakConfig
 Values = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
-# Ratios of a band's ends: the next only if pulses are too few for any band of the one before.
+# Ratio of the limits of a band; the next is used only if no band of the one before is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
-LEAST = 200  # pulses of each side without which a band is not compared
-SLICES, IN_SLICE = 32, 50  # of a band at most, and pulses of each: spectra are made alike there
-HEAVIEST = 5.0  # weight of a simulated pulse
+LEAST = 200  # minimum number of pulses of each side in a band
+# Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
+SLICES, IN_SLICE = 32, 50
+HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ class EnergyBand:
     sim, data
         Rows of the two sides.
     weights
-        Of the simulated pulses, with a mean of 1.
+        Weights of the simulated pulses, with a mean of 1.
     """
 
     name: str
@@ -51,19 +52,19 @@ class EnergyBand:
 def energy_bands(
     sim_kev: Values, data_kev: Values, peaks: Mapping[str, PeakConfig]
 ) -> list[EnergyBand]:
-    """Part two sets of pulses by energy.
+    """Divide two sets of pulses into bands of energy.
 
     Parameters
     ----------
     sim_kev, data_kev
-        Energies of the two sides; all are pulses to be compared.
+        Energies of the pulses to be compared, on the two sides.
     peaks
-        The lines known.
+        Known lines.
 
     Returns
     -------
     list of EnergyBand
-        Lines first.  Pulses of energies with too few of one side are in none.
+        Lines first.  Energies with too few pulses of one side are in no band.
 
     Raises
     ------
@@ -102,7 +103,7 @@ def energy_bands(
 def _continuum(
     sim_kev: Values, data_kev: Values, sim: Rows, data: Rows, widest: float
 ) -> list[EnergyBand]:
-    """Bands of what is on no line, from the highest energy down."""
+    """Bands of the pulses that are not in a line, from the highest energy down."""
     bands, energies = [], (sim_kev, data_kev)
     rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
     while min(map(len, rows)):
@@ -113,7 +114,7 @@ def _continuum(
         ]
         left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
         if min(counts) >= LEAST and min(left) < LEAST and max(left) < 2 * LEAST:
-            counts = [len(r) for r in rows]  # a small rest goes along
+            counts = [len(r) for r in rows]  # include a small remainder
         parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
         if min(counts) >= LEAST:
             low = min(e[r].min() for r, e in zip(parts, energies, strict=True))

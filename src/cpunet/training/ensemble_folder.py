@@ -1,7 +1,7 @@
-"""A folder of trainings that differ in their seed alone.
+"""A folder of trainings that differ only in their seed.
 
 ``ensemble.json``
-    What all were trained with, and what became of each seed; rewritten after each.
+    Common settings, and the outcome of each seed; rewritten after each seed.
 ``seed_000``, ``seed_001``, …
     Run folders; with ``metrics.json`` if they were scored.
 ``seed_002.unfinished``
@@ -58,7 +58,7 @@ def member_folder(ensemble: Path, seed: int) -> Path:
 
 
 def finished_members(ensemble: Path) -> list[Path]:
-    """Run folders of the seeds whose training is done, by seed.
+    """Run folders of the finished seeds, in order of the seed.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def require_usable(
             f"{out}: exists already; continue with --resume, or choose another name or --force"
         )
     left = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    if left != {_LOCK}:  # of a process that was stopped before it had begun
+    if left != {_LOCK}:  # left by a process that was stopped before it began
         require_replaceable(out, kind)
 
 
@@ -99,27 +99,27 @@ def working_folder(
     alone: bool = True,
     note: Note = lambda _message: None,
 ) -> Iterator[Path]:
-    """Give a folder to work in that stays, whatever happens.
+    """Provide a working folder that is kept, whatever happens.
 
     Parameters
     ----------
     out
         The folder.
     kind
-        What it is; others are never replaced.
+        Kind of the folder; folders of other kinds are never replaced.
     resume
-        Go on in an existing folder.
+        Continue in an existing folder.
     force
         Without `resume`, remove what the program wrote in an existing folder.
     alone
-        Keep other processes out.
+        Lock out other processes.
     note
-        Receiver of notes on what is kept of an old folder.
+        Called with messages on what is kept of an old folder.
 
     Raises
     ------
     CpunetError
-        As by `require_usable`; if it cannot be written to, or another process works there.
+        As in `require_usable`, or if `out` cannot be written to or another process uses it.
     """
     out = Path(out)
     require_usable(out, kind, resume=resume, force=force)
@@ -139,7 +139,7 @@ def working_folder(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a mapping, whole or not at all; numbers that are not finite become null."""
+    """Write a mapping, completely or not at all; non-finite numbers become null."""
     text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
     with written_aside(path) as aside:
         aside.write_text(text + "\n", encoding="utf-8")
@@ -166,21 +166,21 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 class _Seed(BaseModel):
-    """What became of a seed."""
+    """Outcome of a seed."""
 
     state: Literal["trained", "failed"]
     reason: str | None = None
 
 
 class _Study(BaseModel):
-    """What is gone on with, of an ensemble or a search."""
+    """Stored state of an ensemble or search that is resumed."""
 
     begun_with: dict[str, Any]
     seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,9}$")], _Seed] = {}
 
 
 def read_study(path: Path, begun_with: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Read what a study was begun with, which must be the same; None if it was not begun.
+    """Read the stored state of a study; None if it was not begun.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def read_study(path: Path, begun_with: Mapping[str, Any]) -> dict[str, Any] | No
 
 
 def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Keep other processes out."""
+    """Lock out other processes."""
     busy = f"{folder}: another process is working there; wait for it, or choose another --out"
     return locked(folder / _LOCK, busy)
 

@@ -1,9 +1,9 @@
-"""The passes of a training step, in fewer and faster ones with the same results.
+"""The passes of a training step, combined into fewer and faster ones with the same results.
 
-On a CPU, convolutions take most of a step, and the discriminators' GRUs most of the rest.  The
-passes of each generator that need not wait for each other go through together, each with its
-own batch statistics, by way of `cpunet.networks.time_major`; the steps of a GRU are one
-compiled loop (`cpunet.networks.gru_walk`).  On a GPU, cuDNN does better.
+On a CPU, convolutions take most of the time of a step, and the GRUs of the discriminators most
+of the rest.  Independent passes of a generator run together in `cpunet.networks.time_major`,
+each with its own batch statistics; the steps of a GRU are one compiled loop
+(`cpunet.networks.gru_walk`).  On a GPU, cuDNN is faster.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cpunet.training.generator_pass import Pass
 
 
 class Translations(NamedTuple):
-    """What the six passes of the generators give."""
+    """Results of the six passes of the generators."""
 
     fake_data: Tensor
     fake_sim: Tensor

@@ -17,16 +17,16 @@ Pass = Callable[[Tensor], Tensor]
 def generator_pass(
     network: nn.Module, precision: Literal["float32", "bf16"], *, compiled: bool
 ) -> Pass:
-    """Make a function that is the network's ``forward``, shape (batch, 1, samples) to the same.
+    """Make a function equivalent to the network's ``forward``, shape (batch, 1, samples).
 
     Parameters
     ----------
     network
-        A generator; it is left as it is.
+        Generator; it is not modified.
     precision
         ``"bf16"`` does convolutions and their gradients in bfloat16 (torch.autocast).
     compiled
-        Whether torch.compile makes fused kernels of it, at the first call: half a minute.
+        Whether to compile it with torch.compile; this takes half a minute at the first call.
     """
     run: Pass = torch.compile(network) if compiled else network
     if precision == "float32":

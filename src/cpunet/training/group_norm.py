@@ -15,16 +15,16 @@ from cpunet.training.process_group import ProcessGroup
 
 
 class GroupBatchNorm(nn.BatchNorm1d):
-    """In the place of a batch norm of the same weights: takes its statistics over the group.
+    """Replaces a batch norm with the same weights, and takes its statistics over the group.
 
-    All processes give it the same number of pulses.
+    All processes must pass the same number of pulses.
 
     Parameters
     ----------
     norm
-        The batch norm, with weights and running statistics; its tensors are taken over.
+        The batch norm, with weights and running statistics; its tensors are reused.
     group
-        Who trains.
+        Process group.
     """
 
     def __init__(self, norm: nn.BatchNorm1d, group: ProcessGroup) -> None:
@@ -34,7 +34,7 @@ class GroupBatchNorm(nn.BatchNorm1d):
         self.num_batches_tracked = norm.num_batches_tracked
         self.train(norm.training)
         self.group = group
-        # what is said between processes is no kernel; asked for here, as it imports for seconds
+        # communication is not compiled; disabled here, since importing the compiler is slow
         self._of_all = torch.compiler.disable(_of_all)  # type: ignore[no-untyped-call]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -84,13 +84,13 @@ def share_norms(network: nn.Module, group: ProcessGroup) -> None:
 
 
 def _of_all(own: Tensor, group: ProcessGroup) -> Tensor:
-    """Stack the statistics of all processes, each of the same shape; gradients flow."""
+    """Stack the statistics of all processes, each of the same shape; differentiable."""
     rows = (group.rank, group.size - 1 - group.rank)
     return _GroupSum.apply(pad(own[None], (0, 0) * own.ndim + rows), group)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _GroupSum(torch.autograd.Function):
-    """Sum over the group; so is its derivative, and the derivative of that."""
+    """Sum over the group; its first and second derivatives are sums over the group, too."""
 
     @staticmethod
     def forward(ctx: Any, own: Tensor, group: ProcessGroup) -> Tensor:

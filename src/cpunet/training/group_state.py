@@ -1,4 +1,4 @@
-"""State and settings that the leading process shares with the others before they begin."""
+"""Share the state of the leading process with the others, and compare their settings."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from cpunet.training.process_group import ProcessGroup
 
 
 def share_state(group: ProcessGroup, state: State | None) -> State | None:
-    """Give all processes the leader's state to go on from, or None; no file is shared.
+    """Send the leader's state, or None, to all processes; no shared file system is needed.
 
     Parameters
     ----------
     group
-        Who trains.
+        Process group.
     state
-        The leader's; of no account in other processes.
+        State of the leader to continue from; ignored in other processes.
     """
     if group.size == 1:
         return state
@@ -51,12 +51,12 @@ def share_state(group: ProcessGroup, state: State | None) -> State | None:
 
 
 def require_same_everywhere(group: ProcessGroup, fingerprint: dict[str, Any]) -> None:
-    """Refuse to train together on other pulses or with other settings.
+    """Require the same pulses and settings in all processes.
 
     Raises
     ------
     CpunetError
-        Naming a process whose fingerprint differs from the leader's.
+        If a fingerprint differs from the leader's; the message names the process.
     """
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).digest()
     digests = group.gathered(torch.frombuffer(bytearray(digest), dtype=torch.uint8))

@@ -1,8 +1,8 @@
-"""Pulses moved to their half maximum, the same way for measured and translated ones.
+"""Align pulses at half maximum, in the same way for measured and translated ones.
 
 The 99.9 % alignment of the preparation jitters by tens of samples on a flat, noisy top.
-What is compared in a fit is therefore aligned where a pulse is steepest.  Both sides go
-through these lines, sample for sample, so that what they do to a pulse cancels.
+Pulses in a fit are therefore aligned where they are steepest.  Both sides go through the same
+code, so that its effects on a pulse cancel.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from cpunet.recipes.training_settings import MatchingConfig
 
 
 def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tensor]:
-    """Last upward crossing of a level before a sample, by straight lines.
+    """Last upward crossing of a level before a sample, by linear interpolation.
 
     Parameters
     ----------
     records
         Shape (pulses, samples).
     level
-        What is crossed.
+        Level that is crossed.
     last
         Sample of each pulse from which the search goes backward, shape (pulses,).
 
@@ -42,29 +42,29 @@ def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tenso
 def at_half_maximum(
     records: Tensor, level: float, last: int, config: MatchingConfig, tail_level: float
 ) -> tuple[Tensor, Tensor]:
-    """Align, take the baseline off and scale.
+    """Align records, subtract the baseline and scale.
 
     Parameters
     ----------
     records
-        Shape (pulses, samples), of about the height of prepared ones.
+        Shape (pulses, samples), of about the height of prepared pulses.
     level
-        Half of the maximum, of the data's mean pulse: the same number for all sets.
+        Half of the maximum of the data's mean pulse, the same number for all sets.
     last
-        Sample from which the crossing is searched backward.
+        Sample from which the crossing is searched for backward.
     config, tail_level
-        Where the baseline and the level are taken, and what the level is to be.
+        Ranges of baseline and level, and the value that the level is scaled to.
 
     Returns
     -------
     tuple of Tensor
-        Windows of ``before + after`` samples about the crossing, moved by fractions of a
-        sample, and the records with baseline and scale alike.
+        Windows of ``before + after`` samples around the crossing, shifted by fractions of a
+        sample, and the records with the same baseline and scale.
     """
     whole = torch.full((len(records),), last, device=records.device)
     _, sample = crossing(records, level, whole)
     first, stop = config.baseline
-    # once more, since baseline and level belong about the crossing of the normalised record
+    # twice, since baseline and level are relative to the crossing of the normalised record
     for _ in range(2):
         base = stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
         records = records - base

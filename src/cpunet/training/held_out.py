@@ -1,4 +1,4 @@
-"""Whether a network beside a chain helps pulses that it was not trained on."""
+"""Test whether a correction of a chain improves pulses that it was not trained on."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torch import Tensor
 from cpunet.networks.hybrid import RecordCorrection
 from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 
-RESAMPLED = 60  # times, to tell a fall of chi-square from chance
-SURE = 2.5  # of its standard deviations
+RESAMPLED = 60  # bootstrap samples, for the error of the decrease of chi-square
+SURE = 2.5  # minimum decrease in units of its standard deviation
 
 Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What became of a correction.
+    """Result of the test of a correction.
 
     Parameters
     ----------
     kept
         Whether it is used.
     rms
-        Of what it adds to the stretch about the half maximum, in pulse heights; 0 if unused.
+        RMS of what it adds around the half maximum, in pulse heights; 0 if unused.
     held_out_before, held_out_after
         Chi-square per function of the held-out sets without and with it.
     """
@@ -40,14 +40,14 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """Functions of measured pulses, and what translations are compared with them by.
+    """Functions of measured pulses, and their comparison with translations.
 
     Parameters
     ----------
     functions, misfit
-        Drawn up from measured pulses.
+        Functions and their chi-square, defined by measured pulses.
     measured
-        Functions of those that are compared, shape (pulses, functions).
+        Functions of the measured pulses that are compared, shape (pulses, functions).
     """
 
     functions: EdgeFunctions
@@ -55,11 +55,11 @@ class Aim:
     measured: Tensor
 
     def chi_square(self, made: Tensor) -> Tensor:
-        """Per function, of those of translated pulses."""
+        """Chi-square per function, for functions of translated pulses."""
         return self._of(made, self.measured)
 
     def resampled(self, made: list[Tensor], rng: np.random.Generator) -> list[float]:
-        """The same of several translations of one set, with pulses drawn with replacement."""
+        """The same for several translations of one set, with one bootstrap sample of pulses."""
         n, m = len(made[0]), len(self.measured)
         rows, others = (torch.from_numpy(rng.integers(0, size, size)) for size in (n, m))
         return [float(self._of(values[rows], self.measured[others])) for values in made]
@@ -85,7 +85,7 @@ def judge(
     least_fall: float,
     rng: np.random.Generator,
 ) -> Kept:
-    """Compare held-out sets with and without a correction, chance allowed for.
+    """Compare held-out sets with and without a correction, allowing for chance.
 
     Parameters
     ----------
@@ -94,11 +94,11 @@ def judge(
     held_out
         Measured pulses that it has not seen.
     records, noise
-        Of simulated pulses that it has not seen, each (pulses, samples).
+        Records and noise of simulated pulses that it has not seen, each (pulses, samples).
     least_fall
-        Fraction by which chi-square must fall, and by more than `SURE` standard deviations.
+        Fraction by which chi-square must fall; it must also fall by `SURE` standard deviations.
     rng
-        Of the pulses drawn with replacement.
+        Random generator of the bootstrap samples.
     """
     corrected, added = network.corrected(records)
     made = [held_out.functions.of_records(of_one + noise) for of_one in (records, corrected)]

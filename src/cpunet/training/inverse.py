@@ -1,9 +1,9 @@
 """The inverse of a fitted readout chain, in closed form.
 
-A response translates as many simulated pulses as wanted, so that both sides of each are
-known, and its noise has a known spectrum.  The linear map with the least mean square error
-(LMMSE) then follows from covariances.  That of the noise is calculated, not drawn: drawn
-noise would have to be many times more than the pulses not to be taken for signal.
+A response translates any number of simulated pulses, so that both sides of each are known,
+and its noise has a known spectrum.  The linear map with the minimum mean square error (LMMSE)
+then follows from covariances.  The covariance of the noise is calculated: noise drawn at
+random would be mistaken for signal unless it was drawn many times for each pulse.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from cpunet.training.moments import MIN_N
 
 Values = npt.NDArray[np.float64]
 
-# RMS, in pulse heights, of white noise beside that of the baselines: rounding to float32,
-# and what the response does not describe.
+# RMS, in pulse heights, of white noise added to that of the baselines: rounding to float32,
+# and effects that the response does not describe.
 FLOOR = 1e-5
-MOST = 4096  # pulses that are translated for it
-RECORD_SAMPLES = 8192  # of the transform from which the noise's correlations follow
+MOST = 4096  # maximum number of translated pulses
+RECORD_SAMPLES = 8192  # minimum length of the transform that gives the correlation of the noise
 
 
 def fit_inverse(
@@ -52,16 +52,16 @@ def fit_inverse(
     sim
         Prepared simulated windows, shape (n, samples).
     energy_kev
-        Of each, shape (n,): the noise goes as its inverse.
+        Energy of each pulse, shape (n,); noise scales as 1/energy.
     recipe
-        With a response to be matched.
+        Recipe that matches a response.
     seed
-        Of the choice of pulses, if there are more than `MOST`.
+        Seed of the choice of pulses, if there are more than `MOST`.
 
     Returns
     -------
     LinearInverse
-        With its weights.
+        The inverse with its weights.
 
     Raises
     ------
@@ -105,17 +105,17 @@ def _check(sim: FloatArray, energy_kev: Values) -> None:
 def _translated(
     generator: ResponseGenerator, sim: FloatArray, recipe: Recipe
 ) -> tuple[Tensor, Tensor, npt.NDArray[np.int64]]:
-    """Noise-free windows made as those of the data, by how much to read each pulse later.
+    """Noise-free translated windows prepared like the data, and the shift of each pulse.
 
     Returns
     -------
     tuple
-        Windows (n', samples); the sample of the simulated pulse at their sample 0, (n',);
+        Windows (n', samples); sample of the simulated pulse at sample 0 of its window, (n',);
         rows of the pulses that could be prepared, (n',).
     """
     preparation = recipe.preparation
     records = torch.cat([generator(torch.from_numpy(sim[rows])) for rows in blocks(len(sim))])
-    # a record without noise may well have equal samples at its top; none is clipped
+    # a record without noise can have equal samples at its top without being clipped
     config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
     dt_ns = float(generator.response.dt_ns)
     prepared = prepare(Pulses.of(records.numpy(), dt_ns=dt_ns), config, "measured")
@@ -129,10 +129,10 @@ def _translated(
 
 
 def _noise_covariance(noise: BaselineNoise, sizes: Sizes, pulse: Values) -> Values:
-    """Covariance that the noise has in a region, for windows and an energy of 1.
+    """Covariance of the noise in the region, for a level of 1 and an energy of 1 keV.
 
-    The baseline that is subtracted has noise, and so has the level by which a window is
-    divided: that moves all samples together, or scales the pulse.
+    The subtracted baseline and the level by which a window is divided are noisy, too: the
+    former shifts all samples together, the latter scales the pulse.
     """
     first = min(-sizes.before, sizes.baseline[0])
     samples = max(sizes.after, sizes.level[1]) - first
@@ -151,7 +151,7 @@ def _noise_covariance(noise: BaselineNoise, sizes: Sizes, pulse: Values) -> Valu
 
 
 def _regress(inverse: LinearInverse, measured: Values, wanted: Values, noise: Values) -> None:
-    """Put means and the least-squares weights into `inverse`."""
+    """Store the means and the least-squares weights in `inverse`."""
     mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
     measured, wanted = measured - mean_in, wanted - mean_out
     own = measured.T @ measured / len(measured) + noise

@@ -1,4 +1,4 @@
-"""Whether a judge has won or lost: then it teaches a generator nothing."""
+"""Detect discriminators that have won or lost, from which a generator learns nothing."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from cpunet.training.loop import Record
 
-LAST = 0.25  # of the updates, over which accuracies are averaged
-MIN_N = 20  # updates
+LAST = 0.25  # last fraction of the updates, over which accuracies are averaged
+MIN_N = 20  # minimum number of updates
 WON, LOST = 0.95, 0.52
 
 
 def judges_noted(records: Sequence[Record]) -> list[str]:
-    """A line for each judge that has won or lost in the last part of a training.
+    """One line for each discriminator that has won or lost in the last part of a training.
 
     Parameters
     ----------
     records
-        Of the whole training, with the judges' accuracies where they were updated.
+        Records of the whole training, with the accuracies of discriminators where updated.
     """
     told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
     last = told[-max(1, round(LAST * len(told))) :]

@@ -13,13 +13,13 @@ from cpunet.training.moments import Values
 
 Listener = Callable[[int, float], None]
 
-# Far from the data all deviations would be clipped alike, so that first rounds clip later.
+# Far from the data all deviations would be clipped, so the first rounds have wider clips.
 FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
-# Fall of chi-square, in units of chi-square per moment, with which a fit ends: a few tenths
-# of a standard deviation along the worst-known direction.
+# Decrease of chi-square, in units of chi-square per moment, below which a fit ends: a few
+# tenths of a standard deviation along the worst-known direction.
 CONVERGED = 0.2
 DAMPING, DAMPING_UP, DAMPING_DOWN, TRIES = 0.01, 6.0, 6.0, 6
-UPDATES = 2  # steps with derivatives that were only updated
+UPDATES = 2  # steps between evaluations of the derivatives, which are only updated meanwhile
 
 
 class Unknowns(Protocol):
@@ -36,7 +36,7 @@ class Unknowns(Protocol):
 
 
 class Problem(Protocol):
-    """Residuals whose squares are to be as small as possible in all."""
+    """Residuals whose sum of squares is to be minimised."""
 
     clip: float | None
 
@@ -52,16 +52,16 @@ class Problem(Protocol):
 
 
 class Minimum(NamedTuple):
-    """Where a fit has ended.
+    """Result of a fit.
 
     Parameters
     ----------
     cost
         Sum of the squared residuals.
     steps
-        Taken.
+        Number of steps taken.
     covariance
-        Of the parameters.
+        Covariance of the parameters.
     """
 
     cost: float
@@ -72,23 +72,23 @@ class Minimum(NamedTuple):
 def levenberg_marquardt(
     problem: Problem, steps: int, listener: Listener | None, *, coarse: bool = True
 ) -> Minimum:
-    """Minimise a problem from where its response is, and leave the response there.
+    """Minimise a problem from its current parameters, and set them to the minimum.
 
     Parameters
     ----------
     problem
-        With the parameters to be found.
+        Problem with the parameters to be found.
     steps
-        The most there may be.
+        Maximum number of steps.
     listener
         Called with step and chi-square.
     coarse
-        Whether it begins far from the data.
+        Whether the start is far from the data.
 
     Raises
     ------
     CpunetError
-        If chi-square is not finite in the end.
+        If chi-square is not finite at the end.
     """
     parameters = problem.parameters
     vector, taken = parameters.vector(), 0
@@ -101,7 +101,7 @@ def levenberg_marquardt(
         for _ in range(max(1, most)):
             step = _step(problem, jacobian, vector, residuals, damping)
             if step is None and updates:
-                # the derivatives may be too old
+                # the derivatives may be outdated
                 jacobian, updates = problem.jacobian(vector, residuals), 0
                 step = _step(problem, jacobian, vector, residuals, damping)
             if step is None:
@@ -109,7 +109,7 @@ def levenberg_marquardt(
             tried, found, damping = step
             fall = cost - float(found @ found)
             if updates < UPDATES:
-                # Broyden's update: the derivatives as the step has shown them
+                # Broyden's update: correct the derivatives by the change in this step
                 way = (tried - vector) / parameters.widths
                 change = found - residuals - jacobian @ (tried - vector)
                 jacobian = jacobian + np.outer(change, way / parameters.widths) / (way @ way)
@@ -129,7 +129,7 @@ def levenberg_marquardt(
             "the fit of the response diverged; check that the sets hold single pulses of one "
             "detector (cpunet info), or train on other energies (--peak)"
         )
-    # the last curvature may be that before the last step, which can be a long one
+    # the last derivatives may be those before the last step, which can be a long one
     jacobian = problem.jacobian(vector, residuals)
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
@@ -139,7 +139,7 @@ def levenberg_marquardt(
 def _step(
     problem: Problem, jacobian: Values, vector: Values, residuals: Values, damping: float
 ) -> tuple[Values, Values, float] | None:
-    """A step that lowers the cost, what is left after it, and the next damping."""
+    """Vector with a lower cost, its residuals, and the next damping; None if none is found."""
     parameters, cost = problem.parameters, residuals @ residuals
     longest = parameters.longest
     curvature, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
@@ -160,7 +160,7 @@ def _within(
     """Return the step to the minimum of a parabola; parameters at a bound do not cross it.
 
     The others move as if those were fixed. Beyond a bound a parameter has no derivative, and a
-    fit that stepped there would not come back.
+    fit that stepped there could not return.
     """
     low, high = vector <= parameters.low, vector >= parameters.high
     free = np.ones(len(vector), dtype=bool)

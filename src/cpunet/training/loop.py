@@ -1,4 +1,4 @@
-"""The training loop: batch, step, log, store, and stop when a loss is no longer a number."""
+"""The training loop: batch, step, log, checkpoint, and stop if a loss is not finite."""
 
 from __future__ import annotations
 
@@ -33,23 +33,24 @@ State = dict[str, Any]  # dicts and lists of tensors, numbers and text; has "ite
 
 
 class StoppedError(CpunetError):
-    """A training ended early because it was asked to; its state was handed over before."""
+    """A training was stopped early on request, after saving its state."""
 
 
 @dataclass(frozen=True)
 class CheckpointHooks:
-    """How a training outlives its process.
+    """Hooks to save and resume a training.
 
     Parameters
     ----------
     save
-        Given the state every ``checkpoint_interval`` iterations, after the last one and
-        before a stop, always after the listener has had all records before it.  The
-        tensors go on changing once it returns.
+        Called with the state every ``checkpoint_interval`` iterations, after the last one and
+        before a stop, always after the listener has received all earlier records.  The tensors
+        change again once it returns.
     start
-        A state to go on from; the same in all processes of a group.
+        State to continue from; the same in all processes of a group.
     stop
-        Asked after each iteration whether to stop there; a group stops if any process should.
+        Called after each iteration; True to stop there.  A group stops if it is True in any
+        process.
     """
 
     save: Callable[[State], None]
@@ -75,9 +76,9 @@ def train(
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
-    The same seed on the same machine gives the same weights, whether the training was
-    interrupted and went on or not.  The processes of a group train on the same sets, end with
-    the same weights, and those are what one process gives, up to rounding and the noise drawn.
+    The same seed on the same computer results in the same weights, whether or not the training
+    was interrupted and resumed.  All processes of a group train on the same sets and end with
+    the same weights: those of a single process, up to rounding and the noise drawn.
 
     Parameters
     ----------
@@ -86,21 +87,21 @@ def train(
     recipe
         Networks and training settings.
     seed
-        Of the initial weights, the dealing of batches, dropout and latent noise.
+        Seed of the initial weights, the order of the pulses, dropout and latent noise.
     device
         ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
-        Fills the networks with weights to start from, in place of the closed-form start.
+        Fills the networks with initial weights, instead of the closed-form start.
     surroundings
-        Noise outside the generators, a chain before them, a teacher; as the recipe asks for.
+        Noise outside the generators, a chain before them, a teacher; as the recipe requires.
     listener
-        Called every ``log_interval`` iterations, and before each state is kept, with the
+        Called every ``log_interval`` iterations, and before each state is saved, with the
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
-        and ``"accuracy"`` of the judges where they were updated.
+        and ``"accuracy"`` of the discriminators where they were updated.
     hooks
-        Where the state goes and comes from, and whether to stop.
+        Hooks to save and resume the training, and to stop it.
     group
-        Who trains; `listener` and ``hooks.save`` are called where it leads.
+        Process group; `listener` and ``hooks.save`` are called in the leading process only.
 
     Raises
     ------
@@ -157,7 +158,7 @@ def _begin(
     init: Callable[[CycleGan], None] | None,
     group: ProcessGroup,
 ) -> None:
-    """Give the generators the start there is: weights, the closed form, pairs."""
+    """Initialise the generators: from given weights or in closed form, then with pairs."""
     if init is not None:
         init(model)
     elif behind is None:
@@ -167,11 +168,11 @@ def _begin(
 
 
 class _DivergenceError(Exception):
-    """Something is no number any more; the message says what and when."""
+    """A loss or weight is not finite; the message says which and when."""
 
 
 class _Training:
-    """All that changes from iteration to iteration."""
+    """Everything that changes from iteration to iteration."""
 
     def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
         self.step, self.samplers = step, samplers
@@ -181,7 +182,7 @@ class _Training:
         average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
         self.generators = (model.ren, model.iren)
         self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
-        self.iteration = 0  # how many are done
+        self.iteration = 0  # number of completed iterations
 
     def advance(self) -> Entry:
         """Do an iteration; return its number, learning rate, losses and accuracies."""
@@ -200,7 +201,7 @@ class _Training:
             network.load_state_dict(averaged.module.state_dict())
 
     def state_dict(self) -> State:
-        """Return all that the next iterations depend on, but the pulses and the settings."""
+        """Return all that the next iterations depend on, except pulses and settings."""
         own = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             own["cuda"] = torch.cuda.get_rng_state(self.device)
@@ -219,7 +220,7 @@ class _Training:
         }
 
     def load_state_dict(self, state: State, seed: int) -> None:
-        """Restore the state of a training of the same pulses, settings and seed."""
+        """Restore the state of a training with the same pulses, settings and seed."""
         self.iteration = state["iteration"]
         self.model.load_state_dict(state["model"])
         for averaged, own in zip(self.averages, state["averages"], strict=True):
@@ -229,7 +230,7 @@ class _Training:
             sampler.load_state_dict(own)
         random = state["random"]
         rank = self.group.rank
-        if rank >= len(random):  # of a larger group than before
+        if rank >= len(random):  # the group is larger than before
             _reseed(seed, rank, self.iteration)
             return
         torch.set_rng_state(random[rank]["cpu"])
@@ -246,7 +247,7 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
         last = done == config.iterations
         stop = training.group.any(hooks.stop()) and not last
         keep = last or stop or done % config.checkpoint_interval == 0
-        # values are fetched in bunches: each fetch makes a GPU wait
+        # several iterations are fetched at once: each transfer makes a GPU wait
         if keep or len(pending) == config.log_interval:
             records = [_record(*entry) for entry in pending]
             pending.clear()
@@ -288,7 +289,7 @@ def _require_finite(records: list[Record]) -> None:
 
 
 def _require_finite_weights(training: _Training) -> None:
-    """Keep no state that can only diverge: a loss is one iteration behind its weights."""
+    """Do not save a state with non-finite weights: losses are one iteration behind them."""
     for name, value in training.model.state_dict().items():
         if not bool(torch.isfinite(value).all()):
             raise _DivergenceError(
@@ -302,14 +303,14 @@ def _sampler_seeds(seed: int) -> Iterator[int]:
 
 
 def _reseed(seed: int, rank: int, iteration: int) -> None:
-    """Let each process of a group draw noise of its own."""
+    """Seed each process of a group differently, so that each draws its own noise."""
     (mixed,) = np.random.SeedSequence([seed, rank, iteration]).generate_state(1, np.uint64)
     torch.manual_seed(int(mixed))
 
 
 @contextmanager
 def _seeded(seed: int, device: str) -> Iterator[None]:
-    """Seed torch inside, and leave its state outside as it was."""
+    """Seed torch inside the context, and restore its random state afterwards."""
     cuda = [torch.device(device)] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=cuda):
         torch.manual_seed(seed)

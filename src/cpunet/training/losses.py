@@ -35,7 +35,7 @@ def weighted_l1(
     weights
         From `window_weights`, shape (samples,).
     tolerance
-        Of each pulse, (batch, 1, 1): what of a difference counts for nothing.
+        Part of each difference that is ignored, per pulse, shape (batch, 1, 1).
     """
     apart = (pulses - others).abs()
     if tolerance is not None:

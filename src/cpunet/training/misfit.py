@@ -1,8 +1,9 @@
-"""What a misfit does to what users cut on.
+"""Effect of a misfit on the current amplitude, which users cut on.
 
-With many pulses any chain is told from the true one: chi-square grows with their number.
-What counts is what the difference does.  So it is also given as the shift of the current
-amplitude (A of A/E) that would make the translated distribution that of the data.
+With enough pulses any chain differs significantly from the true one: chi-square grows with
+their number.  What matters is the effect of the difference.  It is therefore also given as the
+shift of the current amplitude (A of A/E) that would best match the translated distribution to
+the data.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ def amplitude_shift(
 ) -> tuple[float, float]:
     """Relative shift that the translated current amplitudes need, and its error.
 
-    The least-squares shift of the densities of its logarithm, with their covariance from the
+    It is a least-squares fit to the densities of its logarithm, with their covariance from the
     data's events.
 
     Parameters
     ----------
     response
-        That translates.
+        Response that translates the simulated pulses.
     bands
-        What is compared.
+        Bands to compare.
     """
     weight = weighted = 0.0
     for band in bands:
@@ -49,7 +50,7 @@ def amplitude_shift(
 def _density(
     band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
 ) -> tuple[Values, Values]:
-    """Mean densities of translated amplitudes, and their derivatives with a shift."""
+    """Mean densities of translated amplitudes, and their derivatives in the shift."""
 
     def of(readings: Readings) -> tuple[Values, ...]:
         logs = readings.log_amplitude

@@ -1,12 +1,12 @@
-"""What is compared of two unpaired sets: means over events of many functions of a pulse.
+"""Moments that compare two unpaired sets: means over events of many functions of a pulse.
 
-Means of stretches of the pulse, of principal components and their squares, of the
-density of the current amplitude and of the tail slope.  With their covariance from the
-data's own events, the distance of two sets is a chi-square: a direction in which events
-differ much by their physics counts little, one in which only noise moves them counts much
-(generalised method of moments; Hansen, Econometrica 50 (1982) 1029).  The density of the
-current amplitude is there in narrow bins because its sharp features, such as the edge of
-the single-site events, fix the bandwidth four times better than its mean.
+The functions are means over stretches of the pulse, principal components, the tail slope,
+squares of these, and bins of the current amplitude.  With their covariance from the data's own
+events, the distance of two sets is a chi-square: directions in which events differ by their
+physics have little weight, those in which only noise moves them have much (generalised method
+of moments; Hansen, Econometrica 50 (1982) 1029).  The bins of the current amplitude are narrow
+because its sharp features, such as the edge of the single-site events, determine the bandwidth
+four times better than its mean.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from cpunet.training._record_kernels import Window, project, read_records
 Values = npt.NDArray[np.float64]
 
 SIGMA_PER_MAD = 1.4826
-MIN_N = 200  # pulses for a covariance of about a hundred moments
-EDGE = 60  # samples to either side of the half maximum hold the steepest point
-# Up to this sample from the half maximum the physics of drift shape a pulse, later on the
-# electronics do; so many standard deviations off may the moments be where it is wrong.
+MIN_N = 200  # minimum number of pulses for a covariance of about a hundred moments
+EDGE = 60  # samples on either side of the half maximum that contain the steepest point
+# Charge drift shapes a pulse up to sample EARLY from the half maximum, later the electronics.
+# If the simulated physics are wrong, moments may be off by WRONG and LATE standard deviations.
 EARLY, WRONG, LATE = 30, 20.0, 2.0
-MIN_SHARE = 0.2  # of the median amplitude: what is below is no single pulse
-QUIET = 0.05  # of the height: above it before the pulse, there is another one
-# Of translated pulses, beyond which the cut on the data's tails is no longer followed: the
-# response is still far off.
+MIN_SHARE = 0.2  # of the median amplitude; below it, there is no single pulse
+QUIET = 0.05  # of the height; above it before the pulse, there is another pulse
+# Maximum fraction of translated pulses to remove by the data's range of tail slopes.  If it is
+# larger, none are removed: the response is still far off.
 MAX_CUT = 0.2
-# Measured pulses from which the functions are drawn up, and those read at a time.
+# Maximum number of measured pulses that define the functions, and pulses read at a time.
 DRAWN, BLOCK = 8192, 512
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What is read of each pulse, before functions are made of it.
+    """Quantities read from each pulse, from which the functions are computed.
 
     Parameters
     ----------
     linear
-        Stretches, components and tail slope in robust standard deviations of the data from
-        their medians, shape (pulses, quantities).
+        Stretches, components and tail slope relative to the medians of the data, in robust
+        standard deviations, shape (pulses, quantities).
     log_amplitude
         Logarithm of the current amplitude, shape (pulses,).
     weights
-        Of the pulses, shape (pulses,).
+        Weights of the pulses, shape (pulses,).
     """
 
     linear: Values
@@ -70,24 +70,24 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """The functions whose means are compared, drawn up from the measured set.
+    """The functions whose means are compared, defined by the measured set.
 
-    Use `of_data`; `read` and `functions` then give those of any set.
+    Use `of_data`; `read` and `functions` then evaluate them for any set.
 
     Parameters
     ----------
     data
-        Readings of the measured pulses that count.
+        Readings of the measured pulses that are used.
     values
         Functions of these, shape (pulses, moments).
     names
-        Of the moments.
+        Names of the moments.
     left_out
-        Measured pulses that are no single pulses with a flat baseline, and do not count.
+        Number of measured pulses excluded, since they are not single with a flat baseline.
     slope_range
-        Lowest and highest tail slope of the data, as read.  Quality cuts bound it, and what is
-        beyond is left out on the other side too: behind a fast decay the tails of late pulses
-        are steeper, so that such a cut takes more of these.
+        Lowest and highest tail slope of the data.  Quality cuts limit it, so simulated pulses
+        beyond it are excluded, too: with a fast decay the tails of late pulses are steeper, and
+        such a cut removes more of them.
     """
 
     config: MatchingConfig
@@ -109,7 +109,7 @@ class Moments:
     def of_data(
         cls, windows: FloatArray, config: MatchingConfig, preparation: PreparationConfig
     ) -> Moments:
-        """Draw up the moments from prepared measured pulses, shape (pulses, samples).
+        """Define the moments by prepared measured pulses, shape (pulses, samples).
 
         Raises
         ------
@@ -174,19 +174,19 @@ class Moments:
         Parameters
         ----------
         records
-            Shape (pulses, samples), of about the height of prepared ones; they are changed.
+            Shape (pulses, samples), of about the height of prepared pulses; changed in place.
         last
             Sample after all half maxima.
         cut
-            Whether to leave out pulses whose tails are beyond the range of the data's, unless
-            these are very many.
+            Whether to exclude pulses with tail slopes outside the range of the data, unless
+            there are too many of them (`MAX_CUT`).
         weights
-            Of the pulses; 1 by default.
+            Weights of the pulses; 1 by default.
 
         Returns
         -------
         Readings
-            Of the pulses that count.
+            Readings of the pulses that are used.
         """
         window = _window(self.config, self.preparation, self.level, last)
         aligned, slopes, log_amplitude = _aligned(records, window)
@@ -207,9 +207,9 @@ class Moments:
         Parameters
         ----------
         readings
-            Of pulses.
+            Readings of the pulses.
         clip
-            In place of the recipe's: wider far from the data, where all would be clipped.
+            Replaces the clip of the recipe: wider far from the data, where all is clipped.
         """
         limit = clip or self.config.clip
         linear = np.clip(readings.linear, -limit, limit)
@@ -241,7 +241,7 @@ class Moments:
     def _of_windows(
         self, windows: FloatArray, whole: npt.NDArray[np.intp], window: Window, least: float
     ) -> Readings:
-        """Readings of the prepared measured pulses that count."""
+        """Readings of the prepared measured pulses that are used."""
         linear, log_amplitude = [], []
         for first in range(0, len(whole), BLOCK):
             block = windows[whole[first : first + BLOCK]]
@@ -286,8 +286,8 @@ def _aligned(records: FloatArray, window: Window) -> tuple[FloatArray, Values, V
 def _read_windows(
     windows: FloatArray, window: Window, preparation: PreparationConfig
 ) -> tuple[FloatArray, Values, Values]:
-    """As `_aligned`, of prepared windows: their tails lie where the preparation put them."""
-    records = np.array(windows, np.float32)  # is changed
+    """Like `_aligned`, for prepared windows, whose tails are where the preparation put them."""
+    records = np.array(windows, np.float32)  # a copy, to be changed in place
     aligned, _, log_amplitude = _aligned(records, window)
     tails = records[:, -preparation.decay_fit_samples :]
     lever = np.arange(tails.shape[1]) - 0.5 * (tails.shape[1] - 1)
@@ -310,7 +310,7 @@ def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, Floa
     mean = aligned.mean(axis=0)
     covariance = np.cov(aligned.T.astype(float), bias=True)
     size = len(covariance)
-    # only these: all of them may take seconds
+    # only the leading ones: all of them can take seconds
     variances, axes = scipy.linalg.eigh(
         covariance, subset_by_index=(max(size - n, 0), size - 1)
     )

@@ -1,4 +1,4 @@
-"""A CycleGAN's network behind a chain stays only if it helps pulses it has not seen."""
+"""Keep a CycleGAN's network after a chain only if it improves pulses it has not seen."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from cpunet.training.held_out import Aim, Kept, judge, split_rows
 from cpunet.training.outside import of_height
 from cpunet.training.surroundings import MatchedChain
 
-LEAST_FALL = 0.02  # of chi-square
+LEAST_FALL = 0.02  # minimum relative decrease of chi-square
 HELD_OUT = 1_000_003  # keeps the choice of pulses apart from other uses of a seed
 
 
 class NetworkGate:
-    """Holds pulses of both sides back, and judges REN by them.
+    """Hold back pulses of both sides, and test REN with them.
 
     Parameters
     ----------
     sim, data
         Prepared windows, shapes (n, samples) and (n', samples).
     energy_kev
-        Of the simulated pulses.
+        Energies of the simulated pulses.
     recipe
-        With a chain.
+        Recipe with a chain.
     seed
-        Of the pulses held back and of the noise.
+        Seed of the pulses held back and of the noise.
     """
 
     def __init__(
@@ -50,12 +50,12 @@ class NetworkGate:
         self.own_data, self._held_data = split_rows(len(data), share, self._rng)
 
     def judge(self, model: CycleGan, chain: MatchedChain) -> Kept:
-        """Make REN's network add exactly nothing unless it helps."""
+        """Make the correction of REN's network exactly zero unless it improves pulses."""
         functions = EdgeFunctions(self.data, self.recipe.of_chain)
         measured = functions.of_windows(self.data)
         misfit = EdgeMisfit(measured, self.recipe.of_chain.matching.training.ridge)
         held_out = Aim(functions, misfit, functions.of_windows(self.data[self._held_data]))
-        ren, level = model.cpu().ren, self.recipe.preparation.tail_level  # chain and all
+        ren, level = model.cpu().ren, self.recipe.preparation.tail_level  # moves the chain, too
         correction = ChainStep(*chain, ren, model.iren, self.recipe).correction.eval()
         with torch.no_grad():
             pulses = torch.from_numpy(self.sim[self._held])

@@ -1,20 +1,21 @@
-r"""The most that unpaired pulses tell of a response: many functions, optimally weighted.
+r"""Extract all information on a response from unpaired pulses by optimally weighted functions.
 
-The chi-square of a fit compares some eighty means, each function of all pulses alike.  But what
-a bandwidth does to the edge shows best in single-site pulses, whose current amplitude is the
-highest, and hardly in the others.  So each principal component is taken in bins of the current
-amplitude too: some five hundred functions :math:`\varphi`, too many to compare one by one.
-What of them depends on the parameters is as many linear combinations as there are parameters,
+The chi-square of a fit compares about eighty means, each over all pulses.  But the effect of
+the bandwidth on the edge is largest in single-site pulses, which have the highest current
+amplitude, and hardly visible in the others.  Each principal component is therefore also taken
+in bins of the current amplitude.  This gives about five hundred functions :math:`\varphi`, too
+many to compare one by one.  To first order, only as many of their linear combinations depend
+on the parameters as there are parameters,
 
 .. math:: t(x) = J^T C^{-1} \varphi(x), \qquad J = \partial\langle\varphi\rangle/\partial\theta,
 
 with the covariance C of the functions: the efficient weights of the generalised method of
-moments (Hansen, Econometrica 50 (1982) 1029), and Fisher's linear discriminant between one
-response and the next.  J and C come from translated simulation, at a response that a fit has
-found; the parameters are those at which the means of t agree.
+moments (Hansen, Econometrica 50 (1982) 1029), and Fisher's linear discriminant between
+neighbouring responses.  J comes from the simulation translated by a fitted response, C from
+both sides; the parameters are those at which the means of t agree.
 
-With so many functions weights from the same pulses as the means make a bias, which is taken
-off, see `cpunet.training.weighted_means`.
+With so many functions, weights from the same pulses as the means cause a bias, which is
+subtracted, see `cpunet.training.weighted_means`.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from cpunet.training.weighted_means import Parts, Sums, jackknife_bias
 
 # Bins of the current amplitude are no narrower than twice its noise.
 MIN_BIN = 0.006
-FOR_WEIGHTS = 4096  # pulses from which weights are derived; they need not be exact
-PARTS = 10  # of the pulses, each left out once to see the bias
-# Passes over all pulses at most, the fall of the sum of squares with which they end, and the
-# first damping and its factor.
+FOR_WEIGHTS = 4096  # maximum number of pulses for the weights, which need not be exact
+PARTS = 10  # parts of the pulses, each left out once to estimate the bias
+# Maximum number of passes over all pulses, decrease of the sum of squares below which they end,
+# first damping, and factor by which it changes.
 PASSES, CONVERGED, FIRST_DAMPING, DAMPING_UP = 8, 0.1, 100.0, 10.0
-AT_BOUND = 1e-9  # a coordinate no further above its bound is at it
+AT_BOUND = 1e-9  # maximum distance from its bound of a coordinate that counts as at the bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class ConditionalFunctions:
         return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
 
     def sum(self, readings: Readings) -> Values:
-        """Weighted sum of the functions over pulses, without making all of each pulse."""
+        """Weighted sum of the functions over pulses, without storing them for each pulse."""
         values = self.moments.functions(readings)
         first = len(self.moments.config.segments) - 1
         components = values[:, first : first + self.moments.config.components]
@@ -89,17 +90,17 @@ class ConditionalFunctions:
 def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     """Move a response to where the optimally weighted means of both sides agree.
 
-    Weights and derivatives are those of where the response is, to which the end is near; see
-    `SmoothParameters` for the coordinates of the steps.
+    Weights and derivatives are evaluated at the current response, which is close to the result;
+    see `SmoothParameters` for the coordinates of the steps.
 
     Parameters
     ----------
     near
-        A comparison whose fit has ended; its response is moved.
+        Problem that has been fitted; its response is changed.
     bands
-        All pulses.
+        Bands with all pulses.
     bins
-        Of the current amplitude.
+        Number of bins of the current amplitude.
 
     Returns
     -------
@@ -127,14 +128,14 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
 def _bias(
     weighted: Sequence[_Weighted], smooth: SmoothParameters, place: Values, end: Values
 ) -> Values:
-    """By how much the end of steps with the weights of a place is off.
+    """Bias of the end of the steps, with weights evaluated at `place`.
 
-    What has ended at its bound is held there: jumps to and from it are no bias.
+    Coordinates that end at their bound are held there: jumps to and from it are not a bias.
     """
     held = np.where(end > smooth.lowest + AT_BOUND, np.nan, end - place)
     prior = (place - smooth.centre) / smooth.widths
     bias = jackknife_bias([w.parts for w in weighted], prior, smooth.widths, held)
-    # the weights of many pulses come from some, which are a part of what is compared
+    # if there are many pulses, the weights come from only some of those that are compared
     pairs = sum(w.pairs for w in weighted), sum(w.band.pairs for w in weighted)
     return np.asarray(min(1.0, pairs[0] / pairs[1]) * bias)
 
@@ -142,10 +143,10 @@ def _bias(
 def _descend(
     residuals: Callable[[Values], Values], smooth: SmoothParameters, columns: Values
 ) -> Values:
-    """Levenberg's steps from where the response is.
+    """Levenberg steps from the current response.
 
-    A pass over all pulses is dear, so that derivatives are not taken again: each step, whether
-    it lowers the sum of squares or not, corrects them along its way (Broyden).
+    A pass over all pulses is expensive, so derivatives are not evaluated again: each step,
+    whether or not it lowers the sum of squares, corrects them along its direction (Broyden).
     """
     place, damping = smooth.get(), 0.0
     left = residuals(place)
@@ -210,7 +211,7 @@ def _simulated(
     smooth: SmoothParameters,
     response: ElectronicsResponse,
 ) -> list[Sums]:
-    """Sums over each part of simulated pulses, with those of derivatives."""
+    """Sums over each part of the simulated pulses, including those of derivatives."""
 
     def of(readings: Readings) -> tuple[Values, ...]:
         values = functions(readings)

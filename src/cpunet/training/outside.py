@@ -1,9 +1,9 @@
-"""What lies outside the generators: noise, and the preparation that noisy pulses go through.
+"""Noise outside the generators, and the preparation of noisy pulses.
 
-A generator makes a pulse without noise.  What a judge sees of it is what a score will: noise
-drawn from the data's own baselines is added, and the noisy record is prepared as measured
-traces are, so that alignment, baseline and scale suffer from noise as those of the data do.
-Where the window is cut is found without gradients; baseline and scale have theirs.
+A generator makes a pulse without noise.  Before a discriminator or a score sees it, noise drawn
+from the data's own baselines is added, and the noisy record is prepared like a measured trace,
+so that noise affects alignment, baseline and scale like those of the data.  The position of
+the window is found without gradients; baseline and scale are differentiable.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from cpunet.recipes.schema import PreparationConfig
 
 MIN_SCALE = 1e-3
 PLATEAU = 100  # samples after the window whose mean gives the height of a record
-TOLERATED = 3.0  # standard deviations of a pulse's own baseline that no cycle is asked for
+TOLERATED = 3.0  # deviation of a cycle that is ignored, in RMS of the pulse's own baseline
 
 
 class Dressed(NamedTuple):
-    """Noisy pulses, prepared.
+    """Prepared pulses with noise.
 
     Parameters
     ----------
@@ -51,11 +51,11 @@ class Outside:
     Parameters
     ----------
     noise
-        Of the data's baselines.
+        Noise of the data's baselines.
     energy_kev
-        Of the simulated pulses, shape (n,): noise goes as its inverse.
+        Energies of the simulated pulses, shape (n,); noise scales as 1/energy.
     preparation
-        Of the data.
+        Preparation of the data.
     """
 
     noise: TraceNoise
@@ -68,11 +68,11 @@ class Outside:
         Parameters
         ----------
         records
-            Without noise, with room about the window, shape (batch, samples).
+            Noise-free records with padding around the window, shape (batch, samples).
         rows
-            Which of the simulated pulses they are.
+            Indices of the simulated pulses.
         """
-        # torch's random numbers are part of a checkpoint
+        # seeded by torch, whose random state is part of a checkpoint
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
         energies = self.energy_kev[rows.cpu().numpy()]
         drawn = self.noise.draw(energies, records.shape[1], rng)
@@ -91,9 +91,10 @@ class Outside:
 
 
 def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dressed:
-    """Prepare records as measured traces, with gradients for all but the alignment.
+    """Prepare records like measured traces, with gradients for all but the alignment.
 
-    A record that cannot be prepared, as a network may make it at first, is cut where it lies.
+    A record that cannot be prepared, as may happen early in a training, is cut at the nominal
+    position.
     """
     raw = Pulses.of(records.detach().cpu().numpy(), dt_ns=dt_ns)
     prepared = prepare(
@@ -110,15 +111,15 @@ def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dre
 
 
 def tolerance(data: Tensor, config: PreparationConfig) -> Tensor:
-    """How much of each measured pulse is noise, shape (batch, 1, 1).
+    """Tolerance for the noise of each measured pulse, shape (batch, 1, 1).
 
-    A cycle that begins at a measured pulse cannot end with its noise, which no generator is to
-    make: what is within this of the pulse is as good as the pulse.
+    A cycle that starts from a measured pulse cannot reproduce its noise, which generators do
+    not make.  Deviations within this tolerance are therefore ignored.
     """
     return TOLERATED * data[..., : config.baseline_samples].std(dim=-1, keepdim=True)
 
 
 def of_height(records: Tensor, tail_level: float) -> Tensor:
-    """Scale records of windows so that their first samples after the window have a level."""
+    """Scale records so that the mean of the first samples after the window is `tail_level`."""
     plateau = records[:, -RESPONSE_ROOM : PLATEAU - RESPONSE_ROOM].mean(dim=1, keepdim=True)
     return records * (tail_level / plateau.clamp_min(MIN_SCALE))

@@ -1,8 +1,8 @@
-"""Supervised steps: networks learn what a matched chain makes of simulated pulses.
+"""Supervised steps on pairs of simulated pulses and their translations by a matched chain.
 
-A matched chain makes as many pairs as wanted: charge, and what is measured of it without noise
-and with.  REN learns the former, IREN the way back from the latter.  A REN that stands behind
-the chain has nothing to learn from it.
+A matched chain makes any number of pairs of charge pulses and translated pulses, with or
+without noise.  REN learns the translation without noise, IREN the way back from the one with
+noise.  A REN that follows the chain has nothing to learn from it.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ def learn_pairs(
     behind: ChainStep | None,
     group: ProcessGroup = ALONE,
 ) -> None:
-    """Train the generators on pairs, if there is anything that makes some.
+    """Train the generators on pairs, if there is a chain or a teacher to make them.
 
     Parameters
     ----------
     model
-        Its generators learn; all else is left as it is.
+        Networks; only the generators are trained.
     sampler
-        Of simulated pulses.
+        Sampler of simulated pulses.
     recipe
-        Its ``training.pairs`` say how long and how fast.
+        Recipe; ``training.pairs`` sets the number of iterations and the learning rate.
     surroundings
         Noise, and a teacher if there is one.
     behind
-        The passes behind a chain, if there is one.
+        Passes with a chain, if there is one.
     group
-        Who learns, each from its share of the pairs.
+        Process group, each process with its share of the pairs.
 
     Raises
     ------
     CpunetError
-        If a loss is no number.
+        If a loss is not finite.
     """
     outside, teacher = surroundings.outside, surroundings.teacher
     if (behind is None or outside is None) and teacher is None:
@@ -71,7 +71,7 @@ def learn_pairs(
             loss = _of_teacher(model, sim, sampler.last_rows, *teacher, weights)
         if group.any(not bool(torch.isfinite(loss))):
             raise CpunetError(
-                f"pairs: a loss is {float(loss)} in iteration {iteration}; lower "
+                f"pairs: a loss is not finite in iteration {iteration}; lower "
                 "training.pairs.rate"
             )
         optimiser.zero_grad(set_to_none=True)

@@ -1,8 +1,8 @@
 """Processes that train together, each on its share of every batch.
 
-They are started by torchrun, which tells each its rank and where to meet.  The one of rank 0
-leads: it alone reads checkpoints and writes.  A process that is alone is a group of one, for
-which nothing here does anything.
+They are started by torchrun, which sets the rank of each and the address to connect to.  Rank 0
+is the leader: only it reads checkpoints and writes files.  A single process is a group of one,
+for which nothing is exchanged.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from torch import Tensor, distributed
 
 from cpunet.errors import CpunetError
 
-PATIENCE = timedelta(minutes=10)  # with a process that does not answer
+PATIENCE = timedelta(minutes=10)  # timeout for a process that does not answer
 _BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 _FAILURES = "cpunet/failures"
 _LOST = "another process of this training ended or cannot be reached; continue with --resume"
 
 
 class ToldElsewhereError(CpunetError):
-    """The process group ends; another process reports why."""
+    """The process group has failed; another process reports the reason."""
 
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """The processes of a training, as one of them sees them.
+    """The processes of a training, as seen by one of them.
 
     All must call the same methods in the same order.  Each raises a `CpunetError` if another
     process ended or cannot be reached.
@@ -40,7 +40,7 @@ class ProcessGroup:
     Parameters
     ----------
     rank
-        Of this process, from 0.
+        Rank of this process, from 0.
     size
         Number of processes.
     """
@@ -69,13 +69,13 @@ class ProcessGroup:
         return batch_size // self.size
 
     def add(self, tensor: Tensor) -> None:
-        """Put the sum over all processes in the place of each one's."""
+        """Replace the tensor of each process by the sum over all processes."""
         if self.size > 1:
             with _answered():
                 distributed.all_reduce(tensor)
 
     def average_gradients(self, parameters: Iterable[Tensor]) -> None:
-        """Give all processes the mean of their gradients."""
+        """Replace the gradients of each process by their mean over all processes."""
         if self.size == 1:
             return
         gradients = [p.grad for p in parameters if p.grad is not None]
@@ -95,9 +95,9 @@ class ProcessGroup:
         return dict(zip(losses, values / self.size, strict=True))
 
     def any(self, flag: bool) -> bool:
-        """Whether it is true in any process.
+        """Whether a flag is true in any process.
 
-        It goes from host to host, so that no GPU is waited for.
+        It is exchanged between the CPUs, so that no GPU has to be waited for.
         """
         if self.size == 1:
             return flag
@@ -106,7 +106,7 @@ class ProcessGroup:
         return bool(count)
 
     def follow(self, tensors: Iterable[Tensor]) -> None:
-        """Give all processes the leader's values, in place."""
+        """Copy the leader's values to all processes, in place."""
         if self.size == 1:
             return
         with _answered(), torch.no_grad():
@@ -114,7 +114,7 @@ class ProcessGroup:
                 distributed.broadcast(tensor, src=0)
 
     def told(self, content: bytes) -> bytes:
-        """Return the leader's bytes."""
+        """Return the leader's bytes in all processes."""
         if self.size == 1:
             return content
         length = torch.tensor(len(content))
@@ -147,7 +147,7 @@ class Launch:
     group
         Rank and size.
     local_rank
-        The number of this process on its computer.
+        Number of this process on its computer.
     """
 
     group: ProcessGroup
@@ -155,12 +155,12 @@ class Launch:
 
 
 def launch() -> Launch | None:
-    """Return the launch by torchrun; None if it started no process, or only one.
+    """Read the environment set by torchrun; None without it, or for a single process.
 
     Raises
     ------
     CpunetError
-        If it is not whole.
+        If the environment is incomplete or invalid.
     """
     known = os.environ
     if not {"RANK", "WORLD_SIZE"} <= known.keys() or known["WORLD_SIZE"] == "1":
@@ -180,15 +180,16 @@ def launch() -> Launch | None:
 
 @contextmanager
 def meeting(launched: Launch) -> Iterator[Callable[[str], ProcessGroup]]:
-    """Meet the other processes; give what makes them a group that trains on a device.
+    """Connect to the other processes; yield a function that forms the group for a device.
 
-    The group lasts as the meeting.  Of several errors inside, the first alone is told.
+    The group lasts as long as the context.  If several processes fail, only the first one
+    reports its error.
 
     Raises
     ------
     CpunetError
-        If the processes do not find together, or the error that was raised inside, in the
-        process that was the first to have one; a `ToldElsewhereError` from it in the others.
+        If the processes do not connect.  An error raised inside is re-raised in the process
+        that failed first, and becomes a `ToldElsewhereError` in the others.
     """
     if not distributed.is_available():
         raise CpunetError("this build of torch knows no other processes; install a usual one")
@@ -201,7 +202,7 @@ def meeting(launched: Launch) -> Iterator[Callable[[str], ProcessGroup]]:
     try:
         yield partial(_join, launched, store)
     except CpunetError as error:
-        # before the others notice that this process is gone
+        # before the others notice that this process has ended
         if _is_first(store):
             raise
         raise ToldElsewhereError(str(error)) from error
@@ -226,7 +227,7 @@ def _is_first(store: Any) -> bool:
     try:
         return bool(store.add(_FAILURES, 1) == 1)
     except RuntimeError:
-        return False  # kept by another process, which is gone
+        return False  # the store belonged to another process, which has ended
 
 
 @contextmanager

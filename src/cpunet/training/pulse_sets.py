@@ -1,4 +1,4 @@
-"""Two sets of pulses, made ready to be compared."""
+"""Two sets of pulses, divided into bands of energy for comparison."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from cpunet.training.moments import Moments
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, Translated
 
-# Of a band at the least, where a set is thinned out.
+# Minimum number of pulses of a band if only some of a set are taken.
 MIN_OF_BAND = 400
 
 
 class PulseSets:
-    """Both sides in bands of energy, and parts of them that are enough for a question.
+    """Both sides in bands of energy, and representative subsets of them.
 
     Parameters
     ----------
     sim, data
         Prepared pulses with their energies.
     noise
-        Of the data's baselines.
+        Noise of the data's baselines.
     recipe
-        With a response to be matched.
+        Recipe that matches a response.
     rng
-        Chooses the parts, and draws the noise.
+        Random generator that chooses the subsets and draws the noise.
     remains
-        Of earlier pulses, that the data have.
+        Remains of earlier pulses in the data.
 
     Raises
     ------
@@ -55,14 +55,14 @@ class PulseSets:
         self.remains = remains
         require_energies(sim.energy_kev)
         parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
-        # in an order of which any beginning is a fair part
+        # in random order, so that any first part is representative
         self.parted = [
             (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
             for band in parted
         ]
 
     def bands(self, most: int | None = None) -> list[Band]:
-        """All pulses, or as many of each side as `most`, in shares as they are."""
+        """All pulses, or about `most` of each side, in the same proportions."""
         n_sim, n_data = (
             sum(len(order) for order in orders)
             for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
@@ -90,5 +90,5 @@ class PulseSets:
 
 
 def _taken(waveforms: FloatArray, rows: Rows) -> FloatArray:
-    """Rows in their order; all of them without a copy, which may be gigabytes."""
+    """Rows in their order; without a copy, which may take gigabytes, if all are taken."""
     return waveforms if len(rows) == len(waveforms) else waveforms[rows]

@@ -1,9 +1,9 @@
-"""A small network beside a matched chain, trained on the same unpaired pulses.
+"""A small network that corrects a matched chain, trained on the same unpaired pulses.
 
 The chain is frozen.  Its records, corrected and with noise, are compared with the data by the
-weighted means of `cpunet.training.edge_functions`.  What is added must be smooth: means of
-shapes do not forbid wiggles, and a classifier finds them.  A part of both sets is held out:
-unless its chi-square falls clearly, the correction is made zero.
+weighted means of `cpunet.training.edge_functions`.  The correction must be smooth: means of
+shapes do not exclude wiggles, which a classifier finds.  A part of both sets is held out:
+unless its chi-square decreases clearly, the correction is set to zero.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.held_out import Aim, Kept, judge, split_rows
 from cpunet.training.moments import BLOCK
 
-DRAWS = 4  # of the noise; while training, these are dealt anew to the pulses
+DRAWS = 4  # noise traces per pulse; in training, they are assigned to pulses at random
 PER_MILLE = 1e-3  # of a pulse's height: the unit of roughness
 
 
@@ -45,20 +45,20 @@ def fit_residual(
     Parameters
     ----------
     generator
-        The matched chain, with noise; it is left as it is.
+        Matched chain with noise; it is not modified.
     sim, data
         Prepared windows, shapes (n, samples) and (n', samples).
     energy_kev
-        Of the simulated pulses.
+        Energies of the simulated pulses.
     recipe
-        With a residual.
+        Recipe with a residual.
     seed
-        Of the held-out pulses, the weights, the batches and the noise.
+        Seed of the held-out pulses, the weights, the batches and the noise.
 
     Returns
     -------
     tuple
-        The correction, exactly zero if it is not kept, and what became of it.
+        The correction, exactly zero if it is not kept, and the result of its test.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def fit_residual(
 
 @torch.no_grad()
 def _records(generator: ResponseGenerator, sim: FloatArray, recipe: Recipe) -> Tensor:
-    """Noise-free records of the chain alone, as high as prepared windows."""
+    """Noise-free records of the chain alone, with the height of prepared windows."""
     records = torch.cat(
         [
             generator.response(torch.from_numpy(sim[first : first + BLOCK]))

@@ -1,10 +1,10 @@
-"""A readout chain fitted to unpaired pulses: least squares on moments, with errors.
+"""Fit a readout chain to unpaired pulses: least squares on moments, with errors.
 
 The parameters of a response are those for which the moments of the translated simulation,
-noise and all, agree best with those of the data: a chi-square fit in about ten
-parameters by the Levenberg–Marquardt method, with derivatives by finite differences on
-fixed random numbers.  Some of the pulses are enough to find the valley; then all of them,
-optimally weighted, say where in it the response is.
+including noise, agree best with those of the data: a chi-square fit of about ten parameters by
+the Levenberg–Marquardt method, with derivatives by finite differences at fixed random numbers.
+Some of the pulses are enough to find the valley of chi-square; all of them, optimally weighted,
+then determine the response within it.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from cpunet.training.response_starts import (
     ringing_if_better,
 )
 
-# Samples from the half maximum up to which the drift alone shapes a pulse, and the standard
-# deviations from which on that is not as it is simulated.
+# Sample from the half maximum up to which drift alone shapes a pulse, and pull above which this
+# part disagrees with the simulation.
 ONSET, OFF = -15, 4.0
-# Chi-square per moment from which on, with such an onset, nothing else is tried: simulation and
-# data are of different detectors.  Without a ringing that is there it is 50.
+# Chi-square per moment above which, with such an onset, nothing else is tried: simulation and
+# data are from different detectors.  A ringing missing from the response results in 50.
 ANOTHER_DETECTOR = 100.0
-# Pulses of each side with which a poor fit is looked at.
+# Pulses of each side with which a poor fit is examined.
 CHECKED = 4096
-# Rounds of optimal weights: those of the second are of where the first has led.
+# Rounds of optimal weights; those of the second are evaluated at the result of the first.
 ROUNDS = 2
 
 
@@ -56,20 +56,20 @@ class Fit:
     Parameters
     ----------
     chi_square, moments
-        Of the comparison, and the number of moments compared; before errors of the
-        simulation were allowed for, if they were.
+        Chi-square and number of moments of the comparison, before any allowance for errors of
+        the simulation.
     steps
-        Steps taken.
+        Number of steps taken.
     errors
-        Standard deviations of the parameters, by name, as their curvature gives them.
+        Standard deviations of the parameters by name, from the curvature of chi-square.
     pulls
         Deviation of each moment in its standard deviations, by name.
     data_left_out
-        Measured pulses that the moments leave out: a second pulse, or no baseline.
+        Number of measured pulses excluded: those with a second pulse, or without a baseline.
     pairs
-        Number of pulses that the errors go with: the harmonic sum of both sides.
+        Number of pulses that the errors refer to: the harmonic sum of both sides.
     covariance
-        Of the parameters, in the order of `errors`.
+        Covariance of the parameters, in the order of `errors`.
     bands
         Energies compared, with the pulses of each side.
     amplitude_shift, amplitude_shift_error
@@ -91,7 +91,7 @@ class Fit:
 
     @property
     def verdict(self) -> str:
-        """What is left between translation and data, in a sentence."""
+        """Remaining difference between translation and data, in a sentence."""
         shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
         off = abs(shift) >= 2 * error
         size = f"the current amplitude is off by {shift:+.2f} ± {error:.2f} %"
@@ -99,7 +99,7 @@ class Fit:
             size = f"the current amplitude is right to {abs(shift) + error:.2f} %"
         per = self.chi_square / self.moments
         if self.poor:
-            # a shift that is small beside its error does not make the shape right
+            # a shift that is small compared with its error does not make the shape right
             more = f"; {size}" if off else ""
             return f"chi-square is {per:.1f} per moment, too much for chance{more}"
         if per > GOOD_FIT:
@@ -113,14 +113,14 @@ class Fit:
     def poor(self) -> bool:
         """Whether the response does not describe the data.
 
-        With many pulses chi-square tells any response from the true one, so that what counts
-        then is the misfit in units of what single pulses differ by.
+        With enough pulses any response differs significantly from the true one.  What matters
+        then is the misfit relative to the spread of single pulses.
         """
         return self.excess > GOOD_FIT - 1
 
     @property
     def excess(self) -> float:
-        """Chi-square per moment above 1; of more than some thousand pulses, that of so many."""
+        """Chi-square per moment above 1, scaled to `CHECKED` pulses if there are more."""
         return (self.chi_square / self.moments - 1) * min(1.0, 0.5 * CHECKED / self.pairs)
 
 
@@ -140,19 +140,19 @@ def fit_response(
     Parameters
     ----------
     sim, data
-        Prepared pulses with their energies: noise goes as their inverse, and pulses are
-        compared in bands of energy, see `cpunet.training.energy_bands`.
+        Prepared pulses with their energies: noise scales as 1/energy, and pulses are compared
+        in bands of energy, see `cpunet.training.energy_bands`.
     noise
-        Of the data's baselines.
+        Noise of the data's baselines.
     recipe
-        With a response to be matched.
+        Recipe that matches a response.
     seed
-        Of the noise, and of the pulses with which valleys are searched.
+        Seed of the noise, and of the pulses used to search for the valley.
     known
-        The response of a similar readout, of the recipe's configuration, to start from.  Only
-        if that leads nowhere the recipe's own starts are tried.
+        Response of a similar readout, with the recipe's configuration, to start from.  The
+        recipe's own starts are tried only if that fails.
     remains
-        Of earlier pulses, that the data have and the translations are to be given.
+        Remains of earlier pulses in the data, which are added to the translations.
     listener
         Called with step and chi-square.
 
@@ -196,7 +196,7 @@ def _refined(
     training: MatchingConfig,
     listener: Listener | None,
 ) -> Fit:
-    """Let all pulses say where in its valley the response is."""
+    """Determine the response within its valley from all pulses."""
     compared, steps = ResponseProblem(problem.response, bands), found.steps
     for _ in range(ROUNDS):
         covariance = refine(problem, bands, training.conditional_bins)
@@ -213,7 +213,7 @@ def _checked(
     training: MatchingConfig,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
-    """Fit on, with more pulses."""
+    """Continue the fit with more pulses."""
     more = problem.of(problem.response, bands)
     return more, levenberg_marquardt(more, training.steps, listener, coarse=False)
 
@@ -224,7 +224,7 @@ def _with_wrong_physics(
     training: MatchingConfig,
     listener: Listener | None,
 ) -> Fit:
-    """Fit with errors for what the simulation has wrong; its own chi-square says nothing."""
+    """Fit with model errors of the simulation, but report the chi-square without them."""
     told = _fit(problem, found.covariance, found.steps)
     problem.allow_for_model_error()
     again = levenberg_marquardt(problem, training.steps, listener, coarse=False)
@@ -254,10 +254,10 @@ def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
 
 
 def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
-    """Whether pulses begin otherwise than simulated: no readout does that, physics do.
+    """Whether pulses begin differently than simulated, which physics can cause, but no readout.
 
-    If only what follows is off, the data have what no readout chain has, such as remains of
-    earlier pulses in their tails, and the edge is still to be trusted.
+    If only later parts are off, the data contain effects that no readout chain has, such as
+    remains of earlier pulses in their tails, and the edge can still be trusted.
     """
     onset = {f"samples {a} to {b}" for a, b in pairwise(training.segments) if b <= ONSET}
     pulls = problem.pulls(problem.parameters.vector())

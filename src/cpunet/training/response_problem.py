@@ -14,10 +14,10 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import Translated
 
-# Widths of the priors about the start: wide for times (in their logarithm), and for weights
-# such that a chain may be half slow, and that a decay is mostly the main one.
+# Widths of the priors around the start: wide for times (in their logarithm); for weights such
+# that half of the charge may be slow, and that the main decay dominates.
 TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.3
-TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # of the finite differences
+TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # steps of the finite differences
 
 
 class Parameters:
@@ -26,7 +26,7 @@ class Parameters:
     Parameters
     ----------
     response
-        Its parameters are the vector, and where they are now the priors' centre.
+        Response with the parameters; their current values are the centres of the priors.
     """
 
     def __init__(self, response: ElectronicsResponse) -> None:
@@ -54,7 +54,7 @@ class Parameters:
         return torch.cat([p.detach().flatten() for p in self._parts]).numpy().copy()
 
     def set(self, vector: Values) -> None:
-        """Put a vector into the response."""
+        """Set the parameters of the response from a vector."""
         first = 0
         for part in self._parts:
             stop = first + part.numel()
@@ -73,16 +73,16 @@ class Parameters:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Pulses of some energies, on both sides: what is compared with each other.
+    """Simulated and measured pulses of a band of energy, which are compared with each other.
 
     Parameters
     ----------
     name
-        Energies, as the user knows them.
+        Energies, as shown to the user.
     sim
         Simulated pulses, and the moments of the measured ones.
     rows
-        Of the simulated pulses, in the set that they were taken from.
+        Rows of the simulated pulses in the set that they were taken from.
     """
 
     name: str
@@ -91,12 +91,12 @@ class Band:
 
     @property
     def moments(self) -> Moments:
-        """Functions drawn up from the measured pulses."""
+        """Moments defined by the measured pulses."""
         return self.sim.moments
 
     @property
     def pairs(self) -> float:
-        """Number of pulses that errors go with: the harmonic sum of both sides."""
+        """Number of pulses that errors refer to: the harmonic sum of both sides."""
         weights = self.sim.weights
         simulated = weights.sum() ** 2 / (weights @ weights)
         return float(1 / (1 / len(self.moments.data) + 1 / simulated))
@@ -108,11 +108,11 @@ class ResponseProblem:
     Parameters
     ----------
     response
-        To be fitted.
+        Response to be fitted.
     bands
-        What is compared: moments of one band follow those of another.
+        Bands to compare; their moments are concatenated.
     draws
-        Of the noise, for each pulse; None for all that there are.
+        Number of draws of the noise for each pulse; None for all.
     """
 
     def __init__(
@@ -124,32 +124,32 @@ class ResponseProblem:
 
     @property
     def response(self) -> ElectronicsResponse:
-        """What is fitted."""
+        """The response that is fitted."""
         return self.parameters.response
 
     @property
     def moments(self) -> int:
-        """How many there are in all."""
+        """Number of moments in all bands."""
         return sum(len(band.moments.names) for band in self.bands)
 
     @property
     def slope(self) -> float:
-        """Of the logarithm of the data's tails, per sample."""
+        """Slope of the logarithm of the data's tails, per sample."""
         return float(np.mean([band.moments.slope for band in self.bands]))
 
     @property
     def pairs(self) -> float:
-        """Number of pulses that errors go with, of all bands."""
+        """Number of pulses that errors refer to, in all bands."""
         return sum(band.pairs for band in self.bands)
 
     @property
     def left_out(self) -> int:
-        """Measured pulses that do not count."""
+        """Number of measured pulses that are excluded."""
         return sum(band.moments.left_out for band in self.bands)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the moments; with their band, if there are several."""
+        """Names of the moments, with their band if there are several."""
         several = len(self.bands) > 1
         return tuple(
             f"{band.name}: {name}" if several else name
@@ -158,11 +158,11 @@ class ResponseProblem:
         )
 
     def allow_for_model_error(self) -> None:
-        """Let the moments that physics shape, and electronics do not, count for little.
+        """Give little weight to the moments that physics determine, rather than electronics.
 
-        If no response makes the sets agree, the simulated physics differ.  The shape of the
-        edge would then bend the response to its liking; current amplitude, top and tail
-        decide instead, see `Moments.model_errors`.
+        If no response makes the sets agree, the simulated physics are wrong.  The shape of the
+        edge would then distort the response.  Instead, current amplitude, top and tail
+        determine it, see `Moments.model_errors`.
         """
         self._comparisons = [
             _Comparison(b, b.moments.model_errors, self.draws) for b in self.bands
@@ -171,11 +171,11 @@ class ResponseProblem:
     def of(
         self, response: ElectronicsResponse, bands: Sequence[Band] | None = None
     ) -> ResponseProblem:
-        """The comparison for another response, or other pulses, with the priors about it."""
+        """The same for another response, which the priors are centred on, or other pulses."""
         return ResponseProblem(response, bands or self.bands, self.draws)
 
     def pulls(self, vector: Values) -> Values:
-        """Deviations of the moments in standard deviations, correlated as they are."""
+        """Deviations of the moments in standard deviations; they are correlated."""
         self.parameters.set(vector)
         found = [c.pulls(self.response, self.clip) for c in self._comparisons]
         return np.concatenate(found)
@@ -199,7 +199,7 @@ class ResponseProblem:
     def derivatives(
         self, vector: Values, deviations: Values, parameters: Iterable[int]
     ) -> Values:
-        """Derivatives of the deviations by finite differences, one column a parameter."""
+        """Derivatives of the deviations by finite differences, one column per parameter."""
         columns = []
         for i in parameters:
             moved = vector.copy()
@@ -210,7 +210,7 @@ class ResponseProblem:
 
 
 class _Comparison:
-    """One band: what its moments are to be, and how well they are known."""
+    """Moments of the data in one band, and their covariance."""
 
     def __init__(self, band: Band, model_errors: Values | None, draws: int | None) -> None:
         self.sim, self.moments, self.draws = band.sim, band.moments, draws
@@ -229,6 +229,6 @@ class _Comparison:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (readings.weights @ self.moments.functions(readings, clip),)
 
-        # far from the data many tails are beyond theirs, and none is to be left out
+        # far from the data many tails are outside their range, and none may be excluded
         (total,), n = self.sim.sums(response, of, cut=clip is None, draws=self.draws)
         return np.asarray((total / max(n, 1e-9) - self.wanted) / self.sigma)

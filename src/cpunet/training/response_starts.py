@@ -1,7 +1,7 @@
-"""Where a fit of a response starts, and what else it may need to follow the data.
+"""Starting points of the fit of a response, and extensions if the fit is poor.
 
-A fit finds the valley that it starts in.  So there are several starts, and, where the fit is
-poor, a fast decay with a time of its own and a ringing.
+A fit only finds the minimum of the valley that it starts in.  There are therefore several
+starts and, if the fit is poor, a fast decay with a free time and a ringing.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_mar
 from cpunet.training.response_problem import ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
 
-# Chi-square per moment, with as many pulses as valleys are searched with, at which a fit has
-# found its own.  The data's own outliers and the ridge keep it from 1.
+# Chi-square per moment, with as many pulses as are used to search for the valley, below which a
+# fit has found the right one.  Outliers in the data and the ridge keep it above 1.
 GOOD_FIT = 1.6
-# A wrong valley gives three per moment; this is another detector.
+# In a wrong valley it is about three; this means another detector.
 HOPELESS_FIT = 20.0
-# A ringing must lower chi-square to this part of it, or there is none; derivatives far from
-# where it would be promise less.
+# A ringing or free decay must lower chi-square to this fraction.  A ringing is tried from a
+# higher expected one: derivatives far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
-# Where a fast decay of free time may start, in us, and its share.
+# Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
-# An overshoot of more than this is much like a fast decay, and would be a valley beside it.
+# A longer overshoot resembles a fast decay, and would be a second valley.
 SLOWEST_NS = 800.0
-# The main decay that remains of earlier pulses tell is known no better than this: it is that of
-# one exponential, and a readout may have more.
+# Minimum relative error of a main decay known from remains of earlier pulses: these are fitted
+# with one exponential, and a readout may have more.
 MIN_DECAY_ERROR = 0.01
 
 
@@ -48,10 +48,10 @@ def from_known(
     decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum] | None:
-    """Fit from a response that is known, first as if the data were near; None if it is poor.
+    """Fit from a known response, first as if the data were near; None if the fit is poor.
 
-    Its main decay is kept or is that of the data, whichever is nearer to them: tails of a
-    response with several decays do not fall with the main one.
+    Its main decay is kept or replaced by that of the data, whichever fits them better: tails of
+    a response with several decays do not follow the main one.
     """
     start = copy.deepcopy(known)
     set_decay(start, first.slope, decay)
@@ -79,10 +79,10 @@ def best_start(
     decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
-    """Fit from start after start, until one is good or all are done.
+    """Fit from one start after another, until a fit is good or hopeless, or all are done.
 
-    If the first is poor, a decay whose time is free is tried before other starts, with the
-    main decay held to what is known of it.
+    If the first fit is poor, a fast decay with a free time is tried before other starts, with
+    the main decay constrained to its known value, if any.
     """
     best: tuple[ResponseProblem, Minimum] | None = None
     dt_ns = float(first.response.dt_ns)
@@ -95,8 +95,8 @@ def best_start(
         if best is None or found.cost < best[1].cost:
             best = problem, found
         if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
-            break  # no other valley is to be looked for
-    assert best is not None  # the recipe has one start at least
+            break  # there is no other valley to search for
+    assert best is not None  # the recipe has at least one start
     return best
 
 
@@ -107,7 +107,7 @@ def free_decay_if_better(
     decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
-    """Let a fast decay have a time of its own, if that explains much of what is left."""
+    """Free the time of a fast decay if that explains much of the remaining chi-square."""
     other = with_free_decay(problem, training, decay, listener)
     if other is None:
         return problem, found
@@ -124,7 +124,7 @@ def with_free_decay(
     decay: KnownDecay | None,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum] | None:
-    """Fit a response whose fast decay has a time of its own; None if there is no other."""
+    """Fit a response with one free fast decay; None if decays are free already or absent."""
     config = problem.response.config
     if config.free_decays or not config.fast_decays_us:
         return None
@@ -147,9 +147,9 @@ def _free_decay_start(
     share: float,
     decay: KnownDecay | None,
 ) -> ResponseProblem:
-    """The comparison for a fast decay and a main one that give the data's tails together.
+    """The comparison for a fast and a main decay that together match the data's tails.
 
-    With the tails right, so is about the bandwidth that the fit without it has found.
+    The bandwidth found without the fast decay is about right if the tails are.
     """
     dt_ns, slope = float(problem.response.dt_ns), problem.slope
     if decay is None:
@@ -166,8 +166,9 @@ def _decays(
 ) -> Iterator[tuple[float, float]]:
     """Times and shares of a fast decay that a fit may start from; no share is 0.
 
-    Of a share of 0 no time is told, and from tails of another slope fits get lost.  Beside a
-    known decay the share follows from how much steeper the tails are.
+    A share of 0 does not constrain the time, and fits that start from tails of another slope
+    get lost.  If the main decay is known, the share follows from how much steeper the tails
+    are.
     """
     for us in FAST_DECAYS_US:
         if decay is None:
@@ -179,7 +180,7 @@ def _decays(
 
 
 def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
-    """By how much a fast decay makes the tails steeper, for a share of 1; per us."""
+    """Increase of the slope of the tails by a fast decay with a share of 1, per us."""
     preparation = problem.bands[0].moments.preparation
     us = 1e-3 * float(problem.response.dt_ns)
     middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
@@ -198,14 +199,14 @@ def ringing_if_better(
     training: MatchingConfig,
     listener: Listener | None,
 ) -> tuple[ResponseProblem, Minimum]:
-    """Let the response ring, if that promises to explain much of what it leaves."""
+    """Add a ringing to the response if that explains much of the remaining chi-square."""
     if config.ringing_mhz is not None:
         return problem, found
     response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
     if response is None or promised > PROMISES * found.cost:
         return problem, found
     best, steps = (problem, found), found.steps
-    # from where the fit without ringing ended, first as if that were near, then as if far
+    # from the end of the fit without ringing, first as if that were near, then as if far
     for coarse in (False, True):
         rings = problem.of(copy.deepcopy(response))
         again = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
@@ -226,7 +227,7 @@ def start_response(
 ) -> ElectronicsResponse:
     """A response with the recipe's poles times a factor, and the data's own decay.
 
-    That is known, or it follows from the slope of the tails.
+    The decay is known, or it follows from the slope of the tails.
     """
     response = ElectronicsResponse(config, dt_ns)
     response.log_poles_ns.data.add_(math.log(factor))
@@ -237,7 +238,7 @@ def start_response(
 def set_decay(
     response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
 ) -> None:
-    """Take the data's own decay: that of remains if it is known, or else that of the tails."""
+    """Set the main decay to that of the data: known from remains, or else from the tails."""
     if decay is not None:
         response.log_decay_us.data.fill_(math.log(decay.us))
         response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)

@@ -1,9 +1,9 @@
-"""Does a readout ring, and how fast?
+"""Search for a ringing of the readout, and its frequency.
 
-A ringing has a frequency, and from a start far from it a fit does not find it: chi-square
-as a function of the frequency has many valleys.  Its two weights are nearly linear, so that
-for each frequency on a grid the best of them, and the chi-square that they promise, follow
-from derivatives where there is none yet.
+A fit does not find the frequency of a ringing from a distant start: chi-square as a function
+of the frequency has many valleys.  But pulses depend nearly linearly on the two weights of the
+ringing.  The best weights for each frequency on a grid, and the expected chi-square, therefore
+follow from the derivatives at zero weights.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ def most_promising_ringing(
     Parameters
     ----------
     problem
-        Of a response without ringing, where its fit has ended.
+        Problem of a fitted response without ringing.
     config
-        Of that response.
+        Configuration of that response.
     frequencies_mhz
-        At which to look.
+        Frequencies to try.
 
     Returns
     -------
     response
-        A copy of the response with a ringing of the best frequency, of no size yet; None if
+        A copy of the response with a ringing of the best frequency and zero weights; None if
         there are no frequencies.
     promised
-        Chi-square to be expected of it, to first order.
+        Chi-square expected with it, to first order.
     """
     vector = problem.parameters.vector()
     problem.clip = None
@@ -61,7 +61,7 @@ def most_promising_ringing(
 def _ringing_copy(
     response: ElectronicsResponse, config: ResponseConfig, frequency_mhz: float
 ) -> ElectronicsResponse:
-    """The same response with a ringing of a frequency, and of no size."""
+    """A copy of a response with a ringing of a given frequency and zero weights."""
     rings = ElectronicsResponse(
         config.model_copy(update={"ringing_mhz": frequency_mhz}), float(response.dt_ns)
     )

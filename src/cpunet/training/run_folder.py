@@ -1,4 +1,4 @@
-"""What a training leaves behind, in one folder that says where it came from.
+"""Run folder: the results of a training, with their provenance.
 
 ``run.json``
     Versions, seed, device, time taken, fingerprints of the files, counts.
@@ -48,7 +48,7 @@ RUN = FolderKind(
 
 
 def versions() -> dict[str, str]:
-    """Versions of what shapes the result."""
+    """Versions of the software that affects the result."""
     packages = {name: version(name) for name in ("torch", "numpy", "numba")}
     return {"python": platform.python_version(), "cpunet": cpunet.__version__} | packages
 
@@ -81,7 +81,7 @@ def read_info(run: Path) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If the folder is no finished run, or of a newer version.
+        If the folder is not a finished run, or of a newer version.
     """
     path = Path(run) / INFO
     absent = f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
@@ -104,7 +104,7 @@ def read_recipe(run: Path) -> Recipe:
 
 
 def _completed(settings: Any) -> Any:
-    """Settings with what recipes of earlier versions did not have yet."""
+    """Add settings that recipes of earlier versions do not have."""
     for part, (known_by, added) in _LATER.items():
         own = settings.get(part) if isinstance(settings, dict) else None
         if isinstance(own, dict) and known_by in own:
@@ -118,7 +118,7 @@ def _completed(settings: Any) -> Any:
     return settings
 
 
-# by the part of a recipe: a setting by which its kind is known, and what came later
+# by part of a recipe: a setting that identifies its kind, and settings added later
 _LATER: dict[str, tuple[str, dict[str, Any]]] = {
     "generator": ("fast_decays_us", {"free_decays": False}),
     "training": (
@@ -126,7 +126,7 @@ _LATER: dict[str, tuple[str, dict[str, Any]]] = {
         {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}, "held_out": 0.0},
     ),
 }
-# of a loss by which networks beside a chain were trained
+# settings of a former loss for networks that correct a chain
 _FORMER_RESIDUAL = {"projections", "amplitude_weight", "size_weight", "slope_weight"}
 
 
@@ -182,7 +182,7 @@ def load_network(run: Path, name: str, network: nn.Module, device: str = "cpu") 
 
 
 def fill_networks(run: Path, model: nn.Module) -> None:
-    """Fill those networks of a CycleGAN that the run has weights of; REN and IREN at least.
+    """Fill the networks of a CycleGAN for which the run has weights, at least REN and IREN.
 
     Raises
     ------
@@ -214,7 +214,7 @@ def weights_sha256(run: Path) -> str:
 
 
 def _require_weights(path: Path, name: str, weights: dict[str, Tensor]) -> None:
-    """Raise a `CpunetError` if there is no number, or nothing but zeros, among weights."""
+    """Raise a `CpunetError` if a weight is not finite, or all weights are zero."""
     floating = {key: w for key, w in weights.items() if w.is_floating_point()}
     for key, values in floating.items():
         if not bool(torch.isfinite(values).all()):

@@ -1,7 +1,7 @@
-"""What must stand in ``run.json``, and as what: whoever reads a run can rely on it.
+"""Required content of ``run.json``, with types, so that readers of a run can rely on it.
 
-Files of runs are edited by hand, cut off and mixed up.  Further keys are left alone, since
-every version may add some; ``format`` tells which keys mean what.
+Users edit, truncate and mix up files of runs.  Additional keys are accepted, since every
+version may add some; ``format`` defines the meaning of the keys.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from cpunet.pulses.cuts import CutWindows
 
 FORMAT = 1
-"""Of the folders written now; those of versions before it, which do not tell, load as well."""
+"""Format of new run folders; older ones that do not state a format can also be loaded."""
 
 _Number = Annotated[float, Field(ge=0, le=1e15)]
 
@@ -24,17 +24,17 @@ class _Part(BaseModel):
 
 
 class SideFacts(_Part):
-    """The pulses of one side; what is not known, as of runs made elsewhere, may be missing."""
+    """The pulses of one side; unknown facts, for example of imported runs, may be missing."""
 
     file: str | None = None
-    used: int | str | None = None  # of runs made elsewhere, it may not be known
+    used: int | str | None = None  # text if the number is unknown, as for imported runs
     read: int | None = None
     sha256: str | None = None
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
 
 
 class FitFacts(_Part):
-    """Of a matched response: errors of its parameters, and how they go together."""
+    """Fit of a matched response: errors of its parameters, and their covariance."""
 
     errors: dict[str, float] | None = None
     covariance: list[list[float]] | None = None
@@ -57,7 +57,7 @@ class RunFacts(_Part):
 
 
 def problem(info: Mapping[str, Any]) -> str:
-    """What is wrong with the content of a ``run.json``, in words; empty if nothing is.
+    """First error in the content of a ``run.json``, in words; empty if there is none.
 
     Examples
     --------

@@ -49,12 +49,12 @@ class EpochSampler:
         return {"order": self._order.clone(), "random": self._random.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Resume where a sampler of the same pulses was."""
+        """Restore the state of a sampler of the same pulses."""
         self._order = state["order"]
         self._random.set_state(state["random"])
 
     def next_batch(self) -> Tensor:
-        """Return the own share of the next batch, shape (share, 1, samples)."""
+        """Return this process's share of the next batch, shape (share, 1, samples)."""
         n = len(self.pulses)
         if n < self.batch_size:
             chosen = torch.randint(n, (self.batch_size,), generator=self._random)

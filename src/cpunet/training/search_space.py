@@ -9,17 +9,17 @@ from cpunet.errors import CpunetError
 from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe, SearchConfig
 
-# What pulses are compared, and how, must be the same for all trials.
+# Pulses and their comparison must be the same for all trials, so only these may be tuned.
 ROOMS = ("generator", "discriminator", "training")
 
 
 def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
-    """The search space of a recipe, every value of which the recipe could have.
+    """The search space of a recipe, after checking its keys and values.
 
     Raises
     ------
     CpunetError
-        If there is none, or a key or value in it is not allowed: names the key.
+        If there is none, or a key or value is not allowed; the message names the key.
     """
     if not recipe.search:
         raise CpunetError(
@@ -74,13 +74,13 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
 
 
 def is_whole(recipe: Recipe, key: str, config: SearchConfig) -> bool:
-    """Whether a range is one of whole numbers."""
+    """Whether a range is one of integers."""
     numbers = (value_of(recipe, key), config.low, config.high)
     return all(isinstance(n, int) and not isinstance(n, bool) for n in numbers)
 
 
 def holds(config: SearchConfig, value: Any) -> bool:
-    """Whether a value is in a part of a search space."""
+    """Whether a search space contains a value of a setting."""
     if config.choices is not None:
         return value in config.choices
     assert config.low is not None

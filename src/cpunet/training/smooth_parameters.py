@@ -1,8 +1,8 @@
 """Coordinates in which pulses depend nearly linearly on the parameters of a response.
 
 Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of their
-difference.  Where they are equal, derivatives with the difference vanish, and steps along it
-go astray.
+difference.  Where they are equal, derivatives with respect to the difference vanish, and steps
+along it go astray.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from cpunet.training.moments import Values
 from cpunet.training.response_problem import Parameters
 
 POLES = "log_poles_ns"
-# Of the square of half the difference of two logarithms: width of the prior, and step of the
-# finite differences (times of 45 and 36 ns in place of 40 twice).
+# For the square of half the difference of two logarithms: width of the prior, and step of the
+# finite differences (times of 44 and 36 ns instead of 40 ns twice).
 SQUARE_WIDTH, SQUARE_STEP = 0.25, 0.01
 
 
@@ -24,7 +24,7 @@ class SmoothParameters:
     Parameters
     ----------
     parameters
-        Of the response.
+        Parameters of the response.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -40,11 +40,11 @@ class SmoothParameters:
         self.centre = self.of(parameters.centre)
 
     def get(self) -> Values:
-        """Where the response is."""
+        """Coordinates of the current response."""
         return self.of(self.parameters.vector())
 
     def set(self, place: Values) -> None:
-        """Move the response there."""
+        """Set the response from its coordinates."""
         vector = place.copy()
         for mean, square in self._pairs:
             half = np.sqrt(max(place[square], 0.0))
@@ -60,7 +60,7 @@ class SmoothParameters:
         return place
 
     def by_parameters(self, slopes: Values, vector: Values) -> Values:
-        """Derivatives with the parameters from those with the coordinates, by columns."""
+        """Convert derivatives (in columns) from coordinates to parameters."""
         turned = slopes.copy()
         for mean, square in self._pairs:
             half = 0.5 * (vector[mean] - vector[square])

@@ -3,9 +3,9 @@
 Response and alignment together slow the edge of a measured pulse and move it by tens
 of samples: the slow top of a measured pulse reaches 99.9 % of its maximum long after
 its edge, that of a simulated one at once.  A network that starts from the identity
-has to learn this against its cycle loss, and for many seeds does not in the time a
-laptop has.  The delay, the level and how much slower the edge is need no learning:
-they are medians and means of the two sets.  What is left to learn is the shape.
+has to learn this against its cycle loss, and for many seeds fails to in the time
+available on a laptop.  The delay, the level and how much slower the edge is need not
+be learned: they are medians and means of the two sets.  Only the shape remains.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor
 from cpunet.networks.positional_unet import SKIP_KERNEL, smoothed
 from cpunet.training.cyclegan import CycleGan
 
-SLOPE_SAMPLES = 3  # over which the steepest slope is taken: enough to tame the noise
-MOST = 2000  # pulses are plenty for a median
+SLOPE_SAMPLES = 3  # over which the steepest slope is taken: enough to suppress the noise
+MOST = 2000  # maximum number of pulses: enough for a median
 BISECTIONS = 20
 
 
@@ -27,11 +27,11 @@ def match_skips(model: CycleGan, sim: Tensor, data: Tensor, align_sample: int) -
     Parameters
     ----------
     model
-        With residual generators; others are left as they are.
+        Model with residual generators; other generators are not changed.
     sim, data
         Prepared pulses, shape (n, 1, samples).
     align_sample
-        Sample at which both are aligned; after it, the mean measured pulse gives
+        Sample at which both are aligned; after it, the mean measured pulse defines
         the level (simulated ones are flat at 1).
     """
     if not (model.ren.residual and model.iren.residual):

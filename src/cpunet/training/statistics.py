@@ -1,9 +1,9 @@
-"""Batch-norm statistics of what a generator will really be asked to translate.
+"""Batch-norm statistics of the pulses that a generator will translate.
 
 In training a generator sees pulses of both sides (identity and cycle losses), and
 the running averages of its batch norms are a mixture of both. Used for one side
 alone they shift the output: with them the tail slope of a translation is wrong by
-more than its spread. After the training the averages are taken anew over the
+more than its spread. After the training the averages are computed again over the
 generator's own input side (Wu and Johnson 2021, arXiv:2105.07576, section 3).
 """
 
@@ -31,23 +31,23 @@ def refresh_batch_statistics(
     network
         A generator; its mode (training or evaluation) is left as it was.
     sampler
-        Pulses of the side that it translates; in a group, that of the batch norms.
+        Sampler of the side that it translates, with the process group of the batch norms.
     batches
         How many batches to average over.
     run
-        Where the network stands behind a chain, both of windows of shape (batch, samples).
+        If the network follows a chain: both together, for windows of shape (batch, samples).
     """
     batch = (sampler.next_batch() for _ in range(batches))
     update_bn(batch, network if run is None else _Behind(network, run))
 
 
 class _Behind(nn.Module):
-    """A network that is run behind something else."""
+    """A network that is run by a function, such as one that applies a chain first."""
 
     def __init__(self, network: nn.Module, run: Callable[[Tensor], object]) -> None:
         super().__init__()
         self.network = network
-        self.run = partial(run)  # bare, a module would be set to train, too
+        self.run = partial(run)  # a bare module would be switched to training mode, too
         self.training = network.training
 
     def forward(self, pulses: Tensor) -> object:

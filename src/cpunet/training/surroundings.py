@@ -1,4 +1,4 @@
-"""What a CycleGAN is given beside its pulses: noise, a matched chain, a teacher."""
+"""Inputs of a CycleGAN besides its pulses: noise, a matched chain, a teacher."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class MatchedChain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Beside the pulses.
+    """Inputs of a CycleGAN besides its pulses.
 
     Parameters
     ----------
     outside
         Noise for the translations of the simulated pulses.
     chain
-        That the generators stand behind.
+        Matched chain that the generators follow.
     teacher
         A matched chain that makes pairs for generators without one, with its noise.
     """
@@ -39,7 +39,7 @@ class Surroundings:
     teacher: tuple[ResponseGenerator, Outside] | None = None
 
     def of_pulses(self, rows: npt.NDArray[np.int64]) -> Surroundings:
-        """Those of some of the simulated pulses; a teacher has to go with all."""
+        """The same for some of the simulated pulses; a teacher requires all of them."""
         if self.outside is None:
             return self
         outside = replace(self.outside, energy_kev=self.outside.energy_kev[rows])

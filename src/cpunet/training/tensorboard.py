@@ -1,4 +1,4 @@
-"""The losses as TensorBoard reads them, for those who have it installed."""
+"""Write the losses for TensorBoard, if it is installed."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ class LossBoard:
                 self._writer.add_scalar(name, value, record["iteration"])
 
     def close(self) -> None:
-        """Finish the files."""
+        """Close the files."""
         self._writer.close()

@@ -1,8 +1,8 @@
-"""Simulated pulses behind a response and noise, read block by block on all cores.
+"""Simulated pulses after a response and with noise, read block by block on all cores.
 
-A comparison asks the same question at many responses: of what mean are these functions?
-The noise is therefore drawn once, so that two responses are compared with the same noise,
-and what is kept of a pulse is its part of a sum.
+A fit evaluates the means of the same functions for many responses.  The noise is therefore
+drawn once, so that responses are compared with the same noise, and only sums over the pulses
+are kept.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from cpunet.pulses.container import FloatArray
 from cpunet.training._record_kernels import add_noise
 from cpunet.training.moments import BLOCK, Moments, Readings, Values
 
-# Half maxima come at most this many samples after the aligned one: what the response delays.
+# Maximum delay of the half maximum by the response, in samples after the alignment sample.
 DELAY = 100
-PLATEAU = 100  # samples after the window whose mean tells the height of a record
-# Traces of noise that are kept, each twice as long as a record.  More pulses than these share
-# them, at other places and with other signs.
+PLATEAU = 100  # samples after the window whose mean gives the height of a record
+# Maximum number of noise traces, each twice as long as a record.  If there are more pulses,
+# they share the traces, with other start samples and signs.
 NOISE_TRACES = 4096
-SPECTRA_BYTES = 2**27  # of pulses that are not transformed anew for each response
+SPECTRA_BYTES = 2**27  # of pulse spectra that are cached between responses
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise for a set of pulses, the same whenever it is asked for.
+    """Noise for a set of pulses, the same at each use.
 
     Parameters
     ----------
     traces
         For an energy of 1 keV, shape (traces, samples).
     trace, start, factor
-        Of each draw and pulse: which trace, from which sample on, and its sign over the energy;
-        each of shape (draws, pulses).
+        Trace, start sample, and sign divided by energy, for each draw and pulse; each of shape
+        (draws, pulses).
     left, decay
-        Remains of earlier pulses at the beginning of each record, shape (draws, pulses), and
-        what becomes of 1 over it, shape (samples,); None for none.
+        Remains of earlier pulses for each record, shape (draws, pulses), and their decay over
+        a record, shape (samples,); None for none.
     """
 
     traces: FloatArray
@@ -73,8 +73,8 @@ class Noise:
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
-        Every second draw is the one before it with the other sign: what noise adds to a mean
-        cancels.
+        Every second draw is the one before it with opposite sign, so that the contribution of
+        noise to a mean cancels.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class Noise:
         require_energies(energy_kev)
         kept = min(NOISE_TRACES, n * pairs)
         traces = noise.draw(np.ones(kept), 2 * length, rng)
-        # each trace before any is used again
+        # each trace is used before any is used again
         trace = np.concatenate([rng.permutation(kept) for _ in range(-(-n * pairs // kept))])
         sign = rng.choice((-1.0, 1.0), (pairs, n))
         drawn = cls(
@@ -103,7 +103,7 @@ class Noise:
         return replace(drawn, left=left, decay=np.asarray(remains.decay(length), np.float32))
 
     def first(self, n: int) -> Noise:
-        """That of the first `n` pulses."""
+        """Noise of the first `n` pulses."""
         return replace(
             self,
             trace=self.trace[:, :n],
@@ -134,11 +134,11 @@ class Translated:
     sim
         Prepared simulated pulses, shape (pulses, samples).
     noise
-        Of their records.
+        Noise of their records.
     moments
-        Drawn up from the data that they are compared with.
+        Moments defined by the data that they are compared with.
     weights
-        Of the pulses, shape (pulses,).
+        Weights of the pulses, shape (pulses,).
     """
 
     sim: FloatArray
@@ -169,23 +169,23 @@ class Translated:
         cut: bool = True,
         draws: int | None = None,
     ) -> tuple[tuple[Values, ...], float]:
-        """Sums over all pulses and draws of noise, and the weight of those that count.
+        """Sums over all pulses and draws of noise, and the weight of the pulses used.
 
         Parameters
         ----------
         response
-            What the pulses pass through.
+            Response applied to the pulses.
         of
-            Weighted sums over the pulses of one block; called in several threads.
+            Function for the weighted sums over one block of pulses; called in several threads.
         cut
             See `Moments.read`.
         draws
-            Only so many of the draws.
+            Number of draws to use; None for all.
 
         Returns
         -------
         tuple
-            The sums, and the weight of the pulses in them.
+            The sums, and the total weight of the pulses in them.
         """
         parts = self.sums_of_blocks(response, of, cut=cut, draws=draws)
         sums = zip(*(found for found, _ in parts), strict=True)
@@ -200,7 +200,7 @@ class Translated:
         cut: bool = True,
         draws: int | None = None,
     ) -> list[tuple[tuple[Values, ...], float]]:
-        """What `sums` gives, of each block of `size` pulses in their order."""
+        """Same as `sums`, for each block of `size` pulses in their order."""
         transfer = self._transfer(response)
         threads = torch.get_num_threads()
 
@@ -218,7 +218,7 @@ class Translated:
         if threads == 1 or len(starts) == 1:
             return [one(first) for first in starts]
         with ThreadPoolExecutor(min(threads, len(starts))) as pool:
-            # in the order of the pulses, whichever thread was first
+            # in the order of the pulses, whichever thread finishes first
             return list(pool.map(one, starts))
 
     def _transfer(self, response: ElectronicsResponse) -> npt.NDArray[np.complex64]:
@@ -251,7 +251,7 @@ class Translated:
             yield self.moments.read(noisy, last, cut=cut, weights=weights)
 
     def _spectrum(self, first: int, size: int) -> npt.NDArray[np.complex64]:
-        """Fourier transform of the currents of one block, kept as far as there is room."""
+        """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
         sim = self.sim[first : first + size]
         if (kept := self._spectra.get((first, len(sim)))) is not None:
             return kept

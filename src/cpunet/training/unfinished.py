@@ -1,9 +1,9 @@
-"""A training on its way: ``RUN.unfinished`` beside the run folder that it becomes.
+"""An unfinished training: ``RUN.unfinished``, next to the run folder that it becomes.
 
 ``unfinished.json``
-    Recipe, seed and pulses, for whoever looks in; locked by the process that trains.
+    Recipe, seed and pulses, for information; locked by the process that trains.
 ``losses.jsonl``
-    The log of the losses, cut to the checkpoint's iteration when a training goes on.
+    The log of the losses, cut to the checkpoint's iteration when a training is resumed.
 ``checkpoint.safetensors``, ``checkpoint.previous.safetensors``
     See `cpunet.training.checkpoints`.
 
@@ -58,7 +58,7 @@ UNFINISHED = FolderKind(
 
 
 def unfinished_name(out: Path) -> Path:
-    """Folder of the unfinished training of which `out` will be the run."""
+    """Folder of the unfinished training that will become the run `out`."""
     return out.parent / f"{out.name}.unfinished"
 
 
@@ -70,30 +70,29 @@ def unfinished_folder(
     force: bool = False,
     note: Callable[[str], None] = lambda _message: None,
 ) -> Iterator[Path]:
-    """Give ``OUT.unfinished`` to work in; what is there at the end becomes `out`.
+    """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
 
-    On an exception the folder stays if there is a checkpoint in it.
+    On an exception the folder is kept if it contains a checkpoint.
 
     Parameters
     ----------
     out
-        The run folder to be.
+        Run folder to be made.
     inputs
         Files and folders that are read.
     resume
-        Whether an unfinished training may be there; it is left for `UnfinishedRun` to go
-        on with.
+        Whether an unfinished training may exist; it is kept for `UnfinishedRun` to continue.
     force
-        Replace an existing run folder, and begin anew where an unfinished one is.
+        Replace an existing run folder, and allow an unfinished training to be replaced.
     note
-        Told of what is kept of either.
+        Called with messages on what is kept of either.
 
     Raises
     ------
     CpunetError
-        If `out` exists and may not be replaced, an unfinished training is there and is
-        neither to go on nor to be replaced, another process works on it, or the folder
-        cannot be written to.
+        If `out` exists and may not be replaced, an unfinished training exists and is neither
+        to be resumed nor replaced, another process is training there, or the folder cannot
+        be written to.
     """
     out = Path(out)
     refuse_existing(out, *inputs, force=force)
@@ -126,7 +125,7 @@ def unfinished_folder(
 
 
 def _put_in_place(folder: Path, out: Path, *, force: bool, note: Callable[[str], None]) -> None:
-    # a copy: until it is in its place, the folder is all that a resumed training needs
+    # a copy: until it is in place, the training can be resumed from the original folder
     try:
         with folder_written_aside(out, RUN, force=force, note=note) as whole:
             copy_own(folder, whole, RUN)
@@ -135,7 +134,7 @@ def _put_in_place(folder: Path, out: Path, *, force: bool, note: Callable[[str],
 
 
 def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Keep other processes out."""
+    """Lock out other processes."""
     busy = f"{folder}: another process is training there; wait for it, or choose another --out"
     return locked(folder / MARKER, busy)
 
@@ -148,11 +147,11 @@ class UnfinishedRun:
     folder
         From `unfinished_folder`.
     fingerprint
-        What determines the weights, for `require_same`.
+        Everything that determines the weights, for `require_same`.
     environment
-        What may change their last bits: device, threads, version.
+        Facts that may change their last bits: device, threads, version.
     note
-        Told of what the user should know.
+        Called with messages for the user.
     """
 
     def __init__(
@@ -173,16 +172,17 @@ class UnfinishedRun:
 
     @property
     def seconds(self) -> float:
-        """Time taken so far, without what was lost and the pauses between."""
+        """Time taken so far, without lost iterations and pauses."""
         return self._seconds_before + time.perf_counter() - self._clock
 
     def begin(self, *, resume: bool) -> State | None:
-        """Clear the folder, or find the state to go on from (None if there is none).
+        """Clear the folder, or find the state to continue from (None if there is none).
 
         Raises
         ------
         CpunetError
-            If the training was begun otherwise, or all its checkpoints are damaged.
+            If the training was begun with other settings or pulses, or all its checkpoints
+            are damaged.
         """
         checkpoint = self._latest() if resume else None
         if checkpoint is None:
@@ -199,11 +199,11 @@ class UnfinishedRun:
     def log(self, records: Iterable[Record]) -> None:
         """Add training records to the log; if the disk is full, they wait for a later call."""
         self._log.add(records)
-        with suppress(OSError):  # `save` tells of it
+        with suppress(OSError):  # `save` reports it
             self._log.write()
 
     def save(self, state: State) -> None:
-        """Store a checkpoint; if it cannot be, say so and keep the one before."""
+        """Store a checkpoint; if that fails, report it and keep the previous one."""
         facts = {
             "fingerprint": self._fingerprint,
             "environment": self._environment,
@@ -221,7 +221,7 @@ class UnfinishedRun:
             )
 
     def finish(self) -> None:
-        """Write what is left of the log.
+        """Write the rest of the log.
 
         Raises
         ------
@@ -260,7 +260,7 @@ class UnfinishedRun:
 
 
 def _fits(checkpoint: Checkpoint, log_bytes: int) -> bool:
-    """Whether a checkpoint tells all that is needed to go on, and of no longer a log."""
+    """Whether a checkpoint has all facts needed to resume, and the log is long enough."""
     facts: Any = checkpoint.facts
     known: dict[str, Any] = {"fingerprint": dict, "environment": dict, "started": str}
     known |= {"seconds": int | float, "resumed_at": list, "log_bytes": int}
@@ -274,7 +274,7 @@ def _fits(checkpoint: Checkpoint, log_bytes: int) -> bool:
 
 
 class LossLog:
-    """``losses.jsonl``, of which nothing is lost or doubled when a write fails halfway."""
+    """``losses.jsonl``, without lost or duplicate lines if a write fails halfway."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / LOSSES
@@ -282,17 +282,17 @@ class LossLog:
         self._waiting: list[str] = []
 
     def cut(self, length: int) -> None:
-        """Drop all beyond `length` bytes."""
+        """Truncate the log to `length` bytes."""
         with self._path.open("ab") as stream:
             stream.truncate(length)
         self.length = length
 
     def add(self, records: Iterable[Record]) -> None:
-        """Take records, one line each, for the next `write`."""
+        """Queue records, one line each, for the next `write`."""
         self._waiting += (json.dumps(record) + "\n" for record in records)
 
     def write(self, *, sync: bool = False) -> int:
-        """Write what waits; return the length in bytes.
+        """Write the queued lines; return the length of the log in bytes.
 
         Raises
         ------

@@ -1,11 +1,11 @@
-r"""Weights of many functions, from the pulses whose means they weigh, and the bias of that.
+r"""Weights of many functions from the same pulses as their means, and the resulting bias.
 
-Parameters follow from where weighted means of many functions agree on both sides, see
-`cpunet.training.optimal_weights`.  The same pulses give weights and means, and the two are not
+Parameters are determined by the agreement of weighted means of many functions on both sides,
+see `cpunet.training.optimal_weights`.  Weights and means come from the same pulses and are not
 independent: a bin that by chance holds few pulses has a small covariance and small derivatives.
-With many functions the parameters are therefore biased, by an amount that goes as one over the
-number of pulses (Newey and Smith, Econometrica 72 (2004) 219).  Leaving out pulses shows such a
-bias (the jackknife; Quenouille, Biometrika 43 (1956) 353),
+With many functions the parameters are therefore biased, by an amount that scales as one over
+the number of pulses (Newey and Smith, Econometrica 72 (2004) 219).  Leaving out pulses
+estimates such a bias (the jackknife; Quenouille, Biometrika 43 (1956) 353),
 
 .. math:: b = (K - 1) \left(\frac{1}{K} \sum_k \hat\theta_{-k} - \hat\theta\right),
 
@@ -27,18 +27,18 @@ RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over pulses; they add up.
+    """Sums over pulses, which can be added.
 
     Parameters
     ----------
     n
-        Of the pulses' weights.
+        Sum of the weights of the pulses.
     total
-        Of the functions, shape (functions,).
+        Sum of the functions, shape (functions,).
     products
-        Of products of two functions, shape (functions, functions).
+        Sum of products of two functions, shape (functions, functions).
     moved
-        Of the functions' derivatives, shape (functions, coordinates).
+        Sum of the derivatives of the functions, shape (functions, coordinates).
     """
 
     n: float = 0.0
@@ -48,7 +48,7 @@ class Sums:
 
     @classmethod
     def of(cls, values: Values) -> Sums:
-        """Sums over measured pulses, of which there are no derivatives.
+        """Sums over measured pulses, which have no derivatives.
 
         Parameters
         ----------
@@ -67,24 +67,24 @@ class Sums:
 
     @property
     def mean(self) -> Values:
-        """Of the functions."""
+        """Mean of the functions."""
         return np.asarray(self.total / self.n)
 
     @property
     def covariance(self) -> Values:
-        """Of the functions."""
+        """Covariance of the functions."""
         return np.asarray(self.products / self.n - np.outer(self.mean, self.mean))
 
 
 class WeightedMeans:
-    """Weights from sums over both sides, and what they say of the same sums.
+    """Weights from sums over both sides, and the weighted means of the same sums.
 
     Parameters
     ----------
     simulated, measured
         Sums over the two sides.
     pairs
-        Number of pulses that errors go with.
+        Number of pulses that errors refer to.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class WeightedMeans:
     whiten
         Makes the weighted means uncorrelated, in units of their errors.
     deviations, slopes
-        Whitened differences of the two sides, and their derivatives with the coordinates.
+        Whitened differences of the two sides, and their derivatives in the coordinates.
     """
 
     def __init__(self, simulated: Sums, measured: Sums, pairs: float) -> None:
@@ -115,9 +115,9 @@ class Parts:
     Parameters
     ----------
     simulated, measured
-        Sums over each part of the two sides; as many parts of one as of the other.
+        Sums over each part of the two sides, with the same number of parts.
     pairs
-        Number of pulses that errors go with.
+        Number of pulses that errors refer to.
     """
 
     def __init__(
@@ -143,16 +143,16 @@ def jackknife_bias(
     Parameters
     ----------
     bands
-        Whose means are compared together; as many parts of each.
+        Bands compared together, with the same number of parts.
     prior, widths
-        Of the coordinates: their deviations in these widths.
+        Deviations of the coordinates from their priors in units of the widths, and the widths.
     held
-        Moves of the coordinates that are held, such as at a bound; nan of the free ones.
+        Moves of the coordinates that are held, for example at a bound; NaN for free ones.
 
     Returns
     -------
     array
-        To be subtracted, shape (coordinates,).
+        Bias to be subtracted, shape (coordinates,).
     """
     free, scale = np.isnan(held), np.diag(1 / widths)
 

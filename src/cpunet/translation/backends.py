@@ -129,14 +129,14 @@ class NetworkBackend(Backend):
 
 
 class NoisyNetworkBackend(NetworkBackend):
-    """A network from window to window, and noise of baselines outside of it.
+    """A network that maps windows to windows, with baseline noise added to its output.
 
     Parameters
     ----------
     network
-        What it makes has no electronic noise.
+        Network whose output has no electronic noise.
     noise
-        Of the data's baselines.
+        Noise of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
     remains
@@ -159,7 +159,7 @@ class NoisyNetworkBackend(NetworkBackend):
         Raises
         ------
         CpunetError
-            If noise is wanted and an energy is not known.
+            If noise is requested and an energy is unknown.
         """
         energy_kev, second = drawn.energy_kev, drawn.second
         if drawn.noise and energy_kev is None:
@@ -235,7 +235,7 @@ class ResponseBackend(Backend):
     ) -> npt.NDArray[np.float64]:
         """Second pulses with shapes of the same batch, at each sample in prepared units."""
         dt_ns = float(self.chain.response.dt_ns)
-        # those that come early are followed for longer
+        # early second pulses need longer records
         chosen = np.pad(
             windows[second.partner], ((0, 0), (0, second.reach(dt_ns))), mode="edge"
         )

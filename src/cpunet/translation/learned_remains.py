@@ -77,7 +77,7 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
     Raises
     ------
     CpunetError
-        If the rate is no such number, or the run does not know the energies.
+        If the rate is negative or not finite, or the run has no energies.
     """
     if not (np.isfinite(rate_khz) and rate_khz >= 0):
         raise CpunetError(f"--pile-up-khz {rate_khz:g}: expected a rate in kHz, 0 or more")

@@ -38,7 +38,7 @@ def components(templates: Floats, rank: int) -> Floats:
     values, vectors = scipy.linalg.eigh(gram, subset_by_index=(n - rank, n - 1))
     kept = values > 1e-12 * values[-1]
     made = (vectors[:, kept] / np.sqrt(values[kept])).T @ templates
-    # again, since the sums above are of single precision
+    # orthonormalise again, since the sums above are in single precision
     orthonormal = np.linalg.qr(made[::-1].T)[0].T
     return np.asarray(orthonormal, np.float32)
 

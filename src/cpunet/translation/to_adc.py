@@ -103,13 +103,13 @@ def adc_scale(
     Raises
     ------
     CpunetError
-        If one of the two is neither given nor known, or is not a positive number.
+        If one of the two is neither given nor known, the gain is not positive, or the baseline
+        is negative.
     """
-    for name, value in (("--adc-per-kev", adc_per_kev), ("--baseline", baseline)):
-        if value is not None and not (np.isfinite(value) and value >= 0):
-            raise CpunetError(f"{name} is {value}; expected a number above 0")
-    if adc_per_kev == 0:
-        raise CpunetError("--adc-per-kev is 0; expected a number above 0")
+    if adc_per_kev is not None and not (np.isfinite(adc_per_kev) and adc_per_kev > 0):
+        raise CpunetError(f"--adc-per-kev is {adc_per_kev}; expected a number above 0")
+    if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
+        raise CpunetError(f"--baseline is {baseline}; expected a number that is not negative")
     known_gain, known_baseline = _of_the_data(run, ren)
     per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
     level = known_baseline if baseline is None else baseline
@@ -250,7 +250,7 @@ class AdcForm:
         """Second pulses with shapes of the same batch, in prepared units."""
         if not len(second.row):
             return np.zeros((len(windows), self.length))
-        # those that come early are followed for longer
+        # early second pulses need longer traces
         reached = self.length + second.reach(self.ren.dt_ns)
         shapes, _ = self._levels(backend, windows[second.partner], reached)
         return second.added(np.nan_to_num(shapes), energy_kev, self.ren.dt_ns, self.length)
@@ -258,7 +258,7 @@ class AdcForm:
     def _levels(
         self, backend: ResponseBackend, windows: FloatArray, length: int
     ) -> tuple[FloatArray, Codes]:
-        """Noise-free traces of prepared simulated windows, the 99.9 % at sample `n_pre`."""
+        """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
         config, dt_ns = self.config, self.ren.dt_ns
         before = max(0, self.n_pre - config.samples_before)
         after = max(0, length - self.n_pre - config.samples_after)

@@ -47,7 +47,7 @@ from cpunet.translation.learned_remains import remains_of
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
 RESIDUAL = "residual"  # its weights are stored beside those of the chain
-# and beside those of a CycleGAN, what its translations need
+# names of other weights stored with those of a CycleGAN, for its translations
 CHAIN, INVERSE, NOISE = "chain", "inverse", "noise"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
