@@ -165,7 +165,7 @@ class BaselineNoise:
 
         Each long trace of one kind is cut into parts for several pulses, assigned in random
         order and with random signs. Noise slower than a record is nearly the same in these
-        parts but for the sign, so it does not shift their means in common.
+        parts apart from the sign, so it does not shift all their means together.
 
         Parameters
         ----------
@@ -273,10 +273,10 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     if not len(axes):
         return one
     points = np.clip(own @ axes.T, -OUTLIER, OUTLIER)
-    # for an empty kind, the warning of which is no error: it is left out below
+    # kmeans2 warns of an empty kind, which is harmless: it is left out below
     with warnings.catch_warnings(action="ignore"):
         centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
-    # baselines of kinds with few go to the nearest with enough
+    # baselines of kinds with too few are assigned to the nearest kind with enough
     enough = np.bincount(which, minlength=kinds) >= MIN_N
     if not enough.any():
         return one
@@ -294,7 +294,7 @@ def _band_powers(baselines: Values) -> Values:
 
 
 def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
-    """Samples before the pulse in prepared units times keV, the same number of each trace."""
+    """Samples before the pulse in prepared units times keV, the same number for each trace."""
     known = np.flatnonzero(np.isfinite(raw.energy_kev) & (raw.energy_kev > 0))
     prepared = prepare(raw[known], config, "measured")
     if len(prepared) < MIN_N:

@@ -1,4 +1,4 @@
-"""Level and tilt of baselines, and the tails of earlier pulses that they tell of."""
+"""Level and tilt of baselines, and the tails of earlier pulses that they indicate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from cpunet.electronics.baseline_noise import MIN_N, SIGMA_PER_MAD
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 
-MIN_LARGE = 20  # large remainders from which coupling and decay time are taken
+MIN_LARGE = 20  # minimum number of large remainders to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
 # that of a remainder.
 COUPLED = 2.5

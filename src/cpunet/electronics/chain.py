@@ -119,7 +119,7 @@ class Noise(_Figures):
 
 
 class EarlierPulses(_Figures):
-    """Pulses before the record, a Poisson process. Their tails lie under its traces."""
+    """Pulses before the record, a Poisson process. Their tails lie under the traces."""
 
     rate_kHz: _Rate
 
@@ -245,7 +245,7 @@ class Electronics(_Figures):
         hum: Hum | None = None,
         wander: Wander | None = None,
     ) -> Electronics:
-        """Copy of the chain with other rates of other pulses, with hum, or wandering.
+        """Copy of the chain with different rates of other pulses, hum or wandering.
 
         Parameters
         ----------

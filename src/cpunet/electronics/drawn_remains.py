@@ -1,7 +1,7 @@
 """Random tails of earlier pulses for translated pulses, distributed as in the data.
 
 They are drawn from the law of the data. Quality cuts remove traces with large remainders. The
-probability to pass the cuts is measured by adding remainders to measured traces without any.
+probability of passing the cuts is measured by adding remainders to measured traces without any.
 Translations into prepared windows are compared with data after cuts, so their remainders are
 drawn with this probability. Raw traces have not passed any cuts.
 """
@@ -24,7 +24,7 @@ from cpunet.pulses.cuts import CutWindows, apply_cuts
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Remainders in keV at which the probability to pass the cuts is measured.
+# Remainders in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
 TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which remainders are added
 
@@ -51,7 +51,7 @@ class DrawnRemains:
     dt_ns
         Sampling period in ns.
     passed
-        Probability to pass the cuts of the data at `SIZES_KEV`. None if there are no cuts.
+        Probability of passing the cuts of the data at `SIZES_KEV`. None if there are no cuts.
     decay_error_us
         Error in us of the decay time of the law, if it was measured from remainders.
     """
@@ -160,7 +160,7 @@ class TraceNoise:
 
 
 class SameNoise:
-    """Noise that several methods in turn add to the same records, drawn only once.
+    """Noise that several methods add to the same records in turn, drawn only once.
 
     Parameters
     ----------
@@ -170,8 +170,8 @@ class SameNoise:
 
     def __init__(self, noise: BaselineNoise | TraceNoise) -> None:
         self._noise = noise
-        self._asked: tuple[Any, bytes, int] | None = None  # what was last drawn for
-        self._drawn: tuple[FloatArray, Any] | None = None  # and the generator's state after it
+        self._asked: tuple[Any, bytes, int] | None = None  # arguments of the last draw
+        self._drawn: tuple[FloatArray, Any] | None = None  # and the state after it
 
     @property
     def dt_ns(self) -> float:
@@ -181,7 +181,7 @@ class SameNoise:
     def draw(
         self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw as the noise itself would: the same again for a generator in the same state."""
+        """Draw like the noise itself; repeat the last draw for the same generator state."""
         asked = (rng.bit_generator.state, energy_kev.tobytes(), length)
         if self._drawn is None or asked != self._asked:
             self._asked = asked

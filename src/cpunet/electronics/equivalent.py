@@ -1,7 +1,7 @@
-"""A readout chain in two numbers, Gaussian ⊗ exponential, as production simulations have it.
+"""Approximation of a readout chain by Gaussian ⊗ exponential, as in production simulations.
 
-They are fitted as there: to the averaged current about its maximum, weighted with its square.
-The part that two numbers cannot describe is reported with them.
+As there, sigma and tau are fitted to the averaged current around its maximum, weighted by its
+square. The deviations from the chain are reported with them.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from cpunet.electronics.exponentials import Exponentials
 
 Values = npt.NDArray[np.float64]
 
-WINDOW, WINDOWS = 48, 3  # ns, of the averages of a current
-AROUND_NS = 500  # of the maximum, that are compared
-START_NS = (40.0, 60.0)  # sigma and tau at first
+WINDOW, WINDOWS = 48, 3  # width in ns and number of the moving averages of a current
+AROUND_NS = 500  # compared range on either side of the maximum
+START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0
-LENGTH, BEGIN = 8192, 1500  # samples of 1 ns, and the one at which charge moves
+LENGTH, BEGIN = 8192, 1500  # number of 1 ns samples, and the one at which charge moves
 BATCH = 100
-WIDTHS_NS = (1, 20, 50, 100, 150, 200, 300)  # of steady currents, as those of a detector
+WIDTHS_NS = (1, 20, 50, 100, 150, 200, 300)  # of constant currents, as in a detector
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,18 @@ class Equivalent:
     Attributes
     ----------
     sigma_ns, tau_ns
-        Of both.
+        Standard deviation of the Gaussian and time constant of the exponential.
     prompt_share
-        Height of the chain's current over that of the kernel's: what of the charge comes in
+        Factor by which the kernel's current fits the chain's: the fraction of the charge in
         the peak.
     current_error_percent
-        Largest difference of the averaged currents within 500 ns of the maximum, of its height.
+        Largest difference between the averaged currents within 500 ns of the maximum, relative
+        to its height.
     late_charge_percent
-        Charge that comes more than 500 ns after the maximum, and none of which the kernel has.
+        Charge that arrives more than 500 ns after the maximum, minus that of the kernel.
     ae_error_percent
-        Half of the range over which A/E changes against the chain's, among steady currents
-        that last from 1 to 300 ns, normalised in the middle.
+        Half the range of the ratio of A/E of kernel and chain, over constant currents that last
+        from 1 to 300 ns, divided by its median.
     """
 
     sigma_ns: float
@@ -61,7 +62,7 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
     Parameters
     ----------
     undecayed
-        The chain without its decays, as data are after a pole-zero correction.
+        The chain without its decays, like data after pole-zero correction.
 
     Examples
     --------
@@ -105,7 +106,7 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
 def ae_ratios(
     charge: npt.NDArray[np.floating], undecayed: Exponentials, nearest: Equivalent
 ) -> Values:
-    """A/E of templates behind the kernel over that behind the chain.
+    """Ratio of A/E after the kernel to A/E after the chain, for ideal pulses.
 
     Parameters
     ----------
@@ -129,10 +130,10 @@ def ae_ratios(
 
 
 def current_delay_ns(undecayed: Exponentials) -> float:
-    """When the averaged current of a charge that comes at once is highest.
+    """Time of the maximum of the averaged current for charge that arrives instantaneously.
 
-    The averages look back over three times 48 ns; half of their length is taken off, so that
-    they delay nothing.
+    The three averages look back over 48 ns each. Half of their total length is subtracted, so
+    that they add no delay.
     """
     current = _averaged(undecayed.step(np.arange(LENGTH, dtype=float) - BEGIN))
     return float(current.argmax() - BEGIN - 0.5 * WINDOWS * (WINDOW - 1))
@@ -147,7 +148,7 @@ def kernel_step(time_ns: Values, sigma_ns: float, tau_ns: float) -> Values:
 
 
 def _averaged(step: Values, width: int = 1) -> Values:
-    """Current of a charge that comes evenly over `width` ns, averaged over the last 48 ns."""
+    """Current of charge arriving evenly over `width` ns, averaged three times over 48 ns."""
     current = np.diff(step, prepend=0.0)
     for size in (width, *(WINDOW,) * WINDOWS):
         total = np.cumsum(current)
@@ -156,7 +157,7 @@ def _averaged(step: Values, width: int = 1) -> Values:
 
 
 def _about_peak(current: Values) -> Values:
-    """Samples about the maximum, which lies between two of them."""
+    """Current around its maximum, whose position is interpolated between samples."""
     peak = int(current.argmax())
     low, mid, high = current[peak - 1 : peak + 2]
     time = peak + 0.5 * (low - high) / (low - 2 * mid + high)
@@ -165,5 +166,5 @@ def _about_peak(current: Values) -> Values:
 
 
 def _ratios(step: Values, kernel: Values) -> Values:
-    """A of the kernel over A of the chain for currents that last differently long."""
+    """A of the kernel over A of the chain for constant currents of all `WIDTHS_NS`."""
     return np.array([_averaged(kernel, w).max() / _averaged(step, w).max() for w in WIDTHS_NS])

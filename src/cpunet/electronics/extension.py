@@ -1,4 +1,4 @@
-"""Prepared windows made longer: the baseline before them, each one's own decay after them."""
+"""Extend prepared windows with baseline before them and their own decay after them."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Samples of room about a window: where noise moves the maximum, the window is cut there.
+# Samples of padding around a window, so that it can be cut anew if noise moves the maximum.
 PADDING_BEFORE, PADDING_AFTER = 200, 400
 
 
 def extended(
     windows: FloatArray, config: PreparationConfig, dt_ns: float, length: int, n_pre: int
 ) -> FloatArray:
-    """Cut or extend prepared windows: 0 before them, each one's fitted decay after them.
+    """Cut or extend prepared windows, with 0 before them and their fitted decay after them.
 
     Parameters
     ----------
     windows
-        Shape (n, config.length); rows of NaN stay that.
+        Shape (n, config.length); a row with a NaN becomes NaN.
     config
-        How they were prepared; `decay_fit_samples` at the end of each give its decay.
+        Their preparation settings. The last `decay_fit_samples` of each determine its decay.
     dt_ns
         Sampling period in ns.
     length, n_pre
-        Samples of the result, and those before the aligned one.
+        Number of samples of the result, and number of samples before the alignment.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def extended(
         measured = prepare(Pulses.of(windows, dt_ns=dt_ns), config, "measured")
         per_sample = np.zeros(len(windows))
         per_sample[measured.index] = measured.tail_slope * dt_ns * 1e-6
-        # the level of the last samples belongs to their middle
+        # the mean of the last samples is the level at their centre
         since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
         end = windows[:, -config.tail_samples :].mean(axis=1)
         result[:, late] = end[:, np.newaxis] * np.exp(per_sample[:, np.newaxis] * since)
@@ -51,6 +51,6 @@ def extended(
 
 
 def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Records of prepared windows: PADDING_BEFORE + config.length + PADDING_AFTER samples."""
+    """Extend prepared windows to PADDING_BEFORE + config.length + PADDING_AFTER samples."""
     length = PADDING_BEFORE + config.length + PADDING_AFTER
     return extended(windows, config, dt_ns, length, PADDING_BEFORE + config.samples_before)

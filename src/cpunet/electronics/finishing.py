@@ -50,7 +50,7 @@ def finish(
     dt_ns
         Sampling period in ns.
     noise
-        Noise to add, with or without the tails of earlier pulses. None gives noise-free
+        Noise to add, with or without the tails of earlier pulses. None for noise-free
         windows.
     energy_kev
         Energy of each pulse in keV, shape ``(n,)``. Required for noise.

@@ -63,7 +63,7 @@ def draw_other_pulses(
         added_kev += _hum(len(pulses), electronics, slow)
     if electronics.wander is not None:
         wander, dt_ns = electronics.wander, electronics.dt_ns
-        # of its own generator: the others stay as they are without it
+        # its own generator, so that it does not change the other random numbers
         (drift,) = rng.spawn(1)
         added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
     return OtherPulses(added_kev, remains_kev, n_piled, piled_kev, piled_ns)
@@ -119,5 +119,5 @@ def _wander(
     """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
     kept = np.exp(-1e-3 * dt_ns / wander.time_us)
     steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(2 * np.log(kept))), (n, length))
-    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # as likely at any time
+    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # stationary from the start
     return np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=1), float)

@@ -36,11 +36,11 @@ from cpunet.recipes.schema import PreparationConfig
 
 MOST = 16384  # traces used in the fit of the law
 LARGE = 12.0  # minimum height in errors of remainders used for the decay time
-# Fraction of the traces with remainders beyond the error from which half of the noise is given
-# up to measure it without them.
+# If a larger fraction of traces has remainders above the error, noise is measured only from
+# traces with remainders below 0, at the cost of half of the noise.
 MANY = 0.1
 LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
-# The rate is significant if it is SURE errors large and the log-likelihood gain is SURE_GAIN.
+# The rate is significant above SURE errors, with a log-likelihood gain above SURE_GAIN.
 SURE, SURE_GAIN = 4.0, 12.0
 MAX_FULL = 0.97  # maximum fraction of traces with a remainder larger than the error
 MIN_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
@@ -96,11 +96,11 @@ class Remains:
     def empty(self, raw: Pulses) -> npt.NDArray[np.bool_]:
         """Select traces without remains, from whose baselines noise can be measured.
 
-        Where levels are precise, these are the traces about as low as an empty baseline. No
-        condition is placed on the slopes, so that noise alone determines them. Otherwise, if
-        many traces have remains, they are those whose remainder comes out below 0: by
-        symmetry, noise on this side has the power of all noise, while remains are mostly on
-        the other. If few have, all traces are taken.
+        If levels are precise, these are the traces with a level close to that of an empty
+        baseline. No condition is placed on the slopes, so that noise alone determines them.
+        Otherwise, if many traces have remains, those with a measured remainder of 0 or less are
+        selected: by symmetry, the noise on this side has the power of all noise, while remains
+        are mostly on the other side. If few traces have remains, all are selected.
         """
         if not self.coupled or self.level_weight < LEVEL_TELLS:
             if float(self.fit.law.share_above(self.error_kev)) < MANY:

@@ -128,7 +128,7 @@ class _Likelihood:
     def __call__(
         self, expected: float, level: float, sigma: float, weights: FloatArray
     ) -> float:
-        # beyond, the noise leaves nothing; short arrays are allocated faster, too
+        # beyond this the noise term is negligible; shorter arrays are also allocated faster
         u = self.u[: np.searchsorted(self.u, NEGLIGIBLE / sigma)]
         parts = weights @ self.exponents[:, : 2 * len(u)]
         parts *= expected
@@ -156,7 +156,7 @@ class _Likelihood:
 
 
 def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
-    """Points of a grid, the first quarter below 0, that holds remainders and their noise."""
+    """Number of grid points for remainders and their noise; the first quarter is below 0."""
     above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
     below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
     points = max(4 * above / 3, 4 * below) / step_kev

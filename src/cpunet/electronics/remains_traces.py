@@ -1,4 +1,4 @@
-"""What is kept of raw traces to tell remains of earlier pulses, and whether they can tell."""
+"""Gather and check what is needed of raw traces to measure remains of earlier pulses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIN_SAMPLES = 64  # minimum length of a baseline
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """What is kept of the traces: their first samples and scalar properties."""
+    """First samples and scalar properties of the traces."""
 
     baselines: FloatArray
     energy_kev: FloatArray

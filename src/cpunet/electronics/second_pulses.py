@@ -13,7 +13,7 @@ from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import earlier_pulses
 from cpunet.errors import CpunetError
 
-MOST_EXPECTED = 4.0  # second pulses per trace, beyond which there is no pulse to speak of
+MOST_EXPECTED = 4.0  # maximum expected number of second pulses per trace
 
 Columns = dict[str, tuple[npt.NDArray[np.generic], str]]
 
@@ -34,7 +34,7 @@ class SecondPulses:
         Times relative to the trace's own pulse in ns (negative: before it), shape
         ``(pulses,)``.
     partner
-        Traces, of 0 to `n`, whose pulses lend their shapes, shape ``(pulses,)``.
+        Traces (0 to `n` - 1) whose pulse shapes are used, shape ``(pulses,)``.
     """
 
     n: int
@@ -65,7 +65,7 @@ class SecondPulses:
             Quantiles of their energies in keV, see
             `cpunet.electronics.remains_law.RemainsLaw`.
         before_ns, record_ns
-            Part of the record before the trace's own pulse, and the whole of it, in ns.
+            Duration of the record before the trace's own pulse, and of the whole record, in ns.
         rng
             Random generator.
 
@@ -76,7 +76,7 @@ class SecondPulses:
 
         Examples
         --------
-        1 kHz in a record of 20 us are 0.02 pulses per trace.
+        1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
 
         >>> rng = np.random.default_rng(1)
         >>> second = SecondPulses.draw(10_000, 1.0, (10, 2615), 5e3, 20e3, rng)
@@ -94,7 +94,7 @@ class SecondPulses:
         return cls(n, row, kev, 1e3 * time_us - before_ns, partner)
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Self:
-        """Second pulses of some of the traces, which are numbered anew."""
+        """Second pulses of selected traces, with the traces renumbered."""
         place = np.full(self.n, -1)
         place[rows] = np.arange(len(rows))
         kept = place[self.row] >= 0
@@ -107,7 +107,7 @@ class SecondPulses:
         )
 
     def largest(self) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-        """Count the second pulses of each trace, and tell energy and time of the largest.
+        """Number of second pulses in each trace, and energy and time of the largest.
 
         Energies (keV) and times (ns) are NaN where there is none. All of shape ``(n,)``.
         """
@@ -118,7 +118,7 @@ class SecondPulses:
         return np.bincount(self.row, minlength=self.n), kev, after_ns
 
     def columns(self) -> Columns:
-        """The same as columns of a table, with their units."""
+        """Results of `largest` as columns of a table, with their units."""
         count, kev, after_ns = self.largest()
         return {
             "n_piled": (count, ""),
@@ -127,7 +127,7 @@ class SecondPulses:
         }
 
     def reach(self, dt_ns: float) -> int:
-        """Samples by which the earliest of them precedes the trace's own pulse."""
+        """Number of samples beyond a record that `added` needs for the earliest pulse."""
         earliest = float(self.after_ns.min(initial=0.0))
         return int(np.ceil(-min(earliest, 0.0) / dt_ns)) + 1
 
@@ -173,7 +173,7 @@ class SecondPulses:
         for i, row in enumerate(self.row):
             late = shift[i] - whole[i]
             shape = (1 - late) * shapes[i, 1:] + late * shapes[i, :-1]
-            # sample k of the record is sample k - whole of the shape, whose first is left out
+            # sample k of the record is sample k - whole of the shape without its first
             start = whole[i] + 1
             part = shape[max(0, -start) : max(0, length - start)]
             first = max(0, start)
@@ -183,7 +183,7 @@ class SecondPulses:
 
 @dataclass(frozen=True)
 class DrawnPileUp:
-    """How second pulses are drawn.
+    """Parameters of the second pulses to be drawn.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class DrawnPileUp:
     dt_ns: float
 
     def draw(self, n: int, before: int, length: int, rng: np.random.Generator) -> SecondPulses:
-        """Draw the second pulses of `n` records of `length` samples, `before` own pulses."""
+        """Draw second pulses for records of `length` samples, `before` before the own pulse."""
         return SecondPulses.draw(
             n,
             self.rate_khz,

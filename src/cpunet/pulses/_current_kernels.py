@@ -1,8 +1,8 @@
 """Compiled loops of the current amplitude: dspeed's moving windows, several pulses at once.
 
-Each step of a moving window waits for the one before, so a single pulse leaves most of a
-processor idle.  Here the same steps of `LANES` pulses are done together.  Every value is
-float32 and the result of the same operations in the same order as in dspeed's ``upsampler`` and
+Each step of a moving window depends on the one before, so a single pulse leaves most of a
+processor idle.  Here each step is done for `LANES` pulses at once.  All values are float32 and
+result from the same operations in the same order as in dspeed's ``upsampler`` and
 ``moving_window_multi``, so the results are equal to the last bit.
 """
 
@@ -28,7 +28,7 @@ _compiled: Any = kernel(error_model="numpy")
 def _window(values, steps, averaged):  # type: ignore[no-untyped-def]
     """Mean of each value and the `steps` - 1 before it, in reverse order.
 
-    The windows look back and ahead in turn: on reversed values, back is ahead.
+    The windows alternate between looking back and ahead: on reversed values, back is ahead.
     """
     width, last, total = np.float32(steps), len(values) - 1, values[0].copy()
     averaged[last] = total
@@ -52,7 +52,7 @@ def _maxima(current, first, samples, upsampling, steps, averages, ends, maxima):
     for begin in range(0, n, LANES):
         for sample in range(samples):
             for lane in range(LANES):
-                row = min(begin + lane, n - 1)  # the last pulse again where there are no more
+                row = min(begin + lane, n - 1)  # repeat the last pulse in unused lanes
                 highest[lane] = current[row, first[row] + sample]
             # dspeed centres each sample on its steps
             start = sample * upsampling - upsampling // 2
@@ -64,7 +64,7 @@ def _maxima(current, first, samples, upsampling, steps, averages, ends, maxima):
         highest[:] = values[ends]
         for i in range(ends, fine - ends):
             for lane in range(LANES):
-                # a NaN stays
+                # a NaN is kept
                 if not values[i, lane] <= highest[lane]:
                     highest[lane] = values[i, lane]
         for lane in range(min(LANES, n - begin)):
@@ -100,7 +100,7 @@ def _elsewhere(current, first, samples, highest):  # type: ignore[no-untyped-def
 
 
 def currents(waveforms: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Differences of neighbouring samples, and the place of the largest of each pulse.
+    """Differences of neighbouring samples, and the index of the largest one of each pulse.
 
     A pulse with a NaN has a current of NaN.
     """
@@ -113,7 +113,7 @@ def currents(waveforms: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
 def maxima_elsewhere(
     current: FloatArray, first: npt.NDArray[np.int64], samples: int
 ) -> FloatArray:
-    """Largest current of each pulse outside the `samples` from its `first` one."""
+    """Largest current of each pulse outside the `samples` samples that start at `first`."""
     highest = np.empty(len(current), np.float32)
     _elsewhere(current, first, samples, highest)
     return highest
@@ -129,25 +129,25 @@ def averaged_maxima(
     averages: int,
     ends: int,
 ) -> Values:
-    """Maximum of the averaged current among the `samples` from the `first` one of each pulse.
+    """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
 
     Parameters
     ----------
     current
         Float32, shape ``(n, length - 1)``.
     first, samples
-        Samples that are averaged: the first, shape ``(n,)``, and how many.
+        First sample that is averaged, shape ``(n,)``, and number of averaged samples.
     upsampling
         Steps per sample.
     steps, averages
-        Width of a moving average in steps, and how many follow each other.
+        Width of the moving average in steps, and number of successive averages.
     ends
-        Steps at either end that are left out of the search.
+        Steps at each end that are excluded from the search.
 
     Returns
     -------
     numpy.ndarray
-        Float64, shape ``(n,)``; NaN where a value of the search is.
+        Float64, shape ``(n,)``; NaN if a searched value is NaN.
     """
     maxima = np.empty(len(current), np.float32)
     _maxima(current, first, samples, upsampling, steps, averages, ends, maxima)

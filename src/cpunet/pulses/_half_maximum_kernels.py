@@ -17,7 +17,7 @@ _compiled: Any = kernel(error_model="numpy")
 
 @_compiled
 def _weights(t):  # type: ignore[no-untyped-def]
-    """Weights of the coefficients at -1, 0, 1, 2 for a time in 0 … 1."""
+    """Weights of the coefficients at -1, 0, 1, 2 for a time between 0 and 1."""
     s = 1 - t
     return (
         s * s * s / 6,
@@ -73,7 +73,7 @@ def crossings(
 def shifted(
     coefficients: Values, times: Values, pad: int, n_before: int, n_after: int
 ) -> Values:
-    """Splines from `n_before` samples before a time of each; NaN outside the record."""
+    """Each spline from `n_before` samples before its time; NaN outside the record."""
     moved = np.full((len(times), n_before + n_after), np.nan)
     _shifted(coefficients, times, pad, n_before, moved)
     return moved

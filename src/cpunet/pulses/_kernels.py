@@ -42,8 +42,8 @@ N_COLUMNS = 7
 # The alignment moves the baseline window, and the baseline moves the 99.9 % threshold by
 # a thousandth of its own change.  Two rounds settle all but exact ties.
 _ROUNDS = 4
-# A first sample of at most so many times the rise to the second is charge that has moved within
-# it: half of a constant current is the mean of its first period.
+# If the first sample is at most this many times the rise to the second, it is charge that moved
+# within that sample: for a constant current, its mean in the first period is half the rise.
 _MAX_FIRST = 2.0
 # A pulse has begun where it exceeds a hundredth of its height and is clear of the noise.  The
 # baseline ends some samples earlier, since the rise starts below that threshold.
@@ -74,8 +74,8 @@ class Settings(NamedTuple):
 def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
     """Level of a simulated pulse before any charge has moved.
 
-    That is its lowest value, unless the pulse is moving from the first sample on: then what is
-    in this sample has come within it, and taken off as a baseline it would be lost.
+    This is its lowest value, unless the pulse already rises at the first sample.  The value of
+    that sample is then charge that moved within it and must not be subtracted as a baseline.
     """
     first = max(start, 0)
     lowest = np.float64(lowest_of(trace[first:stop]))
@@ -88,7 +88,7 @@ def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
 
 @compiled
 def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: ignore[no-untyped-def]
-    """The aligned sample; `preferred` if rounding alone could move it there or away.
+    """The alignment sample; `preferred` if rounding alone could move it there or away.
 
     Without this preference, one prepared pulse in ten thousand would shift by a sample
     when prepared again.
@@ -143,7 +143,7 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
 
     The baseline part of a window can contain the start of a slow pulse, whose slope would
     make the quality cuts remove long drift times.  A pulse that begins in the first half of
-    that part is not slow: it is a second pulse, and stays in for the cuts to find.
+    that part is not slow: it is a second pulse, which is left in so that the cuts find it.
     """
     level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
     begun = crossing(trace, min(align, len(trace) - 1), level)

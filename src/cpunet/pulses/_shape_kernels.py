@@ -1,6 +1,6 @@
 """Compiled loops of the shape parameters: one pulse in, its numbers out.
 
-All sums are float64.  A pulse without a value gives NaN, never an exception.
+All sums are float64.  An undefined value is NaN and never raises an exception.
 """
 
 from __future__ import annotations
@@ -297,6 +297,6 @@ def current_widths(waveforms: FloatArray, weights: FloatArray) -> Values:
     The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`.
     """
     widths = np.empty(len(waveforms))
-    # negative weights are rounding; they would give a falling pulse a positive current
+    # negative weights are rounding errors that would make the current of a falling pulse > 0
     _current_widths(waveforms, np.clip(weights.astype(float), 0, None), widths)
     return widths

@@ -125,7 +125,7 @@ class ColumnAppender:
                 pulses, t0_ns=self._t0_ns, units=self._units, samples=self._samples
             )
         }
-        # set on the samples: a waveform table with attributes of its own is read only once
+        # set on the samples: a waveform table with its own attributes can be read only once
         content[self._name].values.attrs.update(self._attrs)
         for name, (values, units) in (columns or {}).items():
             array = Array(np.asarray(values), attrs={"units": units} if units else {})

@@ -14,11 +14,11 @@ from cpunet.pulses.container import FloatArray
 Values = npt.NDArray[np.float64]
 
 BISECTIONS = 30  # of one sample: a precision of 1e-9
-PAD = 8  # samples of the edge value; the effect of the spline's end falls by 3.7 per sample
+PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
 
 class Splines:
-    """Cubic splines through pulses, beyond their ends constant.
+    """Cubic splines through pulses, constant beyond their ends.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Splines:
         return kernels.crossings(self.coefficients, before, PAD, level, BISECTIONS)
 
     def shifted(self, times: Values, n_before: int, n_after: int) -> Values:
-        """Pulses from `n_before` samples before a time of each until `n_after` after it.
+        """Each pulse from `n_before` samples before its time to `n_after` samples after it.
 
         Returns
         -------

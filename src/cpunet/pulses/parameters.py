@@ -110,7 +110,8 @@ def current_amplitude_kernel() -> npt.NDArray[np.float32]:
     current[0, 2 * REACH] = 1
     grid = _averaged(current)[0].reshape(-1, UPSAMPLING)
     around = grid[REACH : 3 * REACH + 1]
-    # a unit current at 0 contributes to sample j with the weight that j gives sample -j
+    # the response at sample j to a unit current at sample 0 is the weight of the current j
+    # samples earlier
     return np.ascontiguousarray(around[::-1].T)
 
 
@@ -284,7 +285,7 @@ def _current_amplitude(waveforms: FloatArray) -> Values:
 def _maximum(
     current: FloatArray, first: npt.NDArray[np.int64], samples: int, ends: int
 ) -> Values:
-    """Maximum of the averaged current, but for `ends` samples at either end."""
+    """Maximum of the averaged current, excluding `ends` samples at each end."""
     return _current_kernels.averaged_maxima(
         current,
         first,

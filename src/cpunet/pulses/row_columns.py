@@ -59,8 +59,8 @@ class RowColumns:
         n_pulses
             Number of rows that each column must have.
         own
-            Names that the output uses itself.  A column with such a name gets `SUFFIX`,
-            unless it has the same meaning: the event number, or an energy in keV.
+            Names that the output uses itself.  A column with such a name gets `SUFFIX`, or
+            is omitted if it has the same meaning (event number, energy in energy units).
         """
         table, _, chosen = waveforms.rpartition("/")
         names, left_out = {}, {}

@@ -85,8 +85,8 @@ def load_prepared(
     limit
         Number of accepted pulses after which reading stops.
     most
-        Largest number of accepted pulses to keep: if there are more, a random sample of all of
-        them, the same for the same file.  Memory is bounded by it.
+        Maximum number of accepted pulses to keep.  If there are more, a random sample of them
+        is kept, always the same for the same file.  This bounds the memory.
     progress
         Function called after each block with the number of pulses read since the last call.
 
@@ -130,10 +130,10 @@ def load_prepared(
 
 
 def _thin(sets: list[Prepared], drawn: list[FloatColumn], most: int) -> int:
-    """Keep the pulses that drew the smallest numbers; return how many these are.
+    """Keep the `most` pulses with the smallest random numbers; return their number.
 
-    What is left out now would be left out with all later pulses, too: so the sample is one of
-    the whole file, each pulse as likely as any other.
+    A pulse dropped now would also be dropped after all later pulses were read, so the result is
+    a uniform random sample of the whole file.
     """
     bound = np.partition(np.concatenate(drawn), most)[most]
     for number, part in enumerate(sets):

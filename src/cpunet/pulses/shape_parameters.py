@@ -37,8 +37,8 @@ RISE_TIMES = {
     "rise_90_99": ("t90", "t99"),
 }
 LATE_FRACTION = 0.8  # charge that arrives after 80 % of the height is late (Majorana)
-# Time of the fast decay.  The window constrains only the difference of a tail from a slow
-# decay, so a second free time would follow the noise.
+# Time constant of the fast decay.  The window only constrains how a tail differs from a slow
+# decay, so a second free time constant would fit the noise.
 FAST_DECAY_NS = 4000.0
 
 

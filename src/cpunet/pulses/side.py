@@ -24,7 +24,7 @@ REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 _LOOKED_AT = 256  # pulses
 _MIN_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
 _FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
-_TURNS = 3  # turning points of the baseline: noise has at least these, a charge signal fewer
+_TURNS = 3  # turning points of the baseline: noise has at least this many, a signal fewer
 _SMALL = 1e-5  # of the height: rounding of a flat line
 _MIN_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 
@@ -56,7 +56,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     source
         File of pulses.
     wanted
-        Side as which the file was given.
+        Side that the user states.
     remedy
         Remedy to suggest if the pulses are of the other side.
     insist
@@ -65,7 +65,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     Raises
     ------
     CpunetError
-        If the file states that its pulses are of the other side, or if they look like it
+        If the file states that its pulses are of the other side, or if they appear to be
         and `insist` is False.
     """
     found = recorded_side(source)

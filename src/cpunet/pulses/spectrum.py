@@ -13,7 +13,7 @@ Values = npt.NDArray[np.float64]
 WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
 MIN_N = 30  # minimum counts in the highest bins of a line
-ABOVE = 4.0  # ratio of a line's counts to those beside it
+ABOVE = 4.0  # minimum ratio of a line's counts to those beside it
 WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
 
@@ -65,14 +65,14 @@ SOURCES = {
     "Co-60": (1332.492, 1173.228),
     "Co-56": (846.770, 1238.288, 2598.500, 1771.357, 1037.843, 3253.503),
 }
-# The one line of Cs-137 is told from others by its Compton edge, the highest energy of single
-# scattering, and by what is missing above both.
+# The single line of Cs-137 is identified by its Compton edge, the maximum energy of a single
+# scattering, and by the low counts above the edge and above the line.
 CAESIUM, LINE_KEV, EDGE = "Cs-137", 661.657, 0.7214
-STEP, ABOVE_LINE = 2.0, 0.1  # counts below over above the edge; share beyond the line
-MIN_BINS = 10  # of a spectrum that may hold lines
+STEP, ABOVE_LINE = 2.0, 0.1  # counts below the edge over those above; fraction beyond the line
+MIN_BINS = 10  # minimum number of bins of a spectrum that may contain lines
 LOG_BIN = 0.002  # bin width in the logarithm of the amplitude
 BACKGROUND = 25  # bins to either side whose median is the background under a line
-HIGHEST = 12.0  # standard deviations that one line contributes at most
+HIGHEST = 12.0  # maximum contribution of one line, in standard deviations
 CLEAR, MIN_LINES = 4.0, 3  # significance of a clear line; clear lines required
 
 
@@ -101,8 +101,8 @@ class Suggestion(NamedTuple):
 def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     """Search a spectrum of amplitudes for the lines of calibration sources.
 
-    On a logarithmic axis a calibration is a shift.  The shift is chosen at which most lines
-    coincide with an excess of counts.
+    On a logarithmic axis a calibration is a shift.  The chosen shift is the one at which the
+    lines coincide best with excesses of counts.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     >>> found.source, round(found.kev_per_adc, 4)
     ('Th-228', 0.065)
 
-    One line is enough if the Compton edge of Cs-137 is below it and little above.
+    One line is enough if the Compton edge of Cs-137 is below it and few counts are above it.
 
     >>> scattered = np.append(rng.uniform(100, 477, 6000), rng.uniform(477, 650, 300))
     >>> found = suggested_calibration(np.append(scattered, rng.normal(661.657, 1, 1500)) / 0.2)

@@ -1,4 +1,4 @@
-"""Repeated simulation of the same hits with other physics, as a calibration needs it."""
+"""Repeated simulation of the same hits with other physics, as needed for a calibration."""
 
 from __future__ import annotations
 

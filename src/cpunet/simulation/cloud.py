@@ -16,9 +16,9 @@ from cpunet.kernels import kernel
 FloatArray = npt.NDArray[np.float64]
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-# siggen's rounded value, in everything that is compared with it
+# siggen's rounded value, used in its formulas
 _SIGGEN_FWHM_PER_SIGMA = 2.355
-# 2.355**2 times 0.12 V mm/cm, rounded there
+# 2.355**2 times 0.12 V mm/cm, as rounded in siggen
 _SIGGEN_DIFFUSION = 0.67
 _BOLTZMANN_V_PER_K = 8.617333e-5
 _SMALLEST_FWHM_MM = 0.01

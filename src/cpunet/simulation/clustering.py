@@ -47,7 +47,7 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     """
     if not (math.isfinite(distance_mm) and distance_mm >= 0):
         raise CpunetError(f"hits cannot be merged within {distance_mm} mm; give 0 or more")
-    near = float(distance_mm) ** 2  # compiled for one kind of number
+    near = float(distance_mm) ** 2  # always a float, so that the loop is compiled only once
     merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, near)
     x, y, z, energy = merged.T.copy()
     return Hits(x, y, z, energy, offsets, hits.event_number)

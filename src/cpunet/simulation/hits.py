@@ -147,7 +147,7 @@ class Hits:
     def of_events(self, event_number: npt.ArrayLike) -> Hits:
         """Events with the given numbers, in their order.
 
-        A number without an event gives an event without hits, so the result has one event for
+        A number without an event yields an event without hits, so the result has one event for
         each number.
 
         Raises

@@ -160,7 +160,7 @@ def _fine_pulse(
 
 @kernel
 def _half_time(signal: FloatArray, zero: int) -> float:
-    """Step, with its fraction, after `zero` at which a pulse first reaches half its end."""
+    """Fractional step after `zero` at which a pulse first reaches half its final value."""
     half = 0.5 * signal[-1]
     for k in range(zero + 1, len(signal)):
         if signal[k] >= half and signal[k] > signal[k - 1]:

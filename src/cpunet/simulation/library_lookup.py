@@ -85,7 +85,7 @@ def add_pulse(
     out: Float32Array,
     steps: FloatArray,
 ) -> float:
-    """Add `weight` times the pulse of a hit that `covers` accepts; return what is trapped.
+    """Add `weight` times the pulse of a hit that `covers` accepts; return the trapped part.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Delayed charge from the lithium layer: diffusion in one dimension, with recombination.
+"""Delayed charge from the lithium layer: one-dimensional diffusion with recombination.
 
-In the n+ layer there is no field. Holes that are set free there diffuse; those that come to its
-inner boundary are collected with a delay, those that recombine near the surface or come to it
-are lost (D. Dai et al., arXiv:2207.11902; P. Zhang et al., arXiv:2511.02513; reboost's surface
-model). All that is asked for is the probability to have arrived: it obeys the diffusion
-equation backwards, so that one solution holds for all depths, and its modes for all times.
+The n+ layer has no field, so holes released there diffuse. Those that reach its inner boundary
+are collected with a delay; those that recombine near the surface or reach it are lost (D. Dai
+et al., arXiv:2207.11902; P. Zhang et al., arXiv:2511.02513; reboost's surface model). Only the
+probability of having reached the boundary is needed. It obeys the backward diffusion equation,
+so one solution covers all depths, and its modes cover all times.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from cpunet.errors import CpunetError
 
 Values = npt.NDArray[np.float64]
 
-NODES = 400  # of the layer
-MM2_PER_NS = 1e-7  # in one cm² per s
+NODES = 400  # grid intervals across the layer
+MM2_PER_NS = 1e-7  # 1 cm²/s in mm²/ns
 
 
 @dataclass(frozen=True)
 class LithiumLayer:
-    """What happens to charge in the n+ layer.
+    """Properties of the n+ layer that determine its charge collection.
 
     Parameters
     ----------
     thickness_mm
-        From the surface to where all charge is collected.
+        Distance in mm from the surface to the depth where all charge is collected.
     recombination_depth_mm
-        How deep charge recombines.
+        Depth in mm down to which charge recombines.
     lifetime_ns
-        There.
+        Lifetime of the charge in ns where it recombines.
     diffusion_cm2_per_s
-        Constant of the holes: k T / e times a mobility of 4e4 cm²/Vs is 300 at 90 K.
+        Diffusion constant of the holes in cm²/s: k T / e times a mobility of 4e4 cm²/Vs is 300
+        at 90 K.
 
     Raises
     ------
     CpunetError
-        If a number is not above 0 or the layer is thinner than where charge recombines.
+        If a number is out of range or the recombination depth exceeds the thickness.
     """
 
     thickness_mm: float
@@ -68,21 +69,21 @@ class LithiumLayer:
 
 
 def arrived(layer: LithiumLayer, depth_mm: npt.ArrayLike, time_ns: npt.ArrayLike) -> Values:
-    """Share of a charge that has come to the inner boundary.
+    """Fraction of the charge that has reached the inner boundary.
 
     Parameters
     ----------
     layer
-        Its numbers.
+        Properties of the layer.
     depth_mm
-        Where charge is set free, from the surface; deeper than the layer all is there at once.
+        Depths in mm at which charge is released. Beyond the layer all of it arrives at once.
     time_ns
-        Times after that, 0 or later.
+        Times in ns since the release, 0 or later.
 
     Returns
     -------
     numpy.ndarray
-        Shape (depths, times), 0 … 1.
+        Shape (depths, times), between 0 and 1.
 
     Examples
     --------
@@ -94,11 +95,11 @@ def arrived(layer: LithiumLayer, depth_mm: npt.ArrayLike, time_ns: npt.ArrayLike
     step = layer.thickness_mm / NODES
     inner = step * np.arange(1, NODES)
     rate = layer.diffusion_cm2_per_s * MM2_PER_NS / step**2
-    # where charge recombines, in shares of a cell
+    # fraction of each cell in which charge recombines
     share = np.clip((layer.recombination_depth_mm - inner) / step + 0.5, 0, 1)
     diagonal = -2 * rate - share / layer.lifetime_ns
     values, modes = scipy.linalg.eigh_tridiagonal(diagonal, np.full(NODES - 2, rate))
-    # fed from the boundary alone, where the probability is 1
+    # the steady state: its only source is the inner boundary, where the probability is 1
     end = -(modes / values) @ (rate * modes[-1])
     weights = modes * (modes.T @ end)
     nodes = np.concatenate([[0.0], inner, [layer.thickness_mm]])
@@ -114,19 +115,19 @@ def arrived(layer: LithiumLayer, depth_mm: npt.ArrayLike, time_ns: npt.ArrayLike
 
 
 def delayed(charge: npt.NDArray[np.floating], share: Values) -> npt.NDArray[np.float32]:
-    """Pulses of charge that comes to the boundary little by little.
+    """Pulses of charge that reaches the boundary gradually.
 
     Parameters
     ----------
     charge
-        Pulses of charge set free at the boundary, shape (n, samples).
+        Pulses of charge released at the boundary, shape (n, samples).
     share
-        What has arrived at each sample, shape (n, samples) or (samples,).
+        Fraction that has arrived at each sample, shape (n, samples) or (samples,).
 
     Returns
     -------
     numpy.ndarray
-        Float32 (n, samples), in units of the charge set free in the layer.
+        Float32 (n, samples), in units of the charge released in the layer.
     """
     n_samples = charge.shape[1]
     coming = np.diff(np.broadcast_to(share, charge.shape), axis=1, prepend=0)

@@ -106,7 +106,7 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
 def _solver(
     r_flux: FloatArray, z_flux: FloatArray, to_ground: FloatArray, free: Any
 ) -> tuple[Any, Any]:
-    """The function that gives the flux from the neighbours, and the factorised matrix."""
+    """Function that computes the flux from the neighbours, and the factorised matrix."""
 
     def from_neighbours(values: FloatArray) -> FloatArray:
         flux = np.zeros(free.shape)
@@ -179,7 +179,7 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
     """
     germanium = _germanium_in_cells(detector, grid)
     if detector.siggen_conventions:
-        # fieldgen's ditch holds the charge of N / 16 of germanium
+        # in fieldgen the ditch has 1/16 of the charge density of germanium
         germanium = germanium + (1 - germanium) / EPSILON_GERMANIUM
     inner, outer = _half_rings(grid)
     by_column = np.zeros((len(grid.r_mm), germanium.shape[1]))

@@ -105,7 +105,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
             raise CpunetError(f"shift: {_problem(error, cls)}") from error
 
     def detector(self, detector: Detector) -> Detector:
-        """Shifted detector for a detector as simulated.
+        """Shifted version of a simulated detector.
 
         Raises
         ------
@@ -127,7 +127,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
             ) from error
 
     def settings(self, settings: SimulationSettings) -> SimulationSettings:
-        """Shifted settings for the settings of the simulation.
+        """Shifted version of the simulation settings.
 
         Raises
         ------

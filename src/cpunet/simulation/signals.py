@@ -138,7 +138,7 @@ def hit_signals(
 def hit_table(
     x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
 ) -> FloatArray:
-    """Hits as rows x, y, z (mm), energy (keV); `hit_signals` lists what is refused."""
+    """Hits as rows x, y, z (mm), energy (keV); see `hit_signals` for invalid input."""
     try:
         columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
     except ValueError as error:

@@ -33,7 +33,7 @@ from cpunet.electronics.baseline_methods.window_response import (
 from cpunet.pulses.container import FloatArray
 
 MOST = 2000  # maximum number of pulses of either dataset in the fit
-ROUNDS = 3  # iterations of the fit, each with slices by the response fitted so far
+ROUNDS = 3  # iterations of the fit, each with slices from the response fitted so far
 EDGE = 96  # samples compared before and after the half maximum
 START = 2.0  # initial sigma and tau, in samples
 LONGEST = 64.0  # maximum sigma and tau, in samples

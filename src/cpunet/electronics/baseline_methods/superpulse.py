@@ -83,7 +83,7 @@ class Superpulse:
             response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
             kernel = _kernel(wanted, _superpulses(spectra, response), length)
         found = cls(dt_ns, kernel, slope)
-        # the contribution of the kernel's late part to the tail slope is taken off the decay
+        # subtract the contribution of the kernel's late part to the tail slope from the decay
         windows = found.translate(sim[:MOST])[:, PADDING_BEFORE : PADDING_BEFORE + sim.shape[1]]
         excess = fitted_tail_slope(windows, dt_ns, align) - slope
         return replace(found, tail_slope_per_ms=slope - excess)

@@ -1,4 +1,4 @@
-"""Translation of simulated pulses by a baseline method, prepared as the data."""
+"""Translation of simulated pulses by a baseline method, prepared like the data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def translate_like_data(
     noise: BaselineNoise | TraceNoise | None = None,
     seed: int | np.random.Generator = 0,
 ) -> Pulses:
-    """Translate prepared simulated pulses and prepare them as the data.
+    """Translate prepared simulated pulses and prepare them like the data.
 
     Parameters
     ----------

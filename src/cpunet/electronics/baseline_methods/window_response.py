@@ -1,8 +1,8 @@
 """Linear responses applied to windows: a kernel on the current, then the decay.
 
-A window is padded before the response acts. Before it no charge has moved; after it all has
-been collected, so the current is zero on both sides. The padding holds what the kernel adds
-before and after the window, and allows a later alignment to cut the window again.
+A window is padded before the response is applied. No charge moves before the window, and all is
+collected by its end, so the current is zero on both sides. The padding holds the parts of the
+response outside the window and allows the window to be cut again after a later alignment.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 
-# Factors to keV and ns.  A dictionary and not a units library: only these units occur
+# Factors to keV and ns.  A dictionary rather than a units library: only these units occur
 # beside waveforms, and any other must be refused, not converted.
 ENERGY_UNITS = {"eV": 1e-3, "keV": 1.0, "MeV": 1e3}
 TIME_UNITS = {"ps": 1e-3, "ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9}
@@ -21,22 +21,22 @@ _SHOWN = 6
 
 
 class Column(Protocol):
-    """One value per event, or a single value that holds for all."""
+    """One value per event, or a single value that applies to all events."""
 
     @property
     def units(self) -> str:
-        """Units as the file gives them, ``""`` if it does not."""
+        """Units in the file, ``""`` if there are none."""
         ...
 
     @property
     def constant(self) -> bool:
-        """Whether there is one value for all events."""
+        """Whether a single value applies to all events."""
         ...
 
     def __len__(self) -> int: ...
 
     def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events from `start` to before `stop`."""
+        """Values of the events `start` to `stop` - 1."""
         ...
 
 
@@ -49,14 +49,14 @@ class MemoryColumn:
 
     @property
     def constant(self) -> bool:
-        """Whether there is one value for all events."""
+        """Whether a single value applies to all events."""
         return self.values.ndim == 0
 
     def __len__(self) -> int:
         return self.values.size
 
     def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events from `start` to before `stop`."""
+        """Values of the events `start` to `stop` - 1."""
         if self.constant:
             return np.full(stop - start, self.values)
         return self.values[start:stop]

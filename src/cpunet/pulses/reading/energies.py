@@ -61,7 +61,7 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     """
     n_baseline = max(_BASELINE_SAMPLES, round(_BASELINE_FRACTION * waveforms.shape[1]))
     baseline = waveforms[:, :n_baseline].mean(axis=1, dtype=np.float64)
-    # A trace of infinities has no amplitude; preparation counts it.
+    # A trace of infinities has no amplitude; the preparation rejects and counts it.
     with np.errstate(invalid="ignore"):
         return np.asarray(waveforms.max(axis=1) - baseline)
 
@@ -76,16 +76,17 @@ def resolve_energies(
 ) -> Energies:
     """Choose the source of a file's energies.
 
-    Without `energy` the column ``energy_kev``, ``energy_keV`` or ``energy`` is
-    taken if it is in energy units, or if `kev_per_adc` calibrates it; else the
-    amplitude times `kev_per_adc`; else energies are not known.  `energy` names
-    another column, or ``FILE:path/to/column``.
+    Without `energy`, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
+    is in energy units or `kev_per_adc` is given.  Otherwise the energy is the amplitude
+    times `kev_per_adc`, or unknown without it.  `energy` names another column, or
+    ``FILE:path/to/column``.
 
     Raises
     ------
     CpunetError
-        If the column is not there, has another length than the waveforms, is not
-        in energy units although asked for, or is in keV beside `kev_per_adc`.
+        If the column is missing, differs in length from the waveforms, was requested but is
+        neither in energy units nor calibrated, or is in energy units although `kev_per_adc`
+        is given.
     """
     if energy is None:
         usual = next((name for name in _USUAL if name in columns), None)
@@ -133,7 +134,7 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
         raise CpunetError(
             f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
         )
-    # Late, since the LH5 library takes seconds to load and most files do without.
+    # Imported late: the LH5 library takes seconds to load, and most files do not need it.
     from cpunet.pulses.reading.hdf5 import column_of
 
     return column_of(Path(file), inner)

@@ -22,7 +22,7 @@ _MAX_CHANNELS = 1 << 16
 
 
 class FlashCamSource(PulseSource):
-    """The traces of one channel; `table` is its index where there are several.
+    """The traces of one channel; `table` is its index if there are several.
 
     Full and sparse events are both read; events without the channel are skipped.
     The energy of the digitiser's own filter is not in keV and is not read.
@@ -67,7 +67,7 @@ class FlashCamSource(PulseSource):
             if last is not None:
                 yield last
             last = self._event(stream)
-        # The library calls it an error, too, if nothing follows the configuration.
+        # The library also reports an error if nothing follows the configuration.
         if stream.tag < 0 and any_record:
             after = "" if last is None else f"event {last[1]}: "
             raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
@@ -94,7 +94,7 @@ class FlashCamSource(PulseSource):
 
 
 def channel_sizes(path: Path) -> dict[str, int | None]:
-    """Number of traces of each channel that has any; None, unread, if there is one channel.
+    """Number of traces of each channel that has any; None (not counted) for a single channel.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def _n_channels(path: Path, stream: FCIO) -> int:
 def _next(path: Path, stream: FCIO) -> bool:
     try:
         return bool(stream.get_record())
-    except Exception as error:  # whatever the library makes of damaged records
+    except Exception as error:  # the library raises various errors on damaged records
         said = " ".join(str(error).split())
         raise CpunetError(f"{path}: damaged ({said}); copy it again") from error
 
@@ -151,7 +151,7 @@ def _opened(path: Path) -> Iterator[FCIO]:
     try:
         with _quiet():
             stream = fcio_open(str(path))
-    except Exception as error:  # whatever the library makes of damaged records
+    except Exception as error:  # the library raises various errors on damaged records
         raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
     try:
         yield stream

@@ -60,7 +60,7 @@ class Lh5Source(PulseSource):
     def _rows(
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
-        # lh5 decodes LEGEND's encoded waveforms; it reads only the rows asked for.
+        # lh5 decodes LEGEND's encoded waveforms; it reads only the requested rows.
         values = read_rows(file[self._values], start, size)
         if not isinstance(values, VectorOfVectors):
             traces = np.asarray(values.nda)
@@ -83,7 +83,7 @@ class Lh5Source(PulseSource):
 
 
 def _require_waveforms(path: Path, file: h5py.File, name: str) -> None:
-    """Raise a `CpunetError` unless `name` contains LH5 waveforms, all stored."""
+    """Raise a `CpunetError` unless `name` contains LH5 waveforms, all stored in the file."""
     values = file[name]
     kind = text_attribute(values, "datatype")
     if isinstance(values, h5py.Dataset):

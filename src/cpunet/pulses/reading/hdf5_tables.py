@@ -12,7 +12,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import shortened
 from cpunet.pulses.reading.hdf5 import text_attribute
 
-# preferred of several waveform columns of a table: the full record, then the full-rate window
+# preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
 _PLAIN = ("waveform", "waveforms", "values")
 
@@ -122,7 +122,7 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
 def _as_column(
     item: object, parent: h5py.Group | None = None, name: str | None = None
 ) -> WaveformColumn | None:
-    """Return the item as waveforms under the name in its parent; None if it is none."""
+    """Return an item, `name` in `parent`, as a waveform column; None if it is not one."""
     if isinstance(item, h5py.Group):
         is_lh5 = text_attribute(item, "datatype").startswith("table") and (
             "values" in item and "dt" in item

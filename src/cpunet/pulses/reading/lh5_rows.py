@@ -138,10 +138,11 @@ def first_bad_varlen(
 def first_bad_radware(
     data: npt.NDArray[np.uint8], ends: npt.NDArray[np.int64], lengths: npt.NDArray[np.int64]
 ) -> int:
-    """First row whose sections, in words of two bytes, do not add up to it; -1 if none.
+    """First row whose sections, in words of two bytes, do not match its length; -1 if none.
 
-    A section has its number of samples, the bits of each (32 more if these are differences),
-    one or two values to begin with, and the bits.  Arguments as above.
+    A section consists of its number of samples, the bits per sample (plus 32 if these are
+    differences), one or two initial values, and the packed bits.  For the arguments see
+    `first_bad_varlen`.
     """
     first = 0
     for row in range(len(ends)):

@@ -5,7 +5,7 @@ The layout is that of Table I of the release's notes (arXiv:2308.10856; the file
 ``raw_waveform`` (3,800 samples), ``energy_label`` (keV), ``psd_label_low_avse``,
 ``psd_label_high_avse``, ``psd_label_dcr``, ``psd_label_lq`` (1: passes the cut), ``tp0``,
 ``detector``, ``run_number`` and ``id``.  The NPML files have neither energies nor cuts.
-Neither the notes' table nor the files tell the sampling period.
+Neither the notes' table nor the files give the sampling period.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
-_NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in each of the files
+_NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
 _RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
 _PERIOD_HINT = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
 _SLAB_BYTES = 1 << 25  # of traces read at a time
 
 
 def is_majorana(file: h5py.File) -> bool:
-    """Tell whether a file has the layout of the release."""
+    """Whether a file has the layout of the release."""
     traces = file.get(WAVEFORMS)
     if not isinstance(traces, h5py.Dataset) or traces.ndim != 2:
         return False
@@ -42,7 +42,7 @@ def detectors(file: h5py.File) -> list[str]:
 
 
 class MajoranaSource(PulseSource):
-    """The traces of one detector; `table` is its number, ``raw_waveform`` takes them all."""
+    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
 
     def __init__(self, options: ReadOptions) -> None:
         path = options.path
@@ -69,7 +69,7 @@ class MajoranaSource(PulseSource):
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
-        # whole slabs: single rows of a compressed file would be unpacked again and again
+        # whole slabs: row by row, the chunks of a compressed file would be unpacked repeatedly
         with opened(self.path) as file:
             dataset = file[WAVEFORMS]
             slab = max(1, _SLAB_BYTES // (dataset.dtype.itemsize * self.length))
@@ -80,7 +80,7 @@ class MajoranaSource(PulseSource):
                 chosen = chosen[chosen < start + slab] - start
                 if not len(chosen):
                     continue
-                with np.errstate(over="ignore"):  # a sample beyond is infinite
+                with np.errstate(over="ignore"):  # overflows become infinite
                     found = dataset[start : start + slab][chosen].astype(np.float32)
                 waiting.append(found)
                 held += len(found)
@@ -93,7 +93,7 @@ class MajoranaSource(PulseSource):
 
 
 def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
-    """Rows of the detector that is chosen, in order."""
+    """Rows of the chosen detector, in order."""
     numbers = np.asarray(file[DETECTOR][()])
     if len(numbers) != n:
         raise CpunetError(
@@ -119,7 +119,7 @@ def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64
 def _columns(
     options: ReadOptions, file: h5py.File, n: int
 ) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:
-    """Name, values and units of what stands beside the traces: some bytes per event."""
+    """Yield name, values and units of each column beside the traces (a few bytes per event)."""
     for name in file:
         column = file.get(name)
         if not is_column(column) or column.ndim == 0:

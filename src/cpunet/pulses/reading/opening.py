@@ -94,7 +94,7 @@ def tables_of(path: str | Path) -> list[str]:
 
 
 def table_sizes(path: str | Path) -> dict[str, int | None]:
-    """Tables as `tables_of`, with their numbers of pulses where these had to be counted.
+    """Tables as in `tables_of`, with the number of pulses if it had to be counted, else None.
 
     Raises
     ------

@@ -29,7 +29,6 @@ from cpunet.restricted_unpickler import TruncatedError, load_all
 
 _MAX_NUMBER = 2**62
 _PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
-_NUMBERS = ("tp0", "energy", "dc_label")  # beside the samples
 _CONVERT = "convert it with `cpunet import pulses`, which leaves such out and counts them"
 _WHY = {
     "no_pulse": "no dictionary with wf",
@@ -40,7 +39,7 @@ _WHY = {
 
 @dataclass(frozen=True)
 class PickledPulse:
-    """One entry: samples, and the numbers beside them by name, ``event`` among them."""
+    """One entry: its samples, the numbers beside them by name, and its event number."""
 
     samples: npt.NDArray[np.float32]
     numbers: dict[str, float]
@@ -48,14 +47,14 @@ class PickledPulse:
 
 
 def entries(path: Path) -> Iterator[Any]:
-    """All objects pickled one after the other in a file, and those in lists.
+    """Yield the objects pickled one after the other in a file, and the items of lists.
 
     Raises
     ------
     CpunetError
         If the file cannot be read or asks for more than arrays and plain containers.
     TruncatedError
-        If it breaks off or is damaged, after what comes before.
+        If it is truncated or damaged; the objects before that are yielded first.
     """
     for value in load_all(path):
         if isinstance(value, list | tuple):
@@ -65,14 +64,14 @@ def entries(path: Path) -> Iterator[Any]:
 
 
 def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
-    """An entry as a pulse; or None and the reason why it is none.
+    """Convert an entry to a pulse; None, and the reason, if it is not one.
 
     Parameters
     ----------
     entry
-        Whatever was pickled.
+        Any unpickled object.
     number
-        Its place in the file, the event number of an entry without one.
+        Its index in the file, which replaces a missing event number.
     """
     if not isinstance(entry, dict) or "wf" not in entry:
         return None, "no_pulse"
@@ -93,26 +92,26 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
 
 
 def _samples(trace: Any) -> npt.NDArray[np.float32]:
-    """A trace as an array; of nested lists, which may refer to each other, there is none."""
+    """A trace as an array; empty for nested lists, which may refer to each other."""
     if isinstance(trace, list | tuple):
         if len(trace) > MAX_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
             return np.empty((0, 0), np.float32)
     elif not isinstance(trace, np.ndarray):
         raise TypeError
-    with np.errstate(over="ignore"):  # what is beyond single precision is counted later
+    with np.errstate(over="ignore"):  # values beyond single precision are counted later
         return np.asarray(trace, np.float32)
 
 
 @dataclass
 class _Seen:
-    """Numbers of the pulses met so far, some bytes each: columns are read by rows."""
+    """Numbers of the pulses read so far (a few bytes each), since columns are read by rows."""
 
     path: Path
     numbers: list[dict[str, float]] = field(default_factory=list)
     complete: bool = False
 
     def pulses(self) -> Iterator[PickledPulse]:
-        """All pulses of the file in order, remembering their numbers."""
+        """Yield all pulses of the file in order and keep their numbers."""
         length, place = 0, -1
         try:
             for place, entry in enumerate(entries(self.path)):
@@ -139,7 +138,7 @@ class _Seen:
         self.complete = True
 
     def until(self, stop: float) -> list[dict[str, float]]:
-        """Numbers of this many pulses, from the first on."""
+        """Numbers of at least the first `stop` pulses, or of all if there are fewer."""
         if len(self.numbers) < stop and not self.complete:
             for met, _ in enumerate(self.pulses(), start=1):
                 if met >= stop:
@@ -149,7 +148,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _PickledColumn:
-    """A number of each pulse; of a part of the file that was not met yet, it is read."""
+    """One number per pulse; parts of the file that were not read yet are read when needed."""
 
     seen: _Seen
     name: str
@@ -160,7 +159,7 @@ class _PickledColumn:
         return len(self.seen.until(np.inf))
 
     def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events from `start` to before `stop`."""
+        """Values of the events `start` to `stop` - 1."""
         rows = self.seen.until(stop)[start:stop]
         return np.array([row.get(self.name, np.nan) for row in rows], float)
 

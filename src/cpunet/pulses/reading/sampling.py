@@ -11,7 +11,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import TIME_UNITS, Column, require_length
 
-# Files keep periods in single precision.
+# Files store periods in single precision.
 _TOLERANCE = 1e-5
 
 
@@ -25,7 +25,7 @@ class Sampling:
     ns_per_unit: float = 1.0
 
     def check(self, start: int, event_number: npt.NDArray[np.int64]) -> None:
-        """Raise a `CpunetError` naming the first event sampled otherwise."""
+        """Raise a `CpunetError` that names the first event with another sampling period."""
         if self.column is None:
             return
         values = self.column.read(start, start + len(event_number))
@@ -51,13 +51,13 @@ def resolve_sampling(
 ) -> Sampling:
     """Take the period from `column` (called `name`) or from the user's `dt_ns`.
 
-    A column without units is in ns if its name ends in ``_ns``; else it says
-    nothing and `dt_ns` is needed; the `hint` says what is known of it.
+    A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
+    and `dt_ns` is required; the error message contains `hint`.
 
     Raises
     ------
     CpunetError
-        If neither tells, if they disagree, or if the period is no positive number.
+        If neither gives the period, if they disagree, or if it is not a positive number.
     """
     ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
     if column is None or ns_per_unit is None:
@@ -79,7 +79,7 @@ def resolve_sampling(
         raise CpunetError(
             f"{path}: sampled every {found:g} ns, but --dt-ns says {dt_ns:g}; drop --dt-ns"
         )
-    # A single value, scalar or array of one, holds for all events.
+    # A single value, a scalar or an array of length 1, applies to all events.
     varying = None if len(column) == 1 else column
     return Sampling(path, found, varying, ns_per_unit)
 

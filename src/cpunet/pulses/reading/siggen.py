@@ -16,16 +16,16 @@ from cpunet.pulses.reading.columns import MemoryColumn
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
 # Radware's spectrum, written by siggen's `stester`: one Fortran record of 24 bytes
-# (8 of title, channels, rows, two unused), then one of float32, each between its lengths.
+# (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
 _SPE = struct.Struct("<i8siiiiii")
 
-_MIN_N = 16  # samples: shorter lines are some other table
-_PRINTED = "signal:"  # the line before the numbers which siggen's `psig` prints
+_MIN_N = 16  # samples: shorter lines are not pulses but some other table
+_PRINTED = "signal:"  # the line that siggen's `psig` prints before the numbers
 _UNEVEN = 0.1  # of a step: times are printed with few digits
 
 
 class SpectrumSource(PulseSource):
-    """A ``.spe`` file: one pulse, or one per row of a spectrum of two dimensions."""
+    """A ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
 
     def __init__(self, options: ReadOptions) -> None:
         path = options.path
@@ -57,11 +57,11 @@ class _Line(NamedTuple):
 
 
 class TextSource(PulseSource):
-    """Text in one of four shapes; ``#`` starts a comment, commas may separate.
+    """Text in one of four formats; ``#`` starts a comment, commas may separate numbers.
 
-    One number a line is one pulse; two are its time (ns, evenly spaced) and
-    value; more are one pulse a line.  After a line ``signal:``, as siggen
-    prints it, all numbers are one pulse.
+    Lines of one number are the samples of one pulse.  Lines of two numbers are its times
+    (ns, evenly spaced) and values.  Longer lines are one pulse each.  After a line
+    ``signal:``, as printed by siggen, all numbers are one pulse.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -108,7 +108,7 @@ def _even_lines(path: Path, expected: int) -> Iterator[list[float]]:
 
 
 def _lines(path: Path) -> Iterator[_Line]:
-    """The numbers of each line that has any."""
+    """Yield the numbers of each line that has any."""
     with path.open(encoding="ascii", errors="replace") as file:
         for number, line in enumerate(file, 1):
             words = line.partition("#")[0].replace(",", " ").split()

@@ -60,7 +60,7 @@ class Layout:
     period
         Sampling period, if it is in the file.
     period_hint
-        Hint at the sampling period otherwise, for the error message.
+        Hint for the error message if the sampling period is not in the file.
     """
 
     format: str

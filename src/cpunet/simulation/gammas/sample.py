@@ -86,7 +86,8 @@ def simulate_gammas(
     seed
         Seed of the random generator. The same seed gives the same events.
     wanted
-        Energy windows by name. Only events in a window are kept, until each has its count.
+        Energy windows by name. Only events in a window are kept, until each window has
+        the requested number.
     energy_kev
         Energy of the gammas, 50 to 2700 keV.
 
@@ -101,7 +102,7 @@ def simulate_gammas(
     ------
     CpunetError
         If the source is not above the crystal, a window is empty or beyond the line, or
-        `n_primaries` do not give the requested events.
+        `n_primaries` gammas do not yield the requested events.
     """
     _check(source_height_mm, source_radius_mm, n_primaries, energy_kev, wanted)
     shape = CrystalShape.of(detector)

@@ -25,8 +25,8 @@ _G4SIMPLE_TITLE = "steps data"
 def read_csv(path: Path, detector: str | None, units: Units) -> Steps:
     """Read the steps of a CSV ntuple.
 
-    A column name may end with a unit in brackets. Files of g4simple, recognised by their
-    title, are in MeV and mm. All others name no unit, so it must be given.
+    A column name may end with a unit in brackets. Without it, files of g4simple (recognised
+    by their title) are in MeV and mm. For all other files the unit must be given.
     """
     title, columns = _header(path)
     place = {kind: _find(columns, names) for kind, names in _NAMES.items()}

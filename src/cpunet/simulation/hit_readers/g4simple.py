@@ -16,7 +16,7 @@ NTUPLE = "default_ntuples/g4sntuple"
 
 
 def read_g4simple(path: Path, ntuple: h5py.Group, detector: str | None) -> Steps:
-    """Read the steps in one volume, given by its number ``volID``, or in the only one."""
+    """Read the steps in the volume with number `detector` (``volID``), or in the only one."""
     edep = _column(path, ntuple, "Edep") * 1e3
     rows = len(edep)
     x, y, z, event = (_column(path, ntuple, name) for name in ("x", "y", "z", "event"))
@@ -37,7 +37,7 @@ def of_detector(
     path: Path, steps: Steps, number: npt.NDArray[np.float64], detector: str | None
 ) -> Steps:
     """Select the steps of a detector by its number, or of the only one if none is given."""
-    # a volume without deposits is no detector but, for example, the world or a holder
+    # a volume without deposits is not a detector but, for example, the world or a holder
     volumes = whole_numbers(path, "the detector's number", number)
     there = sorted({int(n) for n in np.unique(volumes[steps.edep_kev > 0])})
     names = ", ".join(map(str, there))

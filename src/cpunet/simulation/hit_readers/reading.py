@@ -82,15 +82,15 @@ def hit_parts(
     length_unit: str | None = None,
     energy_unit: str | None = None,
 ) -> Callable[[], Iterator[Hits]]:
-    """As `read_hits`, part by part where the file allows, so that memory does not grow with it.
+    """Like `read_hits`, but in parts if possible, so that memory does not grow with the file.
 
-    Tables of remage are read in parts, unless rows of one event lie apart; all else is read
-    once, and kept.
+    Tables of remage are read in parts, unless the rows of an event are not adjacent. All other
+    files are read once and kept in memory.
 
     Returns
     -------
     callable
-        Gives the parts from the first on, each time it is called.
+        Returns an iterator over the parts, from the first one, each time it is called.
     """
     file = Path(path)
     units = Units(length_unit, energy_unit)
@@ -113,16 +113,16 @@ def hit_parts(
 
 
 def holds_hits(path: Path | str) -> bool:
-    """Whether a file is one of hits, and not of pulses.
+    """Whether a file contains hits rather than pulses.
 
-    Files of simulated pulses that also hold their hits are files of pulses.
+    Files of simulated pulses that also contain their hits count as files of pulses.
     """
     file = Path(path)
     try:
         with require_file(file).open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
     except OSError:
-        return False  # which the reader tells
+        return False  # the reader reports the error
     if start.startswith(_HDF5_MAGIC):
         with opened(file) as content:
             return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
@@ -130,12 +130,12 @@ def holds_hits(path: Path | str) -> bool:
         try:
             return {"x_mm", "offsets"} <= set(npz_files.keys(file))
         except npz_files.DAMAGED:
-            return False  # which the reader of pulses tells
+            return False  # the reader of pulses reports the error
     return start == _CSV_MAGIC
 
 
 def hit_detectors(path: Path | str) -> list[str]:
-    """Names of the detectors of a remage file; of other formats, nothing."""
+    """Names of the detectors of a remage file; empty for other formats."""
     return detectors_of(Path(path)) if _is_remage(Path(path)) else []
 
 
@@ -145,7 +145,7 @@ def _is_remage(path: Path) -> bool:
             if not stream.read(8).startswith(_HDF5_MAGIC):
                 return False
     except OSError:
-        return False  # which the reader tells
+        return False  # the reader reports the error
     with opened(path) as file:
         return isinstance(file.get("stp"), h5py.Group) and not isinstance(
             file.get(NTUPLE), h5py.Group
@@ -188,7 +188,7 @@ def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
 
 
 def _without_detectors(path: Path, detector: str | None) -> None:
-    """Refuse the choice of a detector where all hits are of one."""
+    """Refuse the choice of a detector if all hits belong to a single one."""
     if detector is not None:
         raise CpunetError(
             f"{path}: its hits name no detector to pick {detector} by; leave "

@@ -19,7 +19,7 @@ from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 _AXES = ("xloc", "yloc", "zloc")
 
 
-ROWS = 5_000  # of a part: some ten MB of steps
+ROWS = 5_000  # rows per part: of the order of 10 MB of steps
 
 
 def read_remage(
@@ -42,18 +42,18 @@ def read_remage(
 
 
 def parts_of(path: Path, detector: str | None, size: int = ROWS) -> list[slice] | None:
-    """Rows of a table in parts of `size` or a little more, so that no event is in two of them.
+    """Divide the rows of a table into parts of at least `size` rows that split no event.
 
     Returns
     -------
     list of slice or None
-        None if rows of one event lie apart, as in files joined from several threads.
+        None if the rows of an event are not adjacent, as in files merged from several threads.
     """
     name = _detector(path, detector)
     with opened(path) as file:
         item = file.get(f"stp/{name}/evtid")
         if not isinstance(item, h5py.Dataset) or item.ndim != 1:
-            return None  # which the reader tells
+            return None  # the reader reports the error
         require_all_stored(path, item)
         numbers = np.asarray(item[()])
     starts = np.flatnonzero(np.diff(numbers, prepend=np.nan if len(numbers) else 0) != 0)
