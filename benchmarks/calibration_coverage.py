@@ -3,11 +3,11 @@
     cpunet stand --preset legend200 --events FEP=20000 --seed 11 --out big
     OMP_NUM_THREADS=1 python benchmarks/calibration_coverage.py big --sets 50
 
-Prints the pulls, (found - true) / error, of each free parameter, their mean and width, and with
-``--figure FILE`` draws them.  The truth is that of the stand's ``stand.json``.
+Prints the pulls, (found - true) / error, of each free parameter, with their mean and width;
+``--figure FILE`` draws them.  The truth is read from the stand's ``stand.json``.
 
-Events of a stand are independent, and each is in one experiment only.  So the mean pull of n
-experiments varies by 1 / sqrt(n) if errors are right, for one stand as for several.
+Events of a stand are independent, and each is used in one experiment only.  If the errors are
+right, the mean pull of n experiments scatters by 1 / sqrt(n), for one stand or several.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Experiment(NamedTuple):
 def experiments(
     stand: Path, nuisances: tuple[Nuisance, ...], sets: int
 ) -> Iterator[Experiment]:
-    """Calibrations of disjoint parts of a stand."""
+    """Calibrate disjoint parts of a stand."""
     recipe, quiet = load_recipe("fast"), Monitor()
     selection = parse_selection("FEP", recipe.peaks)
     files = [InputFile(stand / f"{name}.lh5") for name in ("sim", "data")]
@@ -137,7 +137,7 @@ def experiments(
 
 
 def true_coordinates(physics: Physics, made: dict) -> np.ndarray:
-    """Where the data's side of a stand is."""
+    """Coordinates of the data side of a stand."""
     detector = Detector.model_validate(made["detector"])
     coordinates = []
     for nuisance in physics.nuisances:

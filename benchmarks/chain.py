@@ -1,12 +1,12 @@
-"""Rates and memory of the chain of events: steps → pulses → raw traces → parameters.
+"""Rates and memory of the chain: steps → pulses → raw traces → parameters.
 
-Run with ``python benchmarks/chain.py``; ``--events 4000,40000`` gives two sizes, of which the
-cost of an event and what is paid once are told apart, and scaled to a million.  Each step is a
-process of its own, as in the workflow, with one thread: its time is that of the processor,
-which others on the machine hardly change, its memory that process's maximum.  Steps are those
-of gammas in the crystal, as the built-in Monte Carlo makes them, in the layout of remage.
-The run is a readout chain that was not trained: neither rate nor memory depend on its numbers.
-Pulses are drifted for each hit (exact, a tenth of the events) and interpolated in a library.
+Run with ``python benchmarks/chain.py``.  The two sizes in ``--events 4000,40000`` separate the
+cost per event from the fixed cost, and the total is extrapolated to a million events.  As in
+the workflow, each stage runs in a process of its own, with one thread.  The time is processor
+time, which other load on the machine hardly changes; the memory is the maximum of the process.
+Steps are those of gammas in the crystal from the built-in Monte Carlo, in the format of remage.
+The run is an untrained readout chain: neither rate nor memory depends on its parameters.
+Pulses are simulated by exact drift of each hit (a tenth of the events) and from a library.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ POOL = 500  # different events; the file repeats them
 DSP = ROOT / "workflow" / "scripts" / "dsp.py"
 CONFIG = ROOT / "workflow" / "config" / "dsp.yaml"
 MILLION = 1_000_000
-TENTH = 10  # of the events are drifted one by one
+TENTH = 10  # the exact mode simulates one event in ten
 
 
 class Cost(NamedTuple):
-    """Processor time in s and largest resident memory in MB of a process."""
+    """Processor time in s and peak resident memory in MB of a process."""
 
     seconds: float
     megabytes: float
@@ -52,7 +52,7 @@ def some_hits(seed: int) -> Hits:
 
 
 def write_steps(path: Path, pool: Hits, n_events: int, block: int = 20_000) -> int:
-    """The events again and again, as a table of remage; returns the number of steps."""
+    """Write the events, repeated, as a remage table; return the number of steps."""
     path.unlink(missing_ok=True)
     n_steps = 0
     for first in range(0, n_events, block):
@@ -71,8 +71,8 @@ def write_steps(path: Path, pool: Hits, n_events: int, block: int = 20_000) -> i
     return n_steps
 
 
-# Runs a program and tells the largest memory of its own; that of the parent, from which it was
-# forked, would count in the usage that the system tells.
+# Runs a program and prints its own peak memory.  The usage that the system reports includes the
+# memory of the parent, from which it was forked.
 RUNNER = """
 import runpy, sys
 from pathlib import Path
@@ -90,7 +90,7 @@ finally:
 
 
 def measured(*words: object) -> Cost:
-    """Run a program to its end."""
+    """Run a program to its end, and return its cost."""
     process = subprocess.Popen(
         [sys.executable, "-c", RUNNER, *(str(word) for word in words)],
         stdout=subprocess.DEVNULL,
@@ -107,13 +107,13 @@ def measured(*words: object) -> Cost:
 
 
 def simulated(folder: Path, steps: Path, mode: str) -> Cost:
-    """Steps to pulses, drifted one by one or interpolated in a library."""
+    """Simulate pulses from steps, by exact drift or from a library."""
     words = ["--detector", "icpc", "--hits", steps, "--hits-detector", "V01", mode]
     return measured("cpunet", "simulate", *words, "--out", folder / "pulses.lh5", "--force")
 
 
 def chain(folder: Path, steps: Path) -> dict[str, Cost]:
-    """Each step of the chain on one file."""
+    """Run each stage of the chain on one file."""
     pulses, raw, dsp = (folder / f"{name}.lh5" for name in ("pulses", "raw", "dsp"))
     translate = ["translate", folder / "run", pulses, "--output", "adc"]
     translate += ["--adc-per-kev", 10, "--baseline", 10000, "--out-table", "V01/raw"]
@@ -126,7 +126,7 @@ def chain(folder: Path, steps: Path) -> dict[str, Cost]:
 
 
 def told(step: str, few: int, many: int, first: Cost, last: Cost) -> str:
-    """A row of the table: what an event costs, and what is paid once."""
+    """Format a row of the table: cost per event, and fixed cost."""
     each = (last.seconds - first.seconds) / (many - few)
     once = first.seconds - few * each
     rate = f"{1 / each:.0f}" if each > 0 else "–"

@@ -1,8 +1,8 @@
-"""Recipes on stands, seed by seed: one table with medians, the worst 5 %, and failures.
+"""Train recipes on stands with several seeds: medians, worst 5 % and failures of the scores.
 
 Run with ``python benchmarks/closure.py STAND [STAND ...] --recipe fast --seeds 3``; a stand
-is a folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and truth.npz.  A seed has
-failed if its score is below 0.9 of the median's.
+is a folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and perhaps truth.npz.  A seed
+has failed if its score is below 0.9 of the median.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def summarise(title: str, runs: list[dict[str, Any]]) -> Table:
 
 
 def single_numbers(runs: list[dict[str, Any]], peak: str) -> dict[str, list[float]]:
-    """Numbers of the translation that are best when small, by name and seed."""
+    """Scores of the translation for which small is good: by name, one per seed."""
     found: dict[str, list[float]] = {}
     for run in runs:
         scores = run["peaks"][peak]

@@ -1,4 +1,4 @@
-"""What the diffusion of the charge cloud makes of the largest current.
+"""Effect of the diffusion constant of the charge cloud on the maximum current.
 
 Run with ``python benchmarks/diffusion.py``; takes about a minute.
 """

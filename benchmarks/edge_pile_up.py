@@ -1,8 +1,8 @@
-"""How well pile-up within the rise is found, and what it costs, on sets with known pile-up.
+"""Efficiency and cost of finding pile-up within the rise, on datasets with known pile-up.
 
-Two signs are tried on measured pulses that passed the quality cuts: the distance of the edge to
-the nearest translated pulse, and the second maximum of the current. The translated pulses are
-those of the truth, so this is as good as the first can be. Run with
+Two indicators are tried on measured pulses that passed the quality cuts: the distance of the
+edge from the nearest translated pulse, and the second maximum of the current. The translated
+pulses are the true responses, so the first cannot perform better than here. Run with
 ``python benchmarks/edge_pile_up.py FOLDER``, a folder of ``cpunet stand``.
 """
 
@@ -26,20 +26,20 @@ Values = npt.NDArray[np.float64]
 
 LINES = ("DEP", "SEP", "FEP")
 BEFORE, AFTER = 80, 120  # samples about the half maximum
-COMPONENTS = 30  # that edges are compared by, besides what these leave over
-LOSSES = (0.002, 0.005, 0.01, 0.02, 0.05)  # of the good pulses
+COMPONENTS = 30  # principal components of an edge; the remainder is compared, too
+LOSSES = (0.002, 0.005, 0.01, 0.02, 0.05)  # fractions of the good pulses
 PILE_UP = 2  # bit of a flag
 NEAR = 3  # samples of a moving average of the current
 
 
 def edges_of(windows: npt.NDArray[np.float32]) -> Values:
-    """Edges about their half maxima, by which they are divided."""
+    """Edges around half maximum, of pulses scaled to unit height."""
     height = np.sort(windows, axis=1)[:, -20:].mean(axis=1, keepdims=True)
     return np.nan_to_num(np.asarray(align_half_maximum(windows / height, BEFORE, AFTER), float))
 
 
 def distances(edges: Values, others: Values) -> Values:
-    """RMS distance of each edge to the nearest of the others."""
+    """RMS distance of each edge from the nearest of the others."""
     mean = others.mean(axis=0)
     _, _, axes = np.linalg.svd(others - mean, full_matrices=False)
     axes = axes[:COMPONENTS]
@@ -50,7 +50,7 @@ def distances(edges: Values, others: Values) -> Values:
 
 
 def second_maxima(edges: Values) -> Values:
-    """Height of the current's second maximum over the first one's; 0 if there is none."""
+    """Height of the current's second maximum relative to the first; 0 if there is none."""
     current = np.diff(edges, axis=1)
     for _ in range(2):
         current = np.apply_along_axis(np.convolve, 1, current, np.ones(NEAR) / NEAR, "same")
@@ -61,7 +61,7 @@ def second_maxima(edges: Values) -> Values:
 
 
 def passed(folder: Path) -> tuple[Prepared, npt.NDArray[np.int64], dict[str, Values]]:
-    """Measured pulses that pass the quality cuts, their lines, and what is known of them."""
+    """Measured pulses that pass the quality cuts, their gamma lines, and all their labels."""
     recipe = load_recipe("fast")
     known = dict(np.load(folder / "data_labels.npz"))
     raw = open_pulses(folder / "data.lh5").read()
@@ -79,7 +79,7 @@ def passed(folder: Path) -> tuple[Prepared, npt.NDArray[np.int64], dict[str, Val
 
 
 def translated(folder: Path) -> tuple[Values, npt.NDArray[np.int64]]:
-    """Edges of the truth of simulated pulses, and their lines."""
+    """Edges of the true responses to simulated pulses, and their gamma lines."""
     truth = np.load(folder / "truth.npz")
     lines = truth["label"] < len(LINES)
     records = Pulses.of(truth["response"][lines].astype(np.float32), dt_ns=16)

@@ -1,4 +1,4 @@
-"""Field maps of the detectors that come with the package: solved, and from the cache.
+"""Time for field maps of the detectors of the package: solved, and read from the cache.
 
 Run with ``python benchmarks/fields.py``; takes about ten seconds.
 """

@@ -1,8 +1,8 @@
 """Time and memory of a fit against the number of pulses.
 
 Run with ``python benchmarks/fit_time.py STAND --pulses 1000 2000 5000 10000 20000``; STAND has
-sim.lh5 and data.lh5 (``cpunet stand --events FEP=20000,…``).  More pulses than there are, are
-those there are again: time and memory do not care.  Each fit has a process of its own.
+sim.lh5 and data.lh5 (``cpunet stand --events FEP=20000,…``).  If it has fewer pulses, they are
+repeated, which does not affect time and memory.  Each fit runs in a process of its own.
 """
 
 from __future__ import annotations

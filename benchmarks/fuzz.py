@@ -1,15 +1,15 @@
-"""Thousands of broken inputs for every command, and what becomes of each.
+"""Run every command on thousands of broken inputs, and check how each call ends.
 
 Run with ``python benchmarks/fuzz.py --cases 2000 --seed 1``.  Small valid inputs are made once
-(kept in ``--base``); each case changes one of them (``mutations.py``), an option, a name, a
-cache or a variable of the environment, and calls one command in a process of its own: forked
-from one that has imported everything, or started anew where the environment is what changes.
-Counted are: tracebacks (also what the command line calls a bug), crashes by a signal, wrong
-statuses, more or less than one line of error, outputs or half-written files left by a failure,
-inputs that changed, successes although the change cannot make sense, failures although it
-must not matter, more than 2 GB, and more than 30 s of processor time, or of time that was not
-spent waiting for a core.  ``--only 17`` does one case again, and shows what it says;
-``--part surroundings`` draws from a part of the kinds.
+(kept in ``--base``).  Each case changes one of them (``mutations.py``), an option, a name, a
+cache or an environment variable, and calls one command in a process of its own: a fork of this
+process, which has imported everything, or a new interpreter if the environment changes.
+These faults are counted: tracebacks (including those that the command line reports as a bug),
+crashes by a signal, wrong exit statuses, more or less than one line of error, outputs or
+partial files left by a failure, changed inputs, success although the change makes no sense,
+failure although it must not matter, more than 2 GB of memory, and more than 30 s of processor
+time or of time not spent waiting for a core.  ``--only 17`` repeats one case and shows its
+output; ``--part surroundings`` draws from a part of the kinds.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def listing(folder: Path) -> dict[str, str]:
 
 
 def judged(case: Case, outcome: Outcome, before: dict, after: dict) -> list[str]:
-    """What is wrong with an outcome; nothing, most of the time."""
+    """Faults of an outcome; usually none."""
     faults = []
     status, err = outcome.status, outcome.err
     lines = err.splitlines()
     errors = sum(line.startswith("error: ") for line in lines)
-    # `check` counts what it finds in lines of its own, and ends with 1
+    # `check` lists its findings in lines of its own, and exits with 1
     found = status == 1 and case.words[0] == "check" and "Traceback" not in err
     if outcome.late:
         faults.append("over 30 s")
@@ -74,7 +74,7 @@ def judged(case: Case, outcome: Outcome, before: dict, after: dict) -> list[str]
         faults.append("wrong success")
     if status and case.must_succeed:
         faults.append("wrong failure")
-    # what is resumed is of the command's own making
+    # with --resume, the command may change its own earlier output
     own = case.words[case.words.index("--out") + 1] if "--resume" in case.words else None
     changed = [name for name in before if after.get(name) != before[name]]
     changed = [name for name in changed if own is None or not name.startswith(own.rstrip("/"))]
@@ -87,7 +87,7 @@ def judged(case: Case, outcome: Outcome, before: dict, after: dict) -> list[str]
 
 
 def imported() -> None:
-    """Import what a fork shall not import again."""
+    """Import all modules, so that forks need not."""
     import pkgutil
 
     import torch

@@ -29,7 +29,7 @@ RUN = ["run.json", "recipe.yaml", "weights.safetensors", "losses.jsonl"]
 
 
 def with_file(name: str, words: list[str]) -> Kind:
-    """Cases that change a file of the base."""
+    """Kind of case that changes one valid file."""
 
     def make(folder: Path, rng: np.random.Generator) -> Case:
         return Case(words, f"{name}: {mutate(folder / name, rng)}")
@@ -38,7 +38,7 @@ def with_file(name: str, words: list[str]) -> Kind:
 
 
 def kinds() -> list[tuple[float, Kind]]:
-    """Kinds of cases, and how often they come."""
+    """Kinds of cases with their weights."""
     made: list[tuple[float, Kind]] = []
     for name in PULSES:
         dt = ["--dt-ns", "16"] if Path(name).suffix in (".npy", ".spe", ".txt") else []
@@ -112,7 +112,7 @@ def set_word(_folder: Path, rng: np.random.Generator) -> Case:
 
 
 def option(_folder: Path, rng: np.random.Generator) -> Case:
-    """An option with a value out of range, or of another kind."""
+    """An option with a value that is out of range or of the wrong type."""
     numbers = [
         "nan",
         "inf",
@@ -233,7 +233,7 @@ def place(folder: Path, rng: np.random.Generator) -> Case:
 
 
 def environment(_folder: Path, rng: np.random.Generator) -> Case:
-    """A variable or a stream that is not as it should be; the command itself is fine."""
+    """An invalid environment variable or stream; the command itself is valid."""
     words = pick(rng, [["info", "sim.lh5"], SIMULATE, ["compare", "report", "report"]])
     chances = [
         ({"OMP_NUM_THREADS": pick(rng, ["abc", "0", "-1", "", "99999999"])}, ""),
@@ -250,7 +250,7 @@ def environment(_folder: Path, rng: np.random.Generator) -> Case:
 
 
 def resumed(folder: Path, rng: np.random.Generator) -> Case:
-    """A record of an earlier translation that does not say what it should."""
+    """A changed record of an earlier translation."""
     import h5py
 
     words = ["translate", "run", "sim.lh5", "sim.lh5", "--insist", "--out", "many/"]

@@ -136,7 +136,7 @@ def make_studies(base: Path) -> None:
 
 
 def make_published(base: Path, m: int = 2) -> None:
-    """Weights as the authors of CPU-Net store them, of a narrow network."""
+    """Weights of a narrow network, in the format of the authors of CPU-Net."""
     import torch
 
     state: dict[str, torch.Tensor] = {}
@@ -211,7 +211,7 @@ def make_hits(base: Path) -> None:
 
 
 def make_settings(base: Path) -> None:
-    """Settings of every kind; a small detector, whose fields take a moment."""
+    """Settings of every kind; the detector is small, so its fields are solved quickly."""
     from cpunet.electronics.presets import read_electronics
     from cpunet.recipes import load_recipe
     from cpunet.simulation.settings import SimulationSettings
@@ -248,7 +248,7 @@ def make_settings(base: Path) -> None:
 
 
 def make_response(base: Path) -> None:
-    """A run that has a response, as it is before its fit."""
+    """A run with a readout response that was not fitted."""
     from torch import nn
 
     from cpunet.networks.response_generator import ResponseGenerator

@@ -1,4 +1,4 @@
-"""One call of a command in a process of its own, and what it used."""
+"""Call a command in a process of its own, and measure the resources it uses."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pathlib import Path
 from cpunet.cli.main import main as cpunet_main
 
 MAX_S = 30
-_LONGEST_S = 900  # on the wall, whatever else the machine does
+_LONGEST_S = 900  # wall-clock time, whatever the load of the machine
 _MAX_ADDRESSES = 12 << 30
-_WITH_WORKERS = ("ensemble", "tune")  # whose processes import the main module again
+_WITH_WORKERS = ("ensemble", "tune")  # commands whose workers import the main module again
 _SOURCE = "import sys; sys.argv[0] = 'cpunet'; from cpunet.cli.main import main; main()"
 
 
 @dataclass
 class Case:
-    """One call: words, with what was changed, and whether it must or must not succeed."""
+    """One call: its words, what was changed, and whether it must fail or succeed."""
 
     words: list[str]
     told: str
@@ -43,8 +43,8 @@ class Outcome:
     cpu_s
         Processor time of the process and of its children.
     own_s
-        Time until its end, without what it waited for a core: another machine's load does not
-        count.
+        Time until its end without the time spent waiting for a core, so that other load on the
+        machine does not count.
     """
 
     status: int
@@ -88,7 +88,7 @@ def run(case: Case, folder: Path, logs: Path) -> Outcome:
                 _, code, usage = os.wait4(pid, 0)
                 break
         time.sleep(0.005)
-    with suppress(ProcessLookupError):  # what it has left behind
+    with suppress(ProcessLookupError):  # processes that it has left behind
         os.killpg(pid, signal.SIGKILL)
     cpu_s = usage.ru_utime + usage.ru_stime
     return Outcome(
@@ -104,7 +104,7 @@ def run(case: Case, folder: Path, logs: Path) -> Outcome:
 
 
 def _family(pid: int) -> list[int]:
-    """A process and all that descend from it."""
+    """A process and all its descendants."""
     found = [pid]
     for each in found:
         with suppress(OSError):
@@ -114,7 +114,7 @@ def _family(pid: int) -> list[int]:
 
 
 def _waited_for_a_core(pid: int) -> float:
-    """Seconds in which a process could have run, had the machine had a core for it."""
+    """Seconds that a process was ready to run but had no core; the longest of its threads."""
     with suppress(OSError, IndexError, ValueError):
         texts = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/schedstat")]
         return max(int(text.split()[1]) for text in texts) / 1e9
@@ -122,7 +122,7 @@ def _waited_for_a_core(pid: int) -> float:
 
 
 def _become(case: Case, folder: Path, out: Path, err: Path) -> None:
-    """In the child: set up streams and environment, and never come back."""
+    """In the child: set up streams and environment, run the case and exit."""
     status = 99
     try:
         os.setsid()
@@ -139,7 +139,7 @@ def _become(case: Case, folder: Path, out: Path, err: Path) -> None:
         if case.fresh or case.words[0] in _WITH_WORKERS:
             words = [os.fsencode(word) for word in [sys.executable, "-c", _SOURCE, *case.words]]
             os.execv(sys.executable, words)
-        sys.stdout = sys.stderr = None  # as Python has them where they are closed
+        sys.stdout = sys.stderr = None  # as Python sets them if they are closed
         if case.closed != "closed":
             sys.stdout = os.fdopen(1, "w", encoding="utf-8")
         if case.closed != "errors closed":

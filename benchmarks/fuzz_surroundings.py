@@ -1,4 +1,4 @@
-"""Kinds of cases about what surrounds a command: options, names, caches, work to be resumed."""
+"""Cases with changed surroundings of a command: options, names, caches, unfinished work."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cpunet.cli.main import app
 
 Rng = np.random.Generator
 
-# A call of each command that succeeds, or ends early, but for what a case changes.
+# A call of each command that succeeds or ends early, unless a case changes it.
 WORDS = {
     "demo": ["demo", "--out", "out", "--events", "20", "--set", "training.batch_size=4"],
     "simulate": ["simulate", "--hits", "hits.npz", "--detector", "detector.yaml"],
@@ -76,7 +76,7 @@ def with_out(name: str) -> list[str]:
 
 @functools.cache
 def options() -> dict[str, list[str]]:
-    """Options of each command that take a value, as the command line knows them."""
+    """Options of each command that take a value, read from the command line's definition."""
     found = {}
     tree: Any = get_command(app)
     for name in WORDS:
@@ -164,7 +164,7 @@ def must_be_refused(_folder: Path, rng: Rng) -> Case:
 
 
 def names(folder: Path, rng: Rng) -> Case:
-    """Files with odd names, which are read or written all the same, or refused in a line."""
+    """Files with odd names, which must be read or written, or refused in one line."""
     odd = [
         b"caf\xe9",
         b"\xff\xfe",
@@ -208,7 +208,7 @@ def names(folder: Path, rng: Rng) -> Case:
 
 
 def variables(folder: Path, rng: Rng) -> Case:
-    """A variable of the environment, or a stream, in a new interpreter: all goes on."""
+    """An odd environment variable in a new interpreter; it must not matter."""
     words = pick(rng, [["info", "sim.lh5"], with_out("compare"), with_out("simulate")])
     numbers = ["abc", "0", "-1", "", "99999999", "1,2", "1.5", " 1", "²"]
     chances: list[dict[str, str]] = [
@@ -242,7 +242,7 @@ def streams(_folder: Path, rng: Rng) -> Case:
 
 
 def caches(folder: Path, rng: Rng) -> Case:
-    """A damaged file in the caches of fields or of compiled code: made anew."""
+    """A damaged file in the cache of fields or of compiled code; it must be made again."""
     base = Path(os.environ["CPUNET_CACHE"])
     places = {"CPUNET_CACHE": base, "NUMBA_CACHE_DIR": base.parent / "code"}
     variable = pick(rng, sorted(places))
@@ -260,7 +260,7 @@ def caches(folder: Path, rng: Rng) -> Case:
 
 
 def unfinished(folder: Path, rng: Rng) -> Case:
-    """A training, an ensemble or a search that is resumed from what someone has changed."""
+    """A training, an ensemble or a search that is resumed from changed files."""
     kind = pick(rng, ["stopped", "stopped", "ens", "tuned"])
     place = folder / ("stopped.unfinished" if kind == "stopped" else kind)
     files = [
@@ -278,7 +278,7 @@ def unfinished(folder: Path, rng: Rng) -> Case:
 
 
 def truths(folder: Path, rng: Rng) -> Case:
-    """Truths of other shapes, kinds and formats."""
+    """Truth files of the wrong shape, type or format."""
     whole = np.load(folder / "truth.npz")["response"]
     arrays = {
         "short": whole[:-1], "long": np.vstack([whole, whole]), "flat": whole[0],
@@ -312,7 +312,7 @@ def truths(folder: Path, rng: Rng) -> Case:
 
 
 def wrong_hits(folder: Path, rng: Rng) -> Case:
-    """Hits that are no hits, in arrays that are well formed."""
+    """Impossible hits in a readable file."""
     arrays = dict(np.load(folder / "hits.npz"))
     column = pick(rng, ["x_mm", "y_mm", "z_mm", "edep_keV"])
     value = pick(rng, [np.nan, np.inf, -np.inf, 1e300, -1e300])
@@ -330,7 +330,7 @@ def wrong_hits(folder: Path, rng: Rng) -> Case:
 
 
 def wide_files(folder: Path, rng: Rng) -> Case:
-    """Sparse files that say to be far larger than they are."""
+    """Sparse files that claim to be far larger than they are."""
     shape = pick(
         rng, [(4, 10**7), (10**8, 64), (10**9, 2), (1, 2**31), (10**6, 10**6), (10**12, 8)]
     )
@@ -347,7 +347,7 @@ def wide_files(folder: Path, rng: Rng) -> Case:
     ]
     words += [["train", "--sim", "wide.h5", "--data", "data.lh5", "--out", "out", *tiny()]]
     words += [["check", "--sim", "sim.lh5", "--data", "wide.h5"]]
-    # whatever is done: not for long, and not with much memory
+    # any result is accepted, if it takes little time and memory
     return Case(pick(rng, words), f"a sparse file of {shape}")
 
 
@@ -379,7 +379,7 @@ def pickles(folder: Path, rng: Rng) -> Case:
 
 
 def scores(folder: Path, rng: Rng) -> Case:
-    """Scores with numbers that are none of the usual ones."""
+    """Scores with one unusual value instead of a number."""
     path = folder / "report" / "metrics.json"
     text = path.read_text("utf-8")
     spans = [i for i, sign in enumerate(text) if sign in string.digits]
@@ -397,7 +397,7 @@ def scores(folder: Path, rng: Rng) -> Case:
 
 
 def other_files(folder: Path, rng: Rng) -> Case:
-    """A mutated file for commands that the other kinds do not try."""
+    """A mutated file for commands that the other kinds leave out."""
     chances = [
         ("check", "sim.lh5"), ("check", "data.lh5"), ("calibrate", "made.lh5"),
         ("calibrate", "data.lh5"), ("explore", "detector.yaml"), ("explore",
@@ -416,7 +416,7 @@ def other_files(folder: Path, rng: Rng) -> Case:
 
 
 def figures(_folder: Path, rng: Rng) -> Case:
-    """Names of figures that are none."""
+    """Names of figures that do not exist."""
     name = pick(rng, ["", " ", "x", "../x", "/", "losses/", "*", "[", "FEP " * 2000, "\0"[:0]])
     return Case(
         ["figure", "report", name, "--out", "out"], f"figure {name[:20]!r}", must_fail=True

@@ -16,7 +16,7 @@ from cpunet.simulation.geometry import Detector
 
 N_EVENTS = 3_000
 DEP = {"DEP": WantedLine(1591.0, 1594.0, N_EVENTS)}
-# per gamma in the cone to the crystal: hit, then within 1 keV of the FEP, SEP and DEP
+# fractions of the gammas in the cone to the crystal: any hit; within 1 keV of FEP, SEP and DEP
 GEANT4 = {
     20.0: (0.4265, 0.0997, 0.01131, 0.00370),
     100.0: (0.4450, 0.1101, 0.01199, 0.00386),

@@ -1,15 +1,15 @@
-"""How well pulses tell the current amplitude, and how well the fit uses them.
+"""How well pulses determine the current amplitude, and how much of this the fit uses.
 
 Run with ``python benchmarks/information.py STAND --pulses 3300``; STAND has many full-energy
-pulses on both sides, and the truth.  It is parted into sets of so many pulses, each is fitted
-by the moments alone and by optimal weights, and the shift of the translated current amplitude
-of the double-escape peak from the truth is given for each.  Beside them stands a bound: the
-Fisher information of the best function of a pulse that a small network finds (Charnock et al.,
-Phys. Rev. D 97 (2018) 083004), on pulses that it has not seen.
+pulses on both sides, and the truth.  It is split into sets of that many pulses.  Each is fitted
+by the moments alone and with optimal weights, and the shift of the translated current amplitude
+of the double-escape peak from the truth is printed for both.  A bound is printed beside them,
+from the Fisher information of the best function of a pulse that a small network finds (Charnock
+et al., Phys. Rev. D 97 (2018) 083004), on pulses that it has not seen.
 
-``python benchmarks/information.py STAND --run RUN`` prints the shift of a run alone.  With
-``--chain RUN`` the data are simulated experiments: half of the stand's simulated pulses behind
-the response of a run, with noise.
+``python benchmarks/information.py STAND --run RUN`` prints only the shift of a run.  With
+``--chain RUN`` the data are simulated experiments: half of the stand's simulated pulses, with
+the response of a run and noise.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def off(translated: np.ndarray, wanted: np.ndarray) -> float:
 def experiment(
     run: Path, sim: Pulses, windows: np.ndarray, noise
 ) -> tuple[Pulses, Pulses, np.ndarray]:
-    """Half of the pulses, the others as data behind a known response, and true amplitudes."""
+    """Half of the pulses, the others with a known response as data, and true amplitudes."""
     half, config = len(sim) // 2, RECIPE.preparation
     response = known_response(run, sim.dt_ns)
     kev = sim.energy_kev[half:]
@@ -101,11 +101,11 @@ def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
 
 
 def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:
-    """What is read of each pulse, as a network takes it."""
+    """Readings of each pulse, as input of a network."""
     seen: list[Readings] = []
     with torch.no_grad():
         threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # in the order of the pulses
+        torch.set_num_threads(1)  # keeps the order of the pulses
         band.sim.sums(
             response, lambda r: (seen.append(r), (np.zeros(1),))[1], cut=False, draws=1
         )
@@ -121,7 +121,7 @@ def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:
 def bound(
     band: Band, response: ElectronicsResponse, direction: np.ndarray, pairs: float
 ) -> float:
-    """Error of the shift, in percent, of the best function that a network finds."""
+    """Error of the shift in percent, from the best function that a network finds."""
     parameters = Parameters(response)
     vector, shifted = parameters.vector(), []
     for i, step in enumerate(parameters.steps):

@@ -1,9 +1,9 @@
-"""Load: a thousand reports in one summary, a validation of many pulses, and their memory.
+"""Time and memory of a summary of a thousand reports, and of a validation of many pulses.
 
 Run with ``python benchmarks/load.py summary --reports 1000 --report REPORT`` for copies of a
 report, or with ``validate --run RUN --sim SIM --data DATA --pulses 1000000``, which repeats the
-pulses of two files until there are so many on either side.  Prints wall-clock time, processor
-time and the most memory of the process, and the size of what was written.
+pulses of two files until each side has that many.  Prints wall-clock time, processor time and
+peak memory of the process, and the size of the summary or the rejections of the validation.
 The chain from steps to raw traces has a benchmark of its own, ``chain.py``.
 """
 
@@ -34,7 +34,7 @@ finally:
 
 
 def call(*words: str | Path) -> None:
-    """Run a command, whose last line says what it took."""
+    """Run a command, and print the time and memory it took."""
     done = subprocess.run(
         [sys.executable, "-c", _CALL, *map(str, words)], check=True, capture_output=True
     )
@@ -42,7 +42,7 @@ def call(*words: str | Path) -> None:
 
 
 def many_reports(report: Path, folder: Path, n: int) -> list[Path]:
-    """Copies of the scores of a report, each a bit off, as of many detectors and periods."""
+    """Copy the scores of a report to folders of many detectors and periods."""
     scores = (report / "metrics.json").read_text("utf-8")
     made = []
     for number in range(n):

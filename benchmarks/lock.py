@@ -1,7 +1,7 @@
-"""Write ``requirements.lock``: what ``make install`` brings, with the digests of its files.
+"""Write ``requirements.lock``: the packages of ``make install``, with digests of their files.
 
 Run with ``make lock`` after a change of ``constraints.txt``.  The digests are of the files for
-this Python and this system, by which ``make install-locked`` installs nothing else.
+this Python and this system; ``make install-locked`` installs only these files.
 """
 
 from __future__ import annotations

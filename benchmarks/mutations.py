@@ -1,4 +1,4 @@
-"""Valid files, made invalid by one random change: bytes, arrays, groups, or values of a text.
+"""Damage valid files by one random change of bytes, arrays, groups or text values.
 
 Used by ``fuzz.py`` and by the tests of readers.  A change is drawn from a generator, so that
 the same seed makes the same file.
@@ -21,7 +21,7 @@ from safetensors.numpy import load_file, save_file
 Rng = np.random.Generator
 Change = Callable[[Path, Rng], str]
 
-# What someone's script, or a slip of the hand, may leave where a number or a text was.
+# Values that a faulty script or a typing error may leave in place of a number or a text.
 NASTY: list[Any] = [
     None, True, False, 0, -1, 1, 2, 3.5, -0.0, 1e-300, 1e300, -1e300, 1e9, 10**12, 10**30,
     float("nan"), float("inf"), float("-inf"), "", "x", "16", "nan", "1e400", [], [1], [[]],
@@ -34,7 +34,7 @@ NASTY_TEXTS = [
 
 
 def pick(rng: Rng, items: list[Any]) -> Any:
-    """One of a list, as it is."""
+    """Pick an item of a list, without converting its type."""
     return items[int(rng.integers(len(items)))]
 
 
@@ -279,7 +279,7 @@ CHANGES: dict[str, Change] = {
 
 
 def mutate(path: Path, rng: Rng) -> str:
-    """Change a file as its suffix suggests, half the time by its bytes; say how."""
+    """Change a file's content by its suffix, or its bytes; return a description."""
     structured = CHANGES.get(path.suffix)
     share = 0.2 if path.suffix in (".json", ".yaml") else 0.5
     if structured is None or rng.random() < share:
@@ -287,6 +287,6 @@ def mutate(path: Path, rng: Rng) -> str:
     whole = path.read_bytes()
     try:
         return structured(path, rng)
-    except Exception as error:  # what no library would write
+    except Exception as error:  # a change that the library refuses to write
         path.write_bytes(whole)
         return f"{change_bytes(path, rng)} (no {type(error).__name__})"

@@ -1,8 +1,8 @@
 """Pulse parameters on one core: ours, dspeed's processors on whole pulses, and a plain loop.
 
-Run with ``python benchmarks/parameters.py``; takes about half a minute.  The plain loop takes
-pulse by pulse and does what a reader of the paper would write.  The floor is the time to read
-the pulses and write them once, as any calculation on them must at least do half of.
+Run with ``python benchmarks/parameters.py``; takes about half a minute.  The plain loop goes
+pulse by pulse, as a reader of the paper would write it.  The floor is the time to read and
+write all pulses once; any calculation must do at least half of this.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def prepared() -> FloatArray:
 
 
 def with_dspeed(waveforms: FloatArray) -> None:
-    """The three parameters of the paper by the processors, a block at a time."""
+    """Compute the three parameters of the paper with dspeed's processors, block by block."""
     for first in range(0, len(waveforms), 256):
         block = waveforms[first : first + 256]
         current = np.empty((len(block), 799), np.float32)

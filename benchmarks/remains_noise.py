@@ -1,7 +1,7 @@
-"""Remains added to a closure set, and the noise that is then measured from its baselines.
+"""Add remains to a closure set, and measure the noise from its baselines.
 
-Writes the set with remains, and prints the noise density of all flat baselines, of those that
-are taken for noise, and of those without remains. Run with
+Writes the set with remains, and prints the noise density of all flat baselines, of those
+selected for measuring the noise, and of those without remains. Run with
 ``python benchmarks/remains_noise.py CLOSURE --rate-khz 1 --decay-us 60 --out closure-remains``.
 """
 
@@ -24,7 +24,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
 FREQUENCIES_KHZ = (20, 60, 120, 400)
-LITTLE_KEV = 0.3  # a remainder that is none
+LITTLE_KEV = 0.3  # smaller remainders count as none
 
 
 def main() -> None:

@@ -1,9 +1,9 @@
 """Translate many files, kill the translation half-way, resume it, and compare the bytes.
 
-Run with ``python benchmarks/resumed_translation.py --pulses 1000000 --files 10``: files of
-analytic pulses go through ``cpunet translate`` once in one go, and once killed (SIGKILL, with
-all its processes) when half of the outputs are there and then resumed.  The run is a readout
-chain that was not trained, as in ``streaming.py``.
+Run with ``python benchmarks/resumed_translation.py --pulses 1000000 --files 10``.  Files of
+analytic pulses are translated twice with ``cpunet translate``: without interruption, and killed
+(SIGKILL, with all its processes) when half of the outputs exist and then resumed.  The run is
+an untrained readout chain, as in ``streaming.py``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def killed_half_way(words: list[str], out: Path, files: int) -> int:
-    """Begin a translation and kill it; return the number of outputs that are there."""
+    """Start a translation and kill it half-way; return the number of outputs."""
     process = subprocess.Popen(words, start_new_session=True, stderr=subprocess.DEVNULL)
     while process.poll() is None and len(list(out.glob("[!.]*.lh5"))) < files // 2:
         time.sleep(0.05)

@@ -1,7 +1,7 @@
-"""Pulses of the same hits with other physics: exact and quick, what they cost and differ by.
+"""Pulses of the same hits with changed physics: cost of the exact and quick modes, and errors.
 
-Differences between two physics, of the mean logarithm of the largest current and of the
-mean rise and 90 % times, after a Gaussian of 24 ns for the electronics.
+Prints by how much each change shifts the mean logarithm of the maximum current and the mean
+rise and 90 % times, after a Gaussian of 24 ns that represents the electronics.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SHIFTS = (
 
 
 def moments(waveforms: npt.NDArray[np.float32], dt_ns: float) -> npt.NDArray[np.float64]:
-    """Mean log of the largest current, mean rise time and mean 90 % time in ns."""
+    """Mean log of the maximum current, mean rise time and mean 90 % time in ns."""
     smooth = gaussian_filter1d(waveforms.astype(float), 24 / dt_ns, axis=1)
     current = np.diff(smooth, axis=1).max(axis=1)
     t10, t90 = (_crossing(smooth, level) * dt_ns for level in (0.1, 0.9))
@@ -57,7 +57,7 @@ def main() -> None:
     hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), detector, 0.05)
     same = SameHits(hits)
     first = {}
-    # the same events everywhere, those that lose nothing in the lithium layer
+    # the same events everywhere: those that lose less than 1 keV in the lithium layer
     kept = same.simulate(detector, settings).lost_kev < 1
     for mode in ("exact", "quick"):
         events = same.simulate(detector, settings, mode=mode)

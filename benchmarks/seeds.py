@@ -1,9 +1,9 @@
-"""Many seeds of a recipe on one stand, a file of scores each: can be stopped and resumed.
+"""Train a recipe on one stand with many seeds, one file of scores each; can be resumed.
 
 Run with ``python benchmarks/seeds.py STAND FOLDER --recipe small --seeds 20``; a stand is a
 folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and perhaps truth.npz.  Seeds whose
 file is in FOLDER are not trained again.  With ``--sim`` the simulated pulses are those of
-another stand.  A seed has failed if a score is below 0.9 of the median's.
+another stand.  A seed has failed if a score is below 0.9 of the median.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PEAKS = ("SEP", "DEP")
 def one_seed(
     sim: Path, stand: Path, recipe: str, overrides: list[str], seed: int
 ) -> dict[str, Any]:
-    """Scores over their ceilings, AUC and edge of one training, and what it cost."""
+    """Scores, also over their ceilings, AUC and edge RMSE of one training, and its cost."""
     files = InputFile(sim / "sim.lh5"), InputFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Drift and pulses against siggen's own, from the optional reference vectors.
+"""Compare drift and pulses with those of siggen, from the optional reference vectors.
 
 Run with ``python benchmarks/siggen.py FOLDER``, the folder that holds ``siggen/``.
 """

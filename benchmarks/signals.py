@@ -38,7 +38,7 @@ def random_events(fields: FieldMaps, n_hits: int, seed: int) -> Hits:
 def timed(
     fields: FieldMaps, hits: Hits, settings: SimulationSettings, **how: object
 ) -> tuple[EventPulses, float]:
-    """The events and the rate of hits that give a signal."""
+    """Return the events and the rate of hits with a signal."""
     start = time.perf_counter()
     events = simulate_events(fields, hits, settings, **how)  # type: ignore[arg-type]
     seconds = time.perf_counter() - start

@@ -1,11 +1,11 @@
-"""Ideal libraries made realistic: time and memory, and A/E of real events read out of them.
+"""Translate ideal pulse-shape libraries: time, memory, and A/E of events from the library.
 
     python benchmarks/simflow_library.py RUN [--detector icpc] [--grid-mm 0.5] [--ranks 16,64]
     python benchmarks/simflow_library.py RUN --detector geometry_A.yaml --hits g4_h20mm.npz
 
-RUN holds a readout chain.  Each step is a process of its own, so that its peak memory is known.
-With ``--hits``, whose frame must be the detector's, A/E of events above 600 keV by reboost from
-the library is put beside charges drifted one by one and translated as a whole: at the library's
+RUN contains a readout chain.  Each step runs in its own process, to measure its peak memory.
+With ``--hits``, in the frame of the detector, A/E of events above 600 keV from the library and
+reboost is compared with that of exactly drifted events translated as a whole: at the library's
 own azimuth, and at that of the hits.
 """
 
@@ -42,7 +42,7 @@ SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
 
 
 def run(*words: object) -> None:
-    """Run a command, and print what it took."""
+    """Run a command, and print its time and memory."""
     begun = time.monotonic()
     program = "from cpunet.cli.main import main; main()"
     process = subprocess.Popen([sys.executable, "-c", program, *map(str, words)])
@@ -67,7 +67,7 @@ def events_of(path: Path, detector: str) -> Hits:
 
 
 def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
-    """A/E of whole events, translated."""
+    """A/E of exactly drifted events, translated as a whole."""
     fields, found = compute_fields(read_detector(detector)), []
     translate = TemplateTranslator(REN.load(folder), 1.0)
     for first in range(0, hits.n_events, 500):
@@ -77,7 +77,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
 
 
 def read_out(path: Path, name: str, hits: Hits) -> np.ndarray:
-    """A/E by reboost."""
+    """A/E of events from the library, by reboost."""
     maps = utils.load_hpge_drift_time_maps(str(path), name, (0, 45))
     template = utils.load_hpge_pulse_shape_library(
         str(path), name, "waveform_000_deg", out_of_bounds_val=0

@@ -1,11 +1,11 @@
-"""Are the events of both sides of a stand alike? By their hits alone, before any pulse.
+"""Do the events of both sides of a stand differ? Compares their hits, before any pulse.
 
     python benchmarks/stand_populations.py --seeds 21-23
     python benchmarks/stand_populations.py --seeds 100-123
 
-The sides of a stand are drawn independently, so that they differ by chance. What a calibration
-finds differs with them. Prints, for each seed and for all together, how far the means of the
-full-energy peak's events differ, in standard errors.
+The sides of a stand are drawn independently, so they differ by chance, which shifts the result
+of a calibration. Prints, for each seed and for all together, by how many standard errors the
+means of the events of the full-energy peak differ.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def events_of(side: Side) -> Values:
-    """Numbers of each event with its whole energy in active germanium, shape (events, 6)."""
+    """`NAMES` of each event with all its energy in active germanium, shape (events, 6)."""
     blocks = []
     for hits in side.source.open(side.detector).blocks:
         active = side.detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)

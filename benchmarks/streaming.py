@@ -1,8 +1,8 @@
-"""Translate a long file, and watch the memory: rate, peak, and a picture of it over time.
+"""Translate a long file, and record its memory: rate, peak, and a figure over time.
 
 Run with ``python benchmarks/streaming.py``; ``--pulses 1000000`` for a million,
-``--picture docs/pictures/streaming-memory.png`` for the picture.  The run is a readout chain
-that was not trained: neither rate nor memory depend on its numbers.  Pulses are analytic.
+``--picture docs/pictures/streaming-memory.png`` for the figure.  The run is an untrained
+readout chain: neither rate nor memory depends on its parameters.  Pulses are analytic.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Watched = list[tuple[float, float]]
 
 
 def write_input(path: Path, n: int) -> None:
-    """Ramps of random length, a block at a time."""
+    """Write ramps of random length, block by block."""
     rng = np.random.default_rng(0)
     time_samples = np.arange(LENGTH)
     with PulseWriter(path) as writer:
@@ -55,7 +55,7 @@ def write_input(path: Path, n: int) -> None:
 
 
 def write_fast_run(folder: Path) -> None:
-    """A run of recipe `fast` as it is before its fit, with white noise of 2 keV."""
+    """Write an unfitted run of recipe `fast`, with white noise of 2 keV."""
     recipe = load_recipe("fast")
     chain = ResponseGenerator(recipe.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.full(4097, 4.0), 8192, DT_NS, 100))

@@ -1,11 +1,12 @@
-"""What the lithium layer's delayed charge, and trapping, do to A/E and late charge.
+"""Effects of delayed charge from the lithium layer, and of trapping, on A/E and late charge.
 
     python benchmarks/surface_and_trapping.py RUN [--detector icpc]
 
-Pulses are those of RUN's readout chain, without noise and decays.  From depths of a lithium
-layer of 1 mm at half of the crystal's height: the share that is collected, A/E and late charge
-against a hit at the layer's inner boundary.  Of hits all over the crystal: what trapping
-changes, median and the range from 16 to 84 %.
+Pulses have the response of RUN's readout chain, without noise and decays.  The first table is
+for hits at several depths in a lithium layer of 1 mm, at half of the crystal's height: fraction
+of the charge collected, A/E and late charge relative to a hit at the layer's inner boundary.
+The second shows the changes due to trapping for hits throughout the crystal: median and the
+range from 16 to 84 %.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ TRAPPING = ("hole_trapping_per_us", "electron_trapping_per_us")
 
 
 def settings(**more: float) -> SimulationSettings:
-    """Samples of 1 ns, as long as the record."""
+    """Settings with samples of 1 ns and the length of the record."""
     return SimulationSettings(dt_ns=1.0, length_ns=LENGTH, **more)
 
 
 def told(undecayed: Exponentials, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A/E, and late charge (ns): the area missing after 80 % of what has come in 10 us."""
+    """A/E, and late charge in ns: area missing after 80 % of the charge at 10 us."""
     step = undecayed.step(np.arange(LENGTH, dtype=float))
     size = scipy.fft.next_fast_len(2 * LENGTH, real=True)
     impulse = scipy.fft.rfft(np.diff(step, prepend=0.0), size)

@@ -1,8 +1,8 @@
 """Memory of a training on a million simulated pulses.
 
 Run with ``python benchmarks/training_memory.py --pulses 1000000``: writes a file of that many
-simulated pulses of the full-energy peak and one of measured ones, trains by ``cpunet train`` in
-a process of its own, and prints the most memory that was resident in it.
+simulated pulses of the full-energy peak and one of measured pulses, trains on them with
+``cpunet train`` in a process of its own, and prints the peak resident memory.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MEASURED = 4000
 DT_NS = 16.0
 PEAK_KEV = 2614.5
 RUNS: dict[str, list[str]] = {
-    # two iterations: what a step holds is there after one
+    # two iterations: the memory of a step is allocated after one
     "paper": [
         "training.iterations=2",
         "training.decay_start=1",
@@ -55,7 +55,7 @@ def write_simulation(path: Path, n: int) -> None:
 
 
 def write_data(path: Path) -> None:
-    """The same behind a bandwidth of 60 ns and a decay of 100 us, with noise."""
+    """Write ramps with a bandwidth of 60 ns, a decay of 100 us and noise."""
     rng = np.random.default_rng(1)
     pulses = ramps(rng, MEASURED, 1400)
     times = np.arange(1400) * DT_NS

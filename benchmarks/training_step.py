@@ -1,13 +1,13 @@
-"""A step of a CycleGAN's training: written plainly after the paper, and ours.
+"""Time of a CycleGAN training step: a plain implementation of the paper, and ours.
 
 Run with ``python benchmarks/training_step.py --recipe paper``.  The plain step is eager float32
-PyTorch on the same networks: six passes one by one, a loop over pulses in each L1 loss, and a
-number fetched for every loss.  Each step runs in a process of its own; they take turns, so that
-what else the machine does falls on all, and medians are compared.  All are steps without an
-update of the discriminators, of which `paper` has one in 30.
+PyTorch on the same networks: six passes one by one, a loop over pulses in each L1 loss, and
+each loss fetched as a number.  Each variant runs in a process of its own; they take turns, so
+that other load on the machine affects all of them, and medians are compared.  No step updates
+the discriminators, which recipe `paper` does in one step of 30.
 
-``--steps ours bf16 compiled bf16-compiled`` compares ours as the recipe has it with other
-precisions and torch.compile, and ``--device cuda`` does so on a GPU.
+``--steps ours bf16 compiled bf16-compiled`` compares our step as in the recipe with bf16 and
+torch.compile, and ``--device cuda`` does so on a GPU.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class PlainUNet(nn.Module):
 
 
 class PlainJudge(nn.Module):
-    """Section 2.2.2, with a table that is read between its rows."""
+    """Section 2.2.2, with interpolation between the rows of the table."""
 
     def __init__(self, rows: int, dim: int, hidden: int) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class PlainJudge(nn.Module):
 
 
 def plain_step(recipe: Recipe, sim: Tensor, data: Tensor) -> Callable[[], object]:
-    """The generators' update, as a paper's reader would write it."""
+    """The generators' update, as a reader of the paper would write it."""
     generator, judge, training = recipe.cyclegan
     length, losses = recipe.preparation.length, training.losses
     ren, iren = (PlainUNet(generator.width, length, generator.dropout) for _ in range(2))
@@ -181,13 +181,13 @@ OURS: dict[str, list[str]] = {
 
 
 def wait(device: str) -> None:
-    """Until a GPU has done what it was given."""
+    """Wait until a GPU has finished its work."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 
 
 def work(name: str, recipe_name: str, threads: int, device: str, line: Connection) -> None:
-    """Do what the line says: "step", "share" or "flop"."""
+    """Execute the orders on a connection: "step", "share", "flop" or "end"."""
     torch.set_num_threads(threads)
     torch.set_default_device(device)
     torch.manual_seed(0)
@@ -226,7 +226,7 @@ def work(name: str, recipe_name: str, threads: int, device: str, line: Connectio
 
 
 def gemm_rate(device: str) -> float:
-    """GFLOP/s of a large product of matrices."""
+    """GFLOP/s of a large matrix product."""
     a = torch.randn(2048, 2048, device=device)
     times = []
     for _ in range(5):
@@ -266,7 +266,7 @@ def main() -> None:
         for name in lines:
             times[name].append(ask(name, "step"))
         print("  ".join(f"{name} {v[-1]:.3g} s" for name, v in times.items()), flush=True)
-    # what kernels are compiled to has no names to tell convolutions by, nor has a GPU's time
+    # convolutions cannot be identified in compiled kernels, and time on a GPU is not profiled
     told = {n: ask(n, "share") for n in lines if given.device == "cpu" and "compiled" not in n}
     memory = {name: ask(name, "end") for name in lines}
     rate = float(np.median(rates))

@@ -1,8 +1,8 @@
-"""A REN for another readout, begun from a trained one: time and scores beside a fresh start.
+"""A REN for another readout, started from a trained one: time and scores against a fresh start.
 
 Run with ``python benchmarks/transfer.py KNOWN STAND``: folders of ``cpunet stand`` with
-different readouts.  The REN of the first is the start on the second, where it sees
-``--pulses`` measured pulses of the training's peak only.
+different readouts.  The training on the second starts from the REN of the first, and uses only
+``--pulses`` measured pulses of the training peak.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from cpunet.recipes import load_recipe
 
 
 def few_of(data: InputFile, pulses: int, folder: Path) -> InputFile:
-    """A file with that many traces of the training's peak."""
+    """A file with that many traces of the training peak."""
     recipe = load_recipe("fast")
     select = parse_selection("FEP", recipe.peaks).select
     kept: list[Pulses] = []

@@ -1,9 +1,9 @@
-"""Translation of prepared pulses: readout chain with noise, and U-Nets.
+"""Rate of translation of prepared pulses: readout chain with noise, and U-Nets.
 
 Run with ``python benchmarks/translation.py``, on one core, or with ``--threads 2``; each rate
-is the median of three.  The U-Net of recipe `paper` in eager float32 is what the others are
-compared with; it and the one with fast convolutions take turns.  With ``--device cuda`` there
-is but one way for a U-Net; ``--pulses 4096`` then keeps it busy.
+is the median of three.  The reference is the U-Net of recipe `paper` in eager float32; it and
+the one with fast convolutions take turns.  With ``--device cuda`` there is only one
+implementation of a U-Net; ``--pulses 4096`` then keeps the GPU busy.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def rate(translate: Callable[[], object], n: int) -> float:
 
 
 def unets(pulses: np.ndarray, device: str) -> tuple[float, float, float]:
-    """Pulses per second of the large U-Net, eager and fast, and how far they are apart."""
+    """Pulses per second of the large U-Net, eager and fast, and largest relative difference."""
     torch.manual_seed(0)
     network = PositionalUNet(load_recipe("paper").cyclegan.generator, 800).eval().to(device)
     batch = torch.from_numpy(pulses)[:, None].to(device)
     if not fast_passes_pay(network, device):
-        with torch.inference_mode():  # to the host, so that all is done
+        with torch.inference_mode():  # copied to the host, so that the GPU has finished
             eager = rate(lambda: network(batch, mean=True).cpu(), len(pulses))
         return eager, eager, 0.0
     ways = (partial(network, batch), partial(FrozenUNet(network).translate, batch))

@@ -1,9 +1,9 @@
 """Time and memory of a validation, against the number of pulses and of methods.
 
-Run with ``python benchmarks/validation.py --pulses 6000 15000``: makes a stand and trains
-on it, writes its pulses again and again until there are so many on either side, and runs
-``cpunet validate`` on them in a process of its own.  Prints wall-clock time, processor time and
-the most memory that was resident in it.  A folder that is given is kept, and used again.
+Run with ``python benchmarks/validation.py --pulses 6000 15000``: makes a stand and trains on
+it, repeats its pulses until each side has that many, and runs ``cpunet validate`` on them in a
+process of its own.  Prints wall-clock time, processor time and peak resident memory.  A folder
+given by ``--folder`` is kept and reused.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def make_run(folder: Path) -> None:
 
 
 def repeated(source: Path, target: Path, n: int, *, noise: float) -> int:
-    """Write `n` pulses, those of the source in turn, and return how many those are."""
+    """Write `n` pulses, repeating those of the source, and return the number of the latter."""
     if target.exists():
         return open_pulses(source).n_pulses
     blocks = list(open_pulses(source).blocks(BLOCK))

@@ -1,4 +1,4 @@
-"""``python -m cpunet``: the command line, where the folder of scripts is not on the path."""
+"""``python -m cpunet``: the command line, for when the script is not on the path."""
 
 from cpunet.cli.main import main
 

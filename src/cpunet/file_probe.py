@@ -73,8 +73,9 @@ def _fate(path: str, kind: Kind, _facts: tuple[int, ...]) -> str:
 
 
 def _look_through_and_exit(path: str, kind: Kind) -> None:
-    """In the child: end by itself, or by a signal."""
-    # a FlashCam file that fails here for lack of memory would exhaust it in the reader
+    """Scan the file in the child, and exit; a hang or crash ends the child by a signal."""
+    # for FlashCam an exception means failure: where it is lack of memory, the reader would
+    # exhaust the memory
     ended = 0 if kind == "HDF5" else 1
     try:
         faulthandler.disable()

@@ -116,7 +116,7 @@ def folder_written_aside(
 def _take_the_place(aside: Path, target: Path, kind: FolderKind) -> None:
     """Rename `aside` to `target`; an old folder is removed only afterwards.
 
-    Another process may have put its own there in the meantime: it is replaced, too.
+    A folder that another process has put there in the meantime is replaced, too.
     """
     if not target.exists():
         try:

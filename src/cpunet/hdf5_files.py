@@ -32,7 +32,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     Raises
     ------
     CpunetError
-        If the file is missing, foreign or damaged.
+        If the file is missing, damaged or not HDF5.
     """
     require_file(path)
     require_survivable(path)

@@ -15,7 +15,7 @@ DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
 
 @cache
 def other_package() -> str | None:
-    """One-line remedy if the other package is installed over this one.
+    """One-line message with a remedy if the other package is installed over this one.
 
     Returns
     -------

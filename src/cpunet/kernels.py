@@ -2,8 +2,8 @@
 
 numba's own cache checks only the file of a function, so the function keeps old code of
 functions that it calls in other files.  Moreover, if two processes compile at once, as the
-first jobs after an installation do, one can load the other's code.  Neither happens here; the
-second waits for the code of the first.
+first jobs after an installation do, one can load the other's code.  Neither happens here: the
+second process waits for the code of the first.
 
 numba chooses the folder: beside the package, or ``NUMBA_CACHE_DIR``.  A folder to which others
 can write is never used, since it would let them execute any code; then the user's own cache
@@ -34,7 +34,7 @@ from cpunet.trusted_folders import trusted
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
-# for code that another process compiles: one that hangs holds nobody up for ever
+# Maximum wait for code that another process compiles, in case that process hangs.
 MAX_WAIT_S = 60.0
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
@@ -107,7 +107,7 @@ def code_folder(chosen: Path) -> Path | None:
 
 
 class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
-    """Files of one function: an index, and one with the code for each kind of arguments.
+    """Files of one function: an index, and one file of code per signature.
 
     Code is preceded by a digest.  Damaged code and damaged indices are ignored.
     """
@@ -150,7 +150,7 @@ class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
         for file in Path(self._cache_path).glob(pattern):
             if file.name not in kept.values():
                 with suppress(OSError):
-                    file.unlink()  # a process that looks for it compiles
+                    file.unlink()  # a process that looks for it compiles again
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
@@ -171,9 +171,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Code for a kind of arguments; None if this process is to compile it.
+        """Return the code for a signature; None if this process must compile it.
 
-        If another process is compiling the function, its code is waited for.
+        If another process is compiling the function, wait for its code.
         """
         found = super().load_overload(sig, target_context)
         if found is None and self._enabled:
@@ -184,7 +184,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Cache code, for those that wait for it, too."""
+        """Cache code, and let waiting processes load it."""
         try:
             super().save_overload(sig, data)
         finally:
@@ -199,7 +199,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 
 def _claimed(path: Path) -> IO[str] | None:
-    """Open a lock file, once no other process has it; None if it cannot be had."""
+    """Open and lock a file, waiting up to `MAX_WAIT_S`; None if it cannot be opened."""
     try:
         stream = path.open("a")
     except OSError:

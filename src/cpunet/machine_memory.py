@@ -1,6 +1,7 @@
-"""How much memory a job can still have, and a line instead of a killed process.
+"""Available memory, and an error message instead of a killed process.
 
-Linux lends more than there is, and kills whoever uses it.  So what needs much asks first.
+Linux grants more memory than exists, and kills processes that use it.  Code that needs much
+memory therefore checks first.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from cpunet.errors import CpunetError
 
 _INFO = Path("/proc/meminfo")
 _STATUS = Path("/proc/self/statm")
-# of a container or a batch job: what it may have, and what it has (cgroups of both versions)
+# Limit and use of a container or a batch job, for both versions of cgroups.
 _GROUPS = (
     (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
     (
@@ -23,28 +24,28 @@ _GROUPS = (
 
 
 def available_bytes() -> int | None:
-    """Memory that can still be had: of the machine, the container and the process.
+    """Memory still available, limited by the machine, the container and the process.
 
     Returns
     -------
     int or None
-        The smallest of these; None where the system does not tell, as on macOS.
+        The smallest of the limits; None if the system reports none, as on macOS.
     """
     known = [_of_machine(), *(_of_group(*files) for files in _GROUPS), _of_process()]
     return min((n for n in known if n is not None), default=None)
 
 
 def require_memory(n_bytes: float, what: str, advice: str) -> None:
-    """Raise a `CpunetError` if something needs more memory than there is.
+    """Raise a `CpunetError` if more memory is needed than is available.
 
     Parameters
     ----------
     n_bytes
         Memory needed.
     what
-        What needs it, with the file: the beginning of the message.
+        What needs the memory, with the file; start of the message.
     advice
-        How to need less.
+        How to need less; end of the message.
     """
     there = available_bytes()
     if there is not None and n_bytes > there:
@@ -69,7 +70,7 @@ def _of_machine() -> int | None:
 def _of_group(limit: Path, used: Path) -> int | None:
     try:
         return max(int(limit.read_text()) - int(used.read_text()), 0)
-    except (OSError, ValueError):  # none, or "max": as much as the machine has
+    except (OSError, ValueError):  # no group, or "max": no limit but that of the machine
         return None
 
 

@@ -132,7 +132,7 @@ def read_array(path: Path, key: str, header: Header) -> npt.NDArray[Any]:
         If the array contains objects, is larger than `MAX_BYTES`, or does not match its
         header.
     CpunetError
-        If the memory does not suffice.
+        If there is not enough memory.
     """
     if header.dtype.hasobject:
         raise ValueError("objects instead of numbers")

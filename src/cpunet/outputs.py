@@ -164,7 +164,7 @@ def keep_others(old: Path, new: Path, kind: FolderKind) -> list[str]:
 
 
 def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
-    """Copy the files with names of the program's own from one folder to another."""
+    """Copy the files whose names match ``own`` of the kind from one folder to another."""
     own = re.compile(kind.own)
     for path in _leaves(folder):
         if own.fullmatch(_relative(path, folder)) and path.is_file():
@@ -181,12 +181,12 @@ def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -
     folder, kind
         Folder, and its kind.
     leave
-        Names of the program's own files that are in use and not removed.
+        Names of the program's own files that are in use and must not be removed.
 
     Returns
     -------
     list of str
-        Names of the kept files, relative to the folder; if there are any, so is the marker.
+        Names of the kept files, relative to the folder; if any are kept, so is the marker.
     """
     folder = folder.resolve()  # a link stays
     others = list(_others(folder, kind))

@@ -61,6 +61,16 @@ def test_a_loss_that_was_not_recorded_is_left_out():
     assert [len(axes.lines) for axes in figure.axes] == [2, 0, 0]
 
 
+def test_a_loss_of_every_third_iteration_is_drawn():
+    records = log(60)
+    for record in records:
+        if record["iteration"] % 30:
+            del record["losses"]["discriminator_data"]
+    raw, average = run_figures.loss_curves(records).axes[2].lines[:2]
+    np.testing.assert_array_equal(raw.get_xdata(), np.arange(0, 600, 30))
+    assert np.isfinite(average.get_ydata()).sum() == 11
+
+
 def test_an_empty_log_is_refused():
     with pytest.raises(CpunetError, match="log is empty"):
         run_figures.loss_curves([])

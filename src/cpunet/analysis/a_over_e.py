@@ -1,14 +1,14 @@
 """The A/E cut as used by experiments, and how well a simulation predicts its survival.
 
 A is the maximum current of a pulse, E its energy.  Events of the double-escape peak
-(DEP) deposit their energy at one site, as the searched decay does: the cut is put
-where a given fraction of them survives, and what it leaves of other peaks is the
-figure that a pulse-shape simulation must predict.
+(DEP) deposit their energy at one site, like the decay that is searched for.  The cut is
+placed where a given fraction of them survives.  A pulse-shape simulation must predict
+what fraction of other peaks survives it.
 
 Prepared pulses are normalised, so that `parameters.current_amplitude` is A/E already.
-The slight dependence of A/E on the energy, which experiments take out before the cut,
-is left in: it is the same physics in data and simulation, but it is not a test of it.
-Only the low side is cut; events near the contacts have a high A/E and need another.
+The slight dependence of A/E on the energy, which experiments correct for before the cut,
+is left in: its physics is the same in data and simulation, and the survival is no test of it.
+Only the low side is cut; events near the contacts have a high A/E and need another cut.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def survival_table(
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
 ) -> dict[str, PeakTable]:
-    """Survival of each peak in data and simulations, each of them after its own cut.
+    """Survival of each peak in data and simulations, each after its own cut.
 
     Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
 
@@ -184,7 +184,7 @@ def survival_table(
     Raises
     ------
     CpunetError
-        If the data lack the DEP, or a method a peak of the data.
+        If the data lack the DEP, or a method lacks a peak of the data.
     """
     if DEP not in data:
         raise CpunetError(f"the data lack peak {DEP}; the A/E cut needs it")

@@ -1,8 +1,8 @@
-"""A/E against energy: where events of one site lie, how wide, and the lines through both.
+"""A/E against energy: position and width of the single-site peak, and fits to both.
 
-In each range of energy the single-site events make a peak with a tail of multi-site ones below.
-Its place falls with the energy, since larger clouds are collected more slowly; its width falls
-too, since noise counts for less.
+In each energy range the single-site events form a peak, with a tail of multi-site events below.
+Its position decreases with energy, since larger charge clouds are collected more slowly.  Its
+width decreases too, since noise matters less.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Values = npt.NDArray[np.float64]
 Range = tuple[float, float]
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
-BESIDE_KEV = 8.0  # of a line, that belong to no range of the continuum
-MIN_N = 60  # events about the peak of a range
-BELOW, ABOVE = 6.0, 4.0  # widths about the peak that are fitted
+BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
+MIN_N = 60  # minimum number of events in a fit
+BELOW, ABOVE = 6.0, 4.0  # range of the fit in widths of the peak
 REFERENCE_KEV = 1592.5  # where A/E is 1: the double-escape peak
 
 
@@ -35,11 +35,11 @@ class SiteFit:
     Attributes
     ----------
     low_kev, high_kev, energy_kev
-        The range, and the mean of its events.
+        Ends of the range, and mean energy of its events.
     mean, mean_error, sigma, sigma_error
-        Of the Gaussian, in the units of A/E.
+        Mean and sigma of the Gaussian with their errors, in units of A/E.
     n
-        Events that were fitted.
+        Number of fitted events.
     """
 
     low_kev: float
@@ -53,7 +53,7 @@ class SiteFit:
 
 
 def energy_bands(lines_kev: Mapping[str, Range], dep: str = "DEP") -> list[Range]:
-    """Ranges of 50 keV off the lines, and the double-escape peak, which is of single sites.
+    """Ranges of 50 keV, and first that of the double-escape peak, if it is among the lines.
 
     Parameters
     ----------
@@ -73,30 +73,31 @@ def against_energy(
     energy_kev: Mapping[str, Values],
     lines_kev: Mapping[str, Range],
 ) -> dict[str, Any]:
-    """Place and width of the single-site peak against energy, by method, with straight lines.
+    """Position and width of the single-site peak against energy, by method, with fits to both.
 
     Parameters
     ----------
     amplitude, energy_kev
         A/E and energy of each event, by method, ``data`` among them.
     lines_kev
-        Range of each gamma line.  Events within 8 keV of one are left out of the continuum;
-        without three ranges in all, the other lines are fitted too, although few of their
-        events have one site.
+        Range of each gamma line.  Events within 8 keV of one are left out of the continuum.
+        If fewer than three ranges can be fitted for all methods, the other lines are fitted
+        too, although few of their events have one site.
 
     Returns
     -------
     dict
-        JSON-ready, by method: ``points`` (`SiteFit` of each range), ``mean`` with ``a`` (per
-        keV) and ``b`` of ``a E + b``, which is 1 at 1592.5 keV, ``per_mev_percent`` and its
-        error and ``chi_square`` of ``degrees`` of freedom; ``scale``, the A/E that is 1
-        there; ``resolution`` with ``a``, ``b`` and ``c`` of ``sqrt(a + (b/E)**c)``, or
-        ``missing`` and the reason.  ``multi_site`` says whether lines of many sites take part.
+        JSON-ready: ``methods`` and ``multi_site``, whether lines with mostly multi-site events
+        were fitted too; or ``missing`` with the reason.  For each method: ``points``
+        (`SiteFit` of each range); ``mean`` with ``a`` (per keV) and ``b`` of ``a E + b``, which
+        is 1 at 1592.5 keV, ``per_mev_percent`` with its error, and ``chi_square`` for
+        ``degrees`` of freedom; ``scale``, the A/E at 1592.5 keV; ``resolution`` with ``a``,
+        ``b`` and ``c`` of ``sqrt(a + (b/E)**c)``.
 
     Raises
     ------
     CpunetError
-        If the arrays of a method are not equally long.
+        If the arrays of a method differ in length.
     """
     bands = energy_bands(lines_kev)
     off = [(low - BESIDE_KEV, high + BESIDE_KEV) for low, high in lines_kev.values()]
@@ -133,16 +134,17 @@ def site_fit(
     Parameters
     ----------
     amplitude
-        Of all events of a range.
+        A/E of all events of a range.
     about
-        Place and width of the peak at another energy: where most events have several sites,
-        theirs is not the highest one.  Without, it is looked for.
+        Position and width of the single-site peak at another energy.  It is needed where most
+        events have several sites, since the highest peak is then not that of single sites.  If
+        None, both are estimated from the highest peak.
 
     Returns
     -------
     tuple
-        Mean and its error, sigma and its error, and the events fitted; None where there are
-        too few, or no peak.
+        Mean and its error, sigma and its error, and the number of fitted events; None if
+        there are too few events or no peak.
     """
     values = np.sort(amplitude[np.isfinite(amplitude)])
     about = _seen(values) if about is None else about
@@ -200,7 +202,7 @@ def _common(points: Mapping[str, Sequence[SiteFit]]) -> set[Range]:
 
 
 def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:
-    """Straight line through the means and the law of the widths, A/E 1 at the reference."""
+    """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
     energy, mean, error, sigma, sigma_error = (
         np.array([getattr(p, name) for p in points])
         for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
@@ -229,11 +231,11 @@ def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:
 
 
 def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, Any]:
-    """A and b of sqrt(a + (b/E)^2), neither below 0, by least squares of the squares."""
+    """Fit ``a`` and ``b`` of sqrt(a + (b/E)^2), neither below 0, to the squared widths."""
     terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
     squares = relative**2
     for _ in range(3):
-        # errors of the law's widths: with their own, widths that came out small weigh most
+        # errors are scaled to the fitted widths; otherwise widths that fluctuate low weigh most
         weight = relative / (2 * squares * error)
         a, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
         squares = terms @ np.array([a, b2])
@@ -246,7 +248,7 @@ def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, An
 
 
 def _seen(values: Values) -> tuple[float, float] | None:
-    """Place and width of the highest peak, as its upper side tells them."""
+    """Position of the highest peak, and its width from its upper side."""
     if len(values) < MIN_N:
         return None
     centre = _densest(values)
@@ -276,8 +278,8 @@ def _nll(parameters: Values, x: Values) -> float:
     ]
     norm = max(float(inside[0] - inside[1]), 1e-12)
     density = ((1 - p) * gauss + p * tailed) / norm
-    # weakly held where nothing is known: a tail of some widths, a share of about a third; and
-    # a width near that elsewhere, or else a chance cluster of a few events is taken for a peak
+    # weak priors: a tail of a few widths, a tail fraction of about a third, and a width near
+    # the given one, since otherwise a chance cluster of a few events can be taken for the peak
     held = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
     held += 0.5 * (log_sigma / 0.4) ** 2
     return float(-np.log(np.maximum(density, 1e-300)).sum() + held)

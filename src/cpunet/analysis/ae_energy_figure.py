@@ -1,4 +1,4 @@
-"""A/E against energy in a picture and in a table: points, and the lines through them."""
+"""A/E against energy as a figure and a table: points, and the lines fitted to them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIGURE = "A over E and energy"
 
 @styled
 def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
-    """Place of the single-site peak less 1, and its width, against energy.
+    """Relative shift and relative width of the single-site peak of A/E against energy.
 
     Parameters
     ----------

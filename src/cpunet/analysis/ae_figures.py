@@ -16,9 +16,9 @@ from cpunet.pulses.parameters import PARAMETERS
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear if some are large
-FAR = 5  # times that
+FAR = 5  # times LINEAR: larger ratios count as large
 COLUMNS = 3  # panels per row
-BAR = 0.09  # width of the colours beside them, in panels
+BAR = 0.09  # width of the colour bar beside the panels, in panel widths
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 
@@ -51,7 +51,7 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
         )
         look = {"color": palette[method], "marker": "o", "markersize": 3.5}
         above.errorbar(time, median, error, label=label(method), **look)
-        # the ends of a line of one point would not be seen, but make room for themselves
+        # with one point these lines would be invisible, but widen the range of the axis
         for edge in (low, high) if len(known) > 1 else ():
             above.plot(time, edge, color=palette[method], linestyle=":", linewidth=1.1)
         if method != "data":
@@ -139,7 +139,7 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
     columns = min(COLUMNS, len(shares))
     rows = -(-len(shares) // columns)
     figure = Figure(figsize=(0.9 + 3.1 * columns, 0.6 + 2.9 * rows))
-    # beside the panels, in the same grid: a narrow column for the colours
+    # beside the panels, in the same grid: a narrow column for the colour bar
     places = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [BAR])
     panels: list[Axes] = []
     for i, j in np.ndindex(rows, columns):

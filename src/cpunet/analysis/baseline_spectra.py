@@ -30,7 +30,7 @@ Values = npt.NDArray[np.float64]
 
 MIN_N = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
-# A pulse rises slowly before it crosses 1 %, its nominal start; padding in samples before that.
+# A pulse rises slowly before it crosses 1 %, its nominal start; margin in samples before that.
 MARGIN = 60
 EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are left out
 MIN_SAMPLES = 32  # of the stretch

@@ -116,7 +116,7 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _group(name: str) -> str:
-    """Kind of function of a moment."""
+    """Group to which a moment belongs."""
     plain = name.split(": ")[-1]
     if plain.endswith("squared"):
         return "squares"

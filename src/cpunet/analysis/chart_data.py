@@ -76,7 +76,7 @@ def distributions(
     parameters_info
         Labels and units by parameter.
     max_bins
-        Maximum number of bins where `comparisons` gives none.
+        Maximum number of bins where `comparisons` has none.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def pulse_views(
         Sampling period in ns.
     measured
         Measured pulses by peak.  The nearest to an event has the smallest root-mean-square
-        difference from its truth, or else from its REN translation, among `SEARCHED` pulses.
+        difference from its truth, or else from its REN translation, among at most `SEARCHED`.
     events
         Number of selectable events, equally spaced over the rows.
 

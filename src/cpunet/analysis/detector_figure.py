@@ -113,7 +113,7 @@ def _along_a_ray(fields: FieldMaps) -> list[tuple[float, float]]:
     r, z = r[r < fields.r_mm[-1]], z[r < fields.r_mm[-1]]
     rows, columns = (np.rint(x / fields.grid_mm).astype(int) for x in (r, z))
     along = fields.weighting_potential[rows, columns]
-    # beyond the first contact on its way the ray leaves the crystal
+    # at the first contact that it meets, the ray leaves the crystal
     end = int(np.argmax((along <= 0) & (r > 0))) or len(along)
     firsts = [int(np.argmax(along[:end] <= level)) for level in _WEIGHTING_LEVELS[:-1]]
     return [(float(r[i]), float(z[i])) for i in firsts if i]

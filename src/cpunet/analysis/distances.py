@@ -56,7 +56,7 @@ def wasserstein(a: Values, b: Values) -> float:
 
     Examples
     --------
-    A shift is its own distance:
+    The distance between shifted copies is the shift:
 
     >>> import numpy as np
     >>> values = np.array([0.0, 1.0, 5.0])
@@ -88,7 +88,7 @@ def kolmogorov_smirnov(a: Values, b: Values) -> float:
 
     Examples
     --------
-    Half of the values are below all of the others:
+    Half of the first values are below all of the second:
 
     >>> import numpy as np
     >>> kolmogorov_smirnov(np.arange(4.0), np.arange(4.0) + 2)

@@ -9,7 +9,7 @@ pulse and ends while it still rises.  The paper's drift time ends at the maximum
 flat top depends on the noise and would smear the slices.
 
 The slices are bounded by quantiles of the rise times of the *data*.  Each method is sliced
-by its own rise times: a method with the wrong response has other events in a slice, and this
+by its own rise times: a method with the wrong response has different events in a slice, which
 counts against it.
 """
 
@@ -145,7 +145,7 @@ def superpulses(
 
 
 def sliced(aligned: FloatArray, rise_time: Values, edges: Values, before: int) -> Slices:
-    """As `superpulses`, of pulses as `align_half_maximum` returns them."""
+    """Same as `superpulses`, for pulses already aligned by `align_half_maximum`."""
     timed = np.isfinite(rise_time)
     inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
     place = np.searchsorted(edges[1:-1], rise_time, side="right")
@@ -174,7 +174,7 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
     Raises
     ------
     CpunetError
-        If the two were not sliced and cut out alike.
+        If the two differ in their slices or their window.
     """
     alike = np.array_equal(data.edges, method.edges) and data.before == method.before
     if not alike or data.pulses[0].mean.shape != method.pulses[0].mean.shape:
@@ -224,7 +224,7 @@ def slice_table(
     Raises
     ------
     CpunetError
-        If the datasets were not sliced and cut out alike.
+        If the datasets differ in their slices or their window.
     """
     data = sets["data"]
     return {

@@ -135,7 +135,7 @@ def _content(shown: Exploration) -> dict[str, Any]:
 
 
 def _methods(shown: Exploration) -> list[dict[str, Any]]:
-    """Rows of the legend: both sides, and as many measured pulses as there are neighbours."""
+    """Rows of the legend: simulation, translation, and one for each nearest measured pulse."""
     ranks = range(shown.nearest.index.shape[1] if shown.nearest else 0)
     data = method_looks(["data"])[0]
     return method_looks(["raw", "ren"]) + [

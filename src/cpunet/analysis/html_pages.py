@@ -59,7 +59,7 @@ def part(name: str, *values: Any, **named: Any) -> Markup:
 
 
 def joined(parts: Iterable[str]) -> Markup:
-    """Return pieces one below the other."""
+    """Join pieces of a page, one per line."""
     return Markup("\n").join(parts)
 
 
@@ -79,7 +79,7 @@ def figure_html(caption: str, figure: Figure, png: bytes | None = None) -> Marku
 
 
 def notebook_picture(figure: Figure) -> Markup:
-    """Return a figure as the content of a small image."""
+    """Return a figure as a small PNG in base64."""
     return _base64(figure_png(figure, NOTEBOOK_DPI))
 
 

@@ -1,8 +1,8 @@
-"""Places of the panels of a figure, with room for their labels.
+"""Positions of the panels of a figure, with room for their labels.
 
-matplotlib's constrained layout measures each panel several times, and each time makes all its
-ticks again, which takes longer than to draw it.  Here the labels of a panel are measured once;
-the places of panels in one grid then follow from sums.
+matplotlib's constrained layout measures each panel several times and creates all its ticks anew
+each time, which takes longer than drawing it.  Here the labels of a panel are measured once;
+the positions of panels in one grid then follow from sums.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class MeasuredLayout(ConstrainedLayoutEngine):
         x = _columns(fig, specs, rooms, fig.dpi * pads["w_pad"])
         y = _rows(fig, specs, rooms, fig.dpi * pads["h_pad"], top, bottom)
         if x is None or y is None:
-            super().execute(fig)  # which tells that there is no room
+            super().execute(fig)  # which warns that there is no room
             return
         for axes, spec in zip(panels, specs, strict=True):
             (left, right), (high, low) = (

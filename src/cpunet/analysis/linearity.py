@@ -13,8 +13,8 @@ scales it by its tail, so neither shift nor height is known.  The residual is
 with the shifts :math:`d` and the heights :math:`a, b` that minimise its sum of squares.  It
 is 0 for a linear response.  For any other it is a lower limit, since the free heights can
 absorb a part of the nonlinearity.  With heights in the ratio of :math:`w` and :math:`1 - w`
-(``shared``) they cannot; then the residual also contains that a pulse whose charge arrives
-later has decayed less, which is linear too: an upper limit.
+(``shared``) they cannot.  The residual is then an upper limit: it also contains the linear
+effect that a pulse whose charge arrives later has decayed less.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WEIGHTS = (0.2, 0.8)
 EDGE_SAMPLES = 100
 REACH = 32  # samples: largest shift of each part that is tried
 STEPS = 12  # maximum number of Gauss-Newton steps
-SMALLEST = 1e-7  # of a sample: the last step
+SMALLEST = 1e-7  # samples: a smaller step ends the fit
 
 
 class _Fit(NamedTuple):
@@ -108,8 +108,8 @@ def linearity_residual(
     Raises
     ------
     CpunetError
-        If there are fewer than 2 pulses, `pairs` is less than 1, or the translation has
-        another shape.
+        If there are fewer than 2 pulses, `pairs` is less than 1, or the translation differs in
+        shape.
     """
     if windows.ndim != 2 or len(windows) < 2 or pairs < 1:
         raise CpunetError(
@@ -208,7 +208,7 @@ def _matched(
 def _best_whole_moves(
     target: Values, one: Values, other: Values, inner: npt.NDArray[np.int64]
 ) -> Values:
-    """The best shifts of the parts in whole samples, of all within reach."""
+    """The best shifts of the parts in whole samples, among all up to `REACH`."""
     moves = np.arange(-REACH, REACH + 1)
     a, b = (pulse[inner - moves[:, np.newaxis]] for pulse in (one, other))
     aa, bb = (a * a).sum(axis=1)[:, np.newaxis], (b * b).sum(axis=1)[np.newaxis]

@@ -27,7 +27,7 @@ class MeanPulse(NamedTuple):
 
     @classmethod
     def of_aligned(cls, aligned: FloatArray, before: int) -> Self:
-        """Average pulses as `align_half_maximum` returns them."""
+        """Average pulses already aligned by `align_half_maximum`."""
         known = np.isfinite(aligned)
         count = known.sum(axis=0)
         total = np.where(known, aligned, 0).sum(axis=0, dtype=float)

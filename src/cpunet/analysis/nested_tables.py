@@ -16,8 +16,8 @@ ERRORS = ("_std", "_error")  # suffixes of the name of an error
 UNITS = {"ns": "ns", "kev": "keV", "percent": "%", "mm": "mm"}  # at the end of a key
 SPELT = {"auc": "AUC", "iou": "IoU", "rms": "RMS", "wasserstein": "W₁"}
 MAX_DIGITS = 9  # after the decimal point
-LONG = 12  # lists of this length or more are summarised
-BROAD = 6  # tables of this many columns or more are transposed if they have fewer rows
+LONG = 12  # longer lists are summarised
+BROAD = 6  # tables with more columns than this are transposed if they have fewer rows
 
 
 def html_table(
@@ -32,7 +32,7 @@ def html_table(
 def nested_html(value: Any, level: int = 4) -> Markup:
     """Return nested mappings, lists and values as tables under headings.
 
-    An error, of the same name with ``_std`` or ``_error``, is shown with its value.
+    An error, under the name of its value with ``_std`` or ``_error``, is shown with the value.
     ``missing`` with a text becomes a sentence.  Long lists are summarised; `metrics.json` has
     them in full.
 
@@ -95,7 +95,7 @@ def with_std(value: Any, error: Any) -> str:
 def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
     """Return mappings of values as one table: one row each, or one column each if shorter.
 
-    Rows with a reason why they are missing are told in a sentence.
+    Missing rows are listed in a sentence, with the reasons.
     """
     reasons: dict[str, list[str]] = {}
     for name, row in rows.items():
@@ -121,7 +121,7 @@ def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:
 
 
 def _rows_told(names: Sequence[str]) -> str:
-    """Names of rows one after the other, neighbouring numbers as ranges.
+    """Names of rows as a list, with consecutive numbers as ranges.
 
     Examples
     --------

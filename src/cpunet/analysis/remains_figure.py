@@ -20,7 +20,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 Values = npt.NDArray[np.float64]
 
 SHOWN = 12  # traces
-EMPTY = 0.5  # in errors: traces with smaller remains count as empty
+EMPTY = 0.5  # errors: traces with smaller remains count as empty
 SIGMA_PER_MAD = 1.4826
 
 
@@ -91,7 +91,7 @@ def remains_figure(raw: Pulses, remains: Remains) -> Figure:
 def sizes_figure(
     told: Mapping[str, Any], sizes: Mapping[str, Sequence[float]], energies_kev: Sequence[float]
 ) -> Figure:
-    """Distribution of the remains with the law, as a training keeps them.
+    """Distribution of the remains with the law, from the values stored with a training.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def sizes_figure(
     figure = Figure(figsize=(5.2, 3.4))
     axes = figure.subplots()
     kev = np.asarray(sizes["kev"], float)
-    # one-sided: a fraction of n traces is known to its binomial error
+    # binomial error of a fraction of n traces
     share, n = np.asarray(sizes["percent_above"], float) / 100, max(int(told["traces"]), 1)
     error = np.sqrt(share * (1 - share) / n)
     axes.fill_between(

@@ -38,7 +38,7 @@ from cpunet.analysis.report_tables import (
 from cpunet.pulses.parameters import PARAMETERS
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
-# where a figure stands, by the end of its name; all others are under Details
+# section of a figure by the end of its name; all others are under Details
 PLACES = {
     "A over E survival": "ae",
     "A over E and drift time": "ae_drift",
@@ -48,7 +48,7 @@ PLACES = {
     "noise": "noise",
     **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
 }
-MANY = 4  # number of figures from which they are collapsed
+MANY = 4  # a larger number of figures is collapsed
 
 SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
 
@@ -116,7 +116,7 @@ def write_report(
     notes
         Paragraphs of plain text for the top of the page.
     views
-        Data of the interactive charts from `views`: ``methods`` (see `views.method_looks`),
+        Data of the interactive charts from `chart_data`: ``methods`` (see its `method_looks`),
         ``distributions``, ``slices``, ``pulses``, ``scatter``; any of them can be missing.
         Without views the page has only its figures.
     """
@@ -171,7 +171,7 @@ def write_report(
 def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
     """Figures by their place on the page, see `PLACES`.
 
-    Mean pulses and noise are those of a few peaks, if possible not used in the training.
+    Mean pulses and noise are shown for a few peaks, preferably not that of the training.
     """
     names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
     for name in drawn:
@@ -201,7 +201,7 @@ def _views_html(
 ) -> Markup:
     """Elements in which the script draws, or the reason why it does not.
 
-    On paper the figures stand for them, if there are any.
+    In print the figures replace them, if there are any.
     """
     if not _drawn(views):
         return part("gap", "this report was written without the data of the interactive views")

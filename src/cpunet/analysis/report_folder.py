@@ -1,4 +1,4 @@
-"""The folder of a report: how it is known, and what in it is the program's own."""
+"""Report folders: how they are recognised, and which of their files the program owns."""
 
 from __future__ import annotations
 

@@ -71,11 +71,13 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
     for axes, (title, losses) in zip(panels, LOSS_PANELS.items(), strict=True):
         for name, (text, colour) in losses.items():
             series = np.array([record["losses"].get(name, np.nan) for record in records], float)
-            if np.isnan(series).all():
+            there = ~np.isnan(series)  # discriminators are not updated in every iteration
+            if not there.any():
                 continue
-            axes.plot(iteration, series, color=colour, alpha=0.25, linewidth=0.7)
+            at, series = iteration[there], series[there]
+            axes.plot(at, series, color=colour, alpha=0.25, linewidth=0.7)
             average = _moving_average(series, window)
-            axes.plot(iteration[len(iteration) - len(average) :], average, colour, label=text)
+            axes.plot(at[len(at) - len(average) :], average, colour, label=text)
         axes.set(title=title, xlabel="Iteration")
         if axes.lines:
             axes.legend()

@@ -68,8 +68,8 @@ class SideBySide:
     notes
         Reasons to doubt the comparison, one sentence each.
     compared
-        What the runs were made of: files, detector, period, quality of the fit; texts in the
-        order of the runs, by name.
+        Inputs and origin of the runs (files, detector, period, quality of the fit) by name;
+        texts in the order of the runs.
     """
 
     names: tuple[str, ...]
@@ -80,7 +80,7 @@ class SideBySide:
 
 
 def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide:
-    """Put the scores of several runs beside each other.
+    """Put the scores of several runs side by side.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     Raises
     ------
     CpunetError
-        If the datasets were not sliced and cut out alike.
+        If the datasets differ in their slices or their window.
     """
     data = sets["data"]
     n = len(data.pulses)

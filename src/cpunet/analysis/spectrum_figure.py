@@ -11,7 +11,7 @@ from cpunet.analysis.style import COLOURS, DATA_FILL, styled
 from cpunet.pulses.spectrum import SOURCES, Suggestion, Values
 
 BINS = 1000
-HIGHEST = 0.999  # quantile of the values up to which is drawn, and a little more
+HIGHEST = 0.999  # quantile of the values; the axis ends a little above it
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Spectrum:
     in_kev
         Whether they are energies.
     found
-        Lines found, with the calibration with which they have the right energies.
+        Lines found, and the calibration that gives them the right energies.
     """
 
     values: Values

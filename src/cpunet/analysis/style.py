@@ -16,7 +16,7 @@ COLOURS = {
     "ren": "#0072B2",
     "iren": "#CC79A7",
     "truth": "#009E73",
-    # the same on a whole page, although some of its figures leave one of them out
+    # fixed, so that a method has one colour in all figures of a page
     "rc": "#E69F00",
     "gauss_exp": "#56B4E9",
     "superpulse": "#7F7F7F",

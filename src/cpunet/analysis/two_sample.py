@@ -243,7 +243,7 @@ def _components(windows: Values) -> tuple[Values, Values]:
     from scipy.linalg import eigh
 
     centred = windows
-    centred -= np.median(windows, axis=0)  # in place: they are the caller's own, and many
+    centred -= np.median(windows, axis=0)  # in place: the array is the caller's own copy
     norms = np.linalg.norm(centred, axis=1, keepdims=True)
     # a few corrupted pulses must not determine the principal components
     limit = 3 * np.median(norms)

@@ -56,7 +56,7 @@ def packed(
     bits
         Size of the integers, 16 or 32.
     about_zero
-        Whether the offset is 0, so that it does not depend on the least of the values.
+        Whether the offset is 0, whatever the range of the values.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""One call in Python for each command, with objects to look at: arrays, histograms, figures.
+"""Python functions for the main commands; they return arrays, histograms and figures.
 
 Use them as `cpunet.train`, `cpunet.translate`, `cpunet.validate` and `cpunet.calibrate`.
 """

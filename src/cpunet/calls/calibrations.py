@@ -1,4 +1,4 @@
-"""`cpunet.calibrate`, and a calibrated run to look at."""
+"""`cpunet.calibrate`, and the calibrated run that it returns."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class CalibratedRun(Run):
     Parameters
     ----------
     content
-        Of ``calibration.json``.
+        Content of ``calibration.json``.
     """
 
     content: Mapping[str, Any] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class CalibratedRun(Run):
         Raises
         ------
         CpunetError
-            If it is none.
+            If the folder is not a calibrated run.
         """
         folder = Path(folder)
         info = read_info(folder)
@@ -74,7 +74,7 @@ class CalibratedRun(Run):
 
     @property
     def sim(self) -> Path:
-        """All events simulated again with these physics."""
+        """File of all events, simulated again with the calibrated physics."""
         return self.folder / SIM
 
     @cached_property
@@ -89,7 +89,7 @@ class CalibratedRun(Run):
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """``pulls``, and if something was free, ``profiles`` and ``directions``."""
+        """``pulls``; ``profiles`` and ``directions``, if any parameter was free."""
         found = {"pulls": pulls_figure(self.content)}
         if self.content["profiles"]:
             found["profiles"] = profiles_figure(self.content)
@@ -130,47 +130,48 @@ def calibrate(
     force: bool = False,
     progress: bool | Monitor = True,
 ) -> CalibratedRun:
-    """Fit detector and readout together, and train on the simulation that follows.
+    """Fit detector and readout together, and train on the resulting simulation.
 
     Parameters
     ----------
     sim
         Pulses of ``cpunet simulate`` or ``cpunet stand``, with their hits; or
-        `cpunet.HitFile`, hits that are simulated first, with the `detector` they lie in.
+        `cpunet.HitFile`, hits that are simulated first, in the given `detector`.
     data
         Measured pulses.
     out
         Folder of the run.
     detector, settings
-        To simulate with; those of `sim` by default.
+        Detector and settings of the simulation; those of `sim` by default.
     free
-        Parameters, as ``["temperature", "impurity"]``; None for those that the data tell.
+        Free parameters, such as ``["temperature", "impurity"]``; None for those that the data
+        determine.
     fixed
         Parameters that stay as simulated.
     priors
-        Value and error by name, as ``{"depletion_voltage": (2100, 50)}``.
+        Value and error by name, such as ``{"depletion_voltage": (2100, 50)}``.
     peak
-        Energies to calibrate on.
+        Peak, or ranges of energy, to calibrate on.
     recipe
-        ``"fast"`` or ``"best"``, a YAML file, or a recipe itself.
+        ``"fast"`` or ``"best"``, a YAML file, or a `Recipe`.
     events
-        Simulated events, at most, that are drifted again and again.
+        Maximum number of simulated events that are drifted repeatedly.
     seed
         Seed of all random numbers.
     force
-        Replace what this program wrote there.
+        Whether to replace an output that this program wrote earlier.
     progress
-        Bars in a notebook or on a terminal; or a monitor of your own.
+        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
     CalibratedRun
-        The run, with the physics that were found.
+        The run, with the calibrated physics.
 
     Raises
     ------
     CpunetError
-        If something that is given cannot be used, or the data are of another detector.
+        If an argument cannot be used, or the data are of another detector.
     """
     monitor = shown(progress)
     known = detector if isinstance(detector, Detector | None) else read_detector(str(detector))

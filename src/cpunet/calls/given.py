@@ -1,4 +1,4 @@
-"""What is given to a call: files by name or with how they are read, recipes, runs."""
+"""Arguments of the calls: input files with their reading options, and recipes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ File: TypeAlias = str | Path | InputFile
 
 
 def as_input(file: File, name: str) -> InputFile:
-    """A file of pulses and how it is read.
+    """Return a file of pulses with its reading options.
 
     Raises
     ------
@@ -25,7 +25,7 @@ def as_input(file: File, name: str) -> InputFile:
         If it is neither a path nor an `InputFile`.
     """
     if isinstance(file, InputFile):
-        return replace(file, path=Path(file.path))  # in a notebook it may be text
+        return replace(file, path=Path(file.path))  # users may give text
     if isinstance(file, str | Path):
         return InputFile(Path(file))
     raise CpunetError(
@@ -35,7 +35,7 @@ def as_input(file: File, name: str) -> InputFile:
 
 
 def as_recipe(recipe: str | Path | Recipe, settings: Mapping[str, Any] | None) -> Recipe:
-    """A recipe by name, file or as it is, with single values of it overridden.
+    """Return a recipe, read by name or from a file with single values overridden, or as given.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How far a call is: bars in a notebook or on a terminal, and log records elsewhere."""
+"""Progress of a call: bars in a notebook or on a terminal, and log records elsewhere."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from cpunet.analysis.html_pages import part
 from cpunet.jobs.common.monitor import Advance, Monitor
 
 LOGGER = logging.getLogger("cpunet")
-WARNING = "warning: "  # beginning of a note that is one
-REDRAWN_S = 0.2  # between two pictures of a bar
+WARNING = "warning: "  # start of a note that is a warning
+REDRAWN_S = 0.2  # between two updates of a bar
 
 
 class LoggingMonitor(Monitor):
     """Notes as records of the logger ``cpunet``; no bars."""
 
     def note(self, message: str) -> None:
-        """Log a note: warnings as such, all else for those who ask for it."""
+        """Log a warning at level WARNING, any other note at level INFO."""
         if message.startswith(WARNING):
             LOGGER.warning(message.removeprefix(WARNING))
         else:
@@ -100,7 +100,7 @@ class NotebookMonitor(Monitor):
     Parameters
     ----------
     display
-        ``IPython.display.display``, or what stands for it.
+        ``IPython.display.display``, or a substitute.
     """
 
     def __init__(self, display: Callable[..., Any]) -> None:
@@ -108,7 +108,7 @@ class NotebookMonitor(Monitor):
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Show a bar, which stays when the stage is over."""
+        """Show a bar, which stays after the stage."""
         bar, start = Bar(title, total), time.monotonic()
         handle, drawn = self._display(bar, display_id=True), start
 
@@ -133,7 +133,7 @@ class NotebookMonitor(Monitor):
 
 
 class NotesKept(Monitor):
-    """Pass everything on, and keep the notes."""
+    """Pass stages and notes on to another monitor, and keep the notes."""
 
     def __init__(self, passed_to: Monitor) -> None:
         self._passed_to = passed_to
@@ -152,13 +152,13 @@ class NotesKept(Monitor):
 
 
 def shown(progress: bool | Monitor) -> NotesKept:
-    """What shows the progress of a call.
+    """Return the monitor that shows the progress of a call and keeps its notes.
 
     Parameters
     ----------
     progress
         True for bars in a notebook or on a terminal; False for log records only; or
-        a monitor of the user's.
+        a monitor to use instead.
     """
     if isinstance(progress, Monitor):
         return NotesKept(progress)

@@ -1,4 +1,4 @@
-"""`cpunet.validate`, and a report to look at."""
+"""`cpunet.validate`, and the report that it returns."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _HISTOGRAMS = "histograms"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """How well a run translates: what `cpunet.validate` gives.
+    """Scores of a run, as returned by `cpunet.validate`.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class Report:
     values
         Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
     folder
-        Of the report; None if none was written.
+        Folder of the report; None if none was written.
     notes
         Notes of the job.
     drawn
-        What the figures are drawn of, by name.
+        Data of the figures, by name.
     """
 
     metrics: Mapping[str, Any]
@@ -60,12 +60,12 @@ class Report:
 
     @classmethod
     def load(cls, folder: str | Path) -> Report:
-        """Open a report's folder; `values` are those that its histograms are drawn of.
+        """Open the folder of a report; `values` are those of its histograms.
 
         Raises
         ------
         CpunetError
-            If it is none, or cannot be read.
+            If the folder is not a report, or cannot be read.
         """
         file = Path(folder) / METRICS
         try:
@@ -88,9 +88,9 @@ class Report:
 
     @property
     def scores(self) -> list[dict[str, Any]]:
-        """One row for each peak, parameter and method, as `pandas.DataFrame` takes them.
+        """One row per peak, parameter and method, ready for `pandas.DataFrame`.
 
-        ``iou`` is the overlap with data in percent, ``ceiling`` what data score against data.
+        ``iou`` is the overlap with data in percent, ``ceiling`` that of data with data.
         """
         rows = []
         for peak, of_peak in self.metrics["peaks"].items():
@@ -107,12 +107,12 @@ class Report:
 
     @property
     def verdicts(self) -> list[str]:
-        """What is said of the translation, peak by peak, in words."""
+        """Verdicts on the translation in words, peak by peak."""
         return list(self.metrics["verdicts"]["summary"])
 
     @property
     def figures(self) -> Mapping[str, Figure]:
-        """Figures by name, each drawn when it is asked for."""
+        """Figures by name, drawn on every access."""
         return WhenAsked({name: partial(_draw, one) for name, one in self.drawn.items()})
 
     def hist(
@@ -181,23 +181,23 @@ def validate(
     run
         A trained run or its folder.
     sim, data
-        Simulated and measured pulses: a path, or `cpunet.InputFile` to say how it is read.
+        Simulated and measured pulses: a path, or `cpunet.InputFile` with reading options.
     out
         Folder for ``report.html`` and figures; None to write nothing.
     truth
         Noise-free responses of the simulated pulses, if they are known (``truth.npz``).
     rivals
-        Fit what one would use instead, too.
+        Whether to fit the baseline methods, too.
     seed
-        Of noise and bootstraps.
+        Seed of noise and bootstraps.
     ae_range_kev
-        More energies to read on both sides, for A/E against energy: such as (900, 2350).
+        Further energies to read on both sides for A/E against energy, such as (900, 2350).
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     force
-        Replace what this program wrote there.
+        Whether to replace an output that this program wrote earlier.
     progress
-        Bars in a notebook or on a terminal; or a monitor of your own.
+        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def validate(
     Raises
     ------
     CpunetError
-        If something that is given cannot be used, or no peak can be scored.
+        If an argument cannot be used, or no peak can be scored.
     """
     monitor = shown(progress)
     found, drawn = validated(

@@ -1,4 +1,4 @@
-"""`cpunet.train`, and a trained run to look at."""
+"""`cpunet.train`, and the trained run that it returns."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
-    """A training run: what `cpunet.train` gives, and `Run.load` reads from its folder.
+    """A training run, returned by `cpunet.train` or opened with `Run.load`.
 
     Parameters
     ----------
     folder
-        Of the run.
+        Folder of the run.
     info
         The content of its ``run.json``.
     notes
-        What the training told.
+        Notes of the training.
     """
 
     folder: Path
@@ -57,18 +57,18 @@ class Run:
         Raises
         ------
         CpunetError
-            If it is none.
+            If the folder is not a run.
         """
         return cls(Path(folder), read_info(Path(folder)))
 
     @cached_property
     def ren(self) -> REN:
-        """Simulated pulses → measured-like ones."""
+        """Translator from simulated to measured-like pulses."""
         return REN.load(self.folder)
 
     @cached_property
     def iren(self) -> IREN:
-        """Measured pulses → simulation-like ones."""
+        """Translator from measured to simulation-like pulses."""
         return IREN.load(self.folder)
 
     @cached_property
@@ -83,7 +83,7 @@ class Run:
 
     @property
     def chi_square_per_moment(self) -> float | None:
-        """Of a fitted chain; well above 1, something other than the readout differs."""
+        """Fit quality of a readout chain; well above 1 if more than the readout differs."""
         fit = self.info.get("fit") or {}
         if not fit.get("moments"):
             return None
@@ -91,7 +91,7 @@ class Run:
 
     @cached_property
     def losses(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Losses by name, and ``"iteration"``: arrays of shape (iterations,)."""
+        """Losses by name, and ``"iteration"``: arrays of shape (records,)."""
         records: list[Any] = read_losses(self.folder)
         names = list(dict.fromkeys(name for record in records for name in record["losses"]))
         found = {"iteration": np.array([float(record["iteration"]) for record in records])}
@@ -102,12 +102,12 @@ class Run:
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """The readout chain in terms of physics, the unit at the end of each name.
+        """Physical parameters of the readout chain; each name ends with the unit.
 
         Raises
         ------
         CpunetError
-            If the run is no readout chain.
+            If the run is not a readout chain.
         """
         told = describe_responses([self.folder])["runs"][0]
         return {name: float(value) for name, value in told["values"].items()}
@@ -118,7 +118,7 @@ class Run:
         Raises
         ------
         CpunetError
-            If the run has kept none.
+            If the run contains no losses.
         """
         records = read_losses(self.folder)
         if not records:
@@ -131,14 +131,14 @@ class Run:
         Raises
         ------
         CpunetError
-            If the run is no readout chain.
+            If the run is not a readout chain.
         """
         chain = chain_of(self.folder)
         tail_ns = self.recipe.preparation.samples_after * self.dt_ns
         return response_figure([chain], tail_ns=tail_ns)
 
     def translate(self, pulses: Any, out: str | Path | None = None, **how: Any) -> Translation:
-        """As `cpunet.translate` of this run."""
+        """Translate with this run, see `cpunet.translate`."""
         from cpunet.calls.translations import translate
 
         return translate(self, pulses, out, **how)
@@ -146,7 +146,7 @@ class Run:
     def validate(
         self, sim: File, data: File, out: str | Path | None = None, **how: Any
     ) -> Report:
-        """As `cpunet.validate` of this run."""
+        """Validate this run, see `cpunet.validate`."""
         from cpunet.calls.reports import validate
 
         return validate(self, sim, data, out, **how)
@@ -204,14 +204,14 @@ def train(
     Parameters
     ----------
     sim, data
-        Simulated and measured pulses: a path, or `cpunet.InputFile` to say how it is read.
+        Simulated and measured pulses: a path, or `cpunet.InputFile` with reading options.
     out
         Folder of the run; it appears when the training is done.
     recipe
         ``"fast"`` (a readout chain), ``"best"``, ``"paper"``, ``"small"``, a YAML file, or a
-        recipe itself.
+        `Recipe`.
     settings
-        Single values of a recipe given by name, as ``{"training.steps": 20}``.
+        Values that override those of a named recipe, such as ``{"training.steps": 20}``.
     peak
         Energies to train on: a line, or ranges in keV, such as ``"FEP,1000-1580"``.
     seed
@@ -221,11 +221,11 @@ def train(
     init
         A run of another detector or period to start from.
     resume
-        Resume an unfinished training of a network.
+        Whether to resume an unfinished training of a network.
     force
-        Replace what this program wrote there.
+        Whether to replace an output that this program wrote earlier.
     progress
-        Bars in a notebook or on a terminal; or a monitor of your own.
+        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -235,7 +235,7 @@ def train(
     Raises
     ------
     CpunetError
-        If something that is given cannot be used: one line that says what to do.
+        If an argument cannot be used; the message is one line that says what to do.
     """
     monitor = shown(progress)
     start = init.folder if isinstance(init, Run) else init

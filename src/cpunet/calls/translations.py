@@ -1,4 +1,4 @@
-"""`cpunet.translate`, and translated pulses to look at."""
+"""`cpunet.translate`, and the translated pulses that it returns."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ DRAWN = 50  # pulses in a figure
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Translation:
-    """Translated pulses, row by row those that were given.
+    """Translated pulses, in the order of the input.
 
     Parameters
     ----------
     run
         Folder of the run that translated them.
     counts
-        ``read``, ``translated``, ``rejections`` by reason, in ADC ``saturated``.
+        Row counts: ``read``, ``translated``, ``rejections`` by reason; ``saturated`` in ADC.
     recipe
-        Of the run.
+        Recipe of the run.
     adc
-        Whether these are raw traces in ADC counts; else normalised windows.
+        Whether the pulses are raw traces in ADC counts instead of normalised windows.
     path
         The file they were written to; None if they are in memory only.
     notes
@@ -69,12 +69,12 @@ class Translation:
 
     @cached_property
     def pulses(self) -> Pulses:
-        """All pulses; of a file, read when first asked for."""
+        """All pulses; those in a file are read on first access."""
         return self.kept[0] if self.kept else open_pulses(self._file()).read()
 
     @cached_property
     def codes(self) -> Codes:
-        """A `cpunet.pulses.preparation.Rejection` for each row; 0 is a translated pulse."""
+        """`cpunet.pulses.preparation.Rejection` code of each row; 0 for a translated pulse."""
         if self.kept:
             return self.kept[1]
         column = open_pulses(self._file()).columns["rejection"]
@@ -87,7 +87,7 @@ class Translation:
 
     @property
     def rejections(self) -> dict[str, int]:
-        """How many rows hold none, by reason."""
+        """Number of rows without a pulse, by reason."""
         return dict(self.counts["rejections"])
 
     @cached_property
@@ -97,7 +97,7 @@ class Translation:
         Raises
         ------
         CpunetError
-            Of raw traces, which have to be prepared first.
+            If these are raw traces, which must be prepared first.
         """
         if self.adc:
             raise CpunetError(
@@ -123,7 +123,7 @@ class Translation:
 
     @styled
     def figure(self, n: int = DRAWN) -> Figure:
-        """The first translated pulses, drawn over each other."""
+        """Draw the first `n` translated pulses over each other."""
         rows = np.flatnonzero(self.valid)[:n]
         figure = Figure(figsize=(6.4, 3.2))
         axes = figure.subplots()
@@ -186,17 +186,18 @@ def translate(
     run
         A trained run or its folder.
     pulses
-        A file, streamed if there is an `out`; or pulses in memory.
+        A file, which is streamed if `out` is given; or pulses in memory.
     out
         LH5 file to write, with all columns of the source; None to stay in memory.
     inverse
-        Measured → simulation-like.
+        Whether to translate measured to simulation-like pulses.
     noise, seed
-        Add noise, drawn with this seed.  Memory and file have the same noise.
+        Whether to add noise, and its seed.  The noise is the same in memory and in a file.
     adc
-        Raw traces in ADC counts, as a digitiser writes them: True, or `Adc` with its settings.
+        Whether to make raw traces in ADC counts, like those of a digitiser; or `Adc` with its
+        settings.
     remains
-        Of earlier pulses: ``"learned"``, ``"none"``, or a rate in kHz.
+        Remains of earlier pulses: ``"learned"``, ``"none"``, or a rate in kHz.
     pile_up_khz
         Rate in kHz of second pulses within a trace.
     realisations
@@ -204,11 +205,11 @@ def translate(
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     resume
-        Leave a file as it is that was made in just this way.
+        Whether to keep an existing file that was made from this input, run and options.
     force
-        Replace what this program wrote there.
+        Whether to replace an existing file.
     progress
-        Bars in a notebook or on a terminal; or a monitor of your own.
+        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -218,7 +219,7 @@ def translate(
     Raises
     ------
     CpunetError
-        If something that is given cannot be used, or no pulse can be translated.
+        If an argument cannot be used, or no pulse can be translated.
     """
     wanted = (Adc() if adc else None) if isinstance(adc, bool) else adc
     options = TranslateOptions(
@@ -298,7 +299,7 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
     Raises
     ------
     CpunetError
-        If there is none, with those there are.
+        If there is no such value; the message lists the known names.
     """
     if name not in values:
         raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")
