@@ -14,6 +14,7 @@ from cpunet.calls import progress
 from cpunet.calls.progress import (
     LoggingMonitor,
     NotebookMonitor,
+    NotesKept,
     TerminalMonitor,
     notebook_display,
     shown,
@@ -75,6 +76,25 @@ def test_notes_are_kept_and_logged(caplog):
     assert monitor.notes == ["warning: few pulses", "fit: good"]
     told = [(record.levelname, record.message) for record in caplog.records]
     assert told == [("WARNING", "few pulses"), ("INFO", "fit: good")]
+
+
+def test_a_monitor_of_the_user_hears_all():
+    class Heard(Monitor):
+        def __init__(self) -> None:
+            self.texts: list[str] = []
+
+        def state(self, text: str) -> None:
+            self.texts.append(text)
+
+        def note(self, message: str) -> None:
+            self.texts.append(message)
+
+    heard = Heard()
+    kept = NotesKept(heard)
+    kept.state("chi-square 1.1")
+    kept.note("a remark")
+    assert heard.texts == ["chi-square 1.1", "a remark"]
+    assert kept.notes == ["a remark"]
 
 
 def test_what_is_chosen(monkeypatch):

@@ -145,6 +145,10 @@ class NotesKept(Monitor):
         with self._passed_to.stage(title, total) as advance:
             yield advance
 
+    def state(self, text: str) -> None:
+        """Pass on the text beside the progress."""
+        self._passed_to.state(text)
+
     def note(self, message: str) -> None:
         """Keep a note, and pass it on."""
         self.notes.append(message)
