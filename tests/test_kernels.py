@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -160,3 +161,36 @@ def test_code_is_never_kept_where_others_can_write(
     assert code_folder(shared / "mine") == shared / "mine"
     own.chmod(0o777)
     assert code_folder(shared) is None
+
+
+PARALLEL = """
+from numba import prange
+from cpunet.kernels import kernel
+
+@kernel(parallel=True)
+def loop(x):
+    for i in prange(2):
+        x += i
+    return x
+"""
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        pytest.param("import torch; print(torch.get_num_threads())", id="torch-first"),
+        pytest.param("print(1)", id="numba-first"),
+    ],
+)
+def test_a_parallel_loop_leaves_torch_its_threads(tmp_path, begin):
+    (tmp_path / "loop.py").write_text(PARALLEL)
+    program = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{begin}\n"
+        "import numba\nfrom loop import loop\nloop(3)\n"
+        "import torch\nprint(numba.get_num_threads(), torch.get_num_threads())"
+    )
+    given = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "4"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given
+    )
+    assert done.stdout.split() == ["1", "4", "1"]

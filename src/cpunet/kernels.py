@@ -14,18 +14,20 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import pickle
 import re
 import sys
 import time
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar, overload
 
 import numba
 import platformdirs
+import threadpoolctl
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from cpunet.errors import CpunetError
@@ -58,8 +60,44 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # cache; their last bits differ.  Inlined into the caller there is only one version.
         options.setdefault("forceinline", True)
     compiled = numba.njit(nogil=True, **options)(function)
-    compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
+    cache = _Cache(function, parallel=bool(options.get("parallel")))
+    compiled._cache = cache  # noqa: SLF001  numba has no public way
     return compiled
+
+
+@functools.cache
+def start_threads() -> None:
+    """Start numba's threads; OpenMP, which torch uses as well, keeps its number of threads.
+
+    numba starts them with the first parallel loop and then sets OpenMP's number for the whole
+    process: torch would from then on use other threads than it was told, and the last bits of
+    a network depend on their number.
+    """
+    with suppress(ImportError):  # another threading layer
+        importlib.import_module("numba.np.ufunc.omppool")  # loads OpenMP: it has a number now
+    with threadpoolctl.ThreadpoolController().select(user_api="openmp").limit(limits=None):
+        numba.get_num_threads()
+
+
+def use_threads(count: int) -> None:
+    """Have torch use so many threads, and parallel loops no more than that."""
+    import torch  # seconds, which compiled loops alone do not need
+
+    torch.set_num_threads(count)
+    start_threads()
+    numba.set_num_threads(min(count, numba.get_num_threads()))
+
+
+@contextmanager
+def at_most_threads(count: int) -> Iterator[None]:
+    """Let parallel loops that this thread calls use no more than so many threads."""
+    start_threads()
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(before, count))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 @functools.cache
@@ -158,8 +196,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     _cache_path: str
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], *, parallel: bool) -> None:
         super().__init__(function)
+        self._parallel = parallel
         self._claim: IO[str] | None = None
         folder = code_folder(Path(self._cache_path))
         if folder is None:
@@ -175,6 +214,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
         If another process is compiling the function, wait for its code.
         """
+        if self._parallel:
+            start_threads()  # before numba does so itself when it loads or compiles the loop
         found = super().load_overload(sig, target_context)
         if found is None and self._enabled:
             self._claim = _claimed(Path(self._cache_path) / f"{self._impl.filename_base}.lock")

@@ -61,18 +61,17 @@ def train(
 
     Example: torchrun --nproc-per-node 4 --no-python cpunet train --recipe paper … --out run
     """
-    import torch
-
     from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.training.train import train_run
     from cpunet.jobs.training.train_channels import train_channels
     from cpunet.jobs.training.training_job import TrainOptions
+    from cpunet.kernels import use_threads
     from cpunet.training.loop import StoppedError
     from cpunet.training.process_group import ToldElsewhereError, launch
 
     refuse_inputs(out_folder, on.recipe)
     if threads is not None:
-        torch.set_num_threads(threads)
+        use_threads(threads)
     shown = monitor()
     launched = launch()
     try:

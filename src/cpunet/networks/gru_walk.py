@@ -12,17 +12,14 @@ in torch's notation, where the update gate `u` keeps the old state.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numba import prange
 from torch import Tensor, nn
 
-from cpunet.kernels import kernel
+from cpunet.kernels import at_most_threads, kernel
 
 _DIRECTIONS = ("", "_reverse")
 _TANH_IS_1 = np.float32(10.0)  # beyond it, tanh is 1 in float32
@@ -69,7 +66,7 @@ class _Walk(torch.autograd.Function):
         steps, batch, width = gates.shape
         states = gates.new_empty(steps, batch, width // 3)
         kept = gates.new_empty(2, steps, batch, 2 * width // 3)
-        with _threads_of_torch():
+        with at_most_threads(torch.get_num_threads()):
             _forth(*_arrays(gates, kernel, bias, states, kept))
         ctx.save_for_backward(states, kept, kernel)
         return states
@@ -81,7 +78,7 @@ class _Walk(torch.autograd.Function):
         steps, batch, width = states.shape
         by_gates = states.new_empty(steps, batch, 3 * width)
         back = kernel.transpose(1, 2)
-        with _threads_of_torch():
+        with at_most_threads(torch.get_num_threads()):
             _back(*_arrays(slope, back, states, kept, by_gates))
         if not any(ctx.needs_input_grad[1:]):
             return by_gates, None, None
@@ -98,17 +95,6 @@ class _Walk(torch.autograd.Function):
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
-
-
-@contextmanager
-def _threads_of_torch() -> Iterator[None]:
-    """Use no more threads in compiled loops than torch does."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(before, torch.get_num_threads()))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
 
 
 @kernel(inline="always")
