@@ -55,6 +55,19 @@ def test_a_process_that_waits_for_ever_is_given_up(
         assert not list(file)
 
 
+def test_killed_by_the_system_says_nothing_about_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for lack of memory."""
+    path = tmp_path / "whole.lh5"
+    h5py.File(path, "w").close()
+    monkeypatch.setattr(
+        file_probe, "_look_through", lambda _of: os.kill(os.getpid(), signal.SIGKILL)
+    )
+    with opened(path) as file:
+        assert not list(file)
+
+
 def test_a_file_is_looked_through_again_if_it_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -68,8 +68,9 @@ def _fate(path: str, kind: Kind, _facts: tuple[int, ...]) -> str:
         return "" if os.waitstatus_to_exitcode(status) == 0 else _FAILS
     if os.WTERMSIG(status) == signal.SIGALRM:  # timed out without a result for the file
         return ""
-    hung = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
-    return "runs for ever" if hung else "crashes"
+    if os.WTERMSIG(status) == signal.SIGKILL:  # by the system, as for lack of memory
+        return ""
+    return "runs for ever" if os.WTERMSIG(status) == signal.SIGXCPU else "crashes"
 
 
 def _look_through_and_exit(path: str, kind: Kind) -> None:
@@ -81,6 +82,7 @@ def _look_through_and_exit(path: str, kind: Kind) -> None:
         faulthandler.disable()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGXCPU, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())
         signal.setitimer(signal.ITIMER_REAL, MAX_WAIT_S)
         resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

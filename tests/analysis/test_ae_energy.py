@@ -55,6 +55,18 @@ def test_the_line_through_the_continuum() -> None:
     np.testing.assert_allclose(np.mean(widths, axis=0), expected, rtol=0.08)
 
 
+def test_a_wide_line_is_no_continuum() -> None:
+    rng = np.random.default_rng(1)
+    wide = {"DEP": (1560.0, 1625.0)}
+    lines = joined(
+        events(rng.uniform(*wide["DEP"], 600), 0.1, rng),
+        events(rng.uniform(1000, 1500, 3000), 0.4, rng),
+    )
+    found = against_energy({"data": lines[0]}, {"data": lines[1]}, wide)
+    points = found["methods"]["data"]["points"]
+    assert wide["DEP"] in [(p["low_kev"], p["high_kev"]) for p in points]
+
+
 def test_lines_of_many_sites_are_fitted_about_the_single_ones() -> None:
     rng = np.random.default_rng(1)
     shares = {1587.5: 0.1, 2098.5: 0.85, 2609.5: 0.8}

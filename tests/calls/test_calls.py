@@ -153,6 +153,10 @@ def test_a_report(home, report):
     assert "FEP" in report.values
     data = report.values["FEP"]["data"]["current_amplitude"]
     histogram = report.hist("FEP")
+    scored = report.metrics["peaks"]["FEP"]["parameters"]["current_amplitude"]["axis"]
+    assert histogram.axes[1].size == scored["bins"]
+    assert histogram.axes[1].edges[[0, -1]].tolist() == [scored["low"], scored["high"]]
+    assert report.hist("FEP", max_bins=3).axes[1].size == 3
     assert list(histogram.axes["method"]) == [
         m for m, v in report.values["FEP"].items() if "current_amplitude" in v
     ]

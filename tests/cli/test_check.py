@@ -65,6 +65,12 @@ def first(outcome: Any) -> str:
     return next(line for line in outcome.out.splitlines() if not line.startswith("ok"))
 
 
+def test_lines_within_a_range_are_no_test(sides, check):
+    done = check(sides.write_sim(), sides.write_data(), "--peak", "1000-")
+    assert done.code == 0
+    assert "FEP, SEP, DEP are in the range trained on, and no test of it any more" in done.out
+
+
 def test_sides_that_fit(sides, check):
     picture = sides.folder / "check.png"
     done = check(sides.write_sim(), sides.write_data(), "--out", picture)

@@ -100,9 +100,9 @@ def against_energy(
         If the arrays of a method differ in length.
     """
     bands = energy_bands(lines_kev)
-    off = [(low - BESIDE_KEV, high + BESIDE_KEV) for low, high in lines_kev.values()]
+    lines = list(lines_kev.values())
     points = {
-        method: _points(values, energy_kev[method], bands, off)
+        method: _points(values, energy_kev[method], bands, lines)
         for method, values in amplitude.items()
     }
     common = _common(points)
@@ -110,7 +110,7 @@ def against_energy(
     if multi_site:
         bands += [span for span in lines_kev.values() if span not in bands]
         points = {
-            method: _points(values, energy_kev[method], bands, off)
+            method: _points(values, energy_kev[method], bands, lines)
             for method, values in amplitude.items()
         }
         common = _common(points)
@@ -172,20 +172,20 @@ def site_fit(
 
 
 def _points(
-    amplitude: Values, energy_kev: Values, bands: Sequence[Range], off: Sequence[Range]
+    amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
 ) -> list[SiteFit]:
     if amplitude.shape != energy_kev.shape:
         raise CpunetError(
             f"{len(amplitude)} amplitudes beside {len(energy_kev)} energies; give one for each"
         )
     beside = np.ones(len(energy_kev), bool)
-    for low, high in off:
-        beside &= (energy_kev < low) | (energy_kev >= high)
+    for low, high in lines:
+        beside &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
     found = []
     about = None
     for low, high in bands:  # the double-escape peak first, if there is one
         inside = (energy_kev >= low) & (energy_kev < high)
-        if high - low >= WIDTH_KEV:  # a range of the continuum
+        if (low, high) not in lines:
             inside &= beside
         fitted = site_fit(amplitude[inside], about)
         if fitted is not None:

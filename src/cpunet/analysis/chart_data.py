@@ -243,7 +243,7 @@ def _peak_distributions(
             found[name] = info | {"missing": "no measured pulse has a value"}
             continue
         comparison = comparisons.get(name, {})
-        axis = _binning(data, comparison.get("axis", {}), max_bins)
+        axis = scored_axis(data, comparison.get("axis", {}), max_bins)
         counts = {
             method: histogram(np.asarray(values[name], dtype=float), axis).astype(int).tolist()
             for method, values in methods.items()
@@ -259,8 +259,8 @@ def _peak_distributions(
     return found
 
 
-def _binning(data: Values, axis: Mapping[str, Any], max_bins: int) -> hist.axis.Regular:
-    """Return the bins of the comparison, or else those of `comparisons.data_axis`."""
+def scored_axis(data: Values, axis: Mapping[str, Any], max_bins: int) -> hist.axis.Regular:
+    """Return the bins of a comparison's ``axis``, or those of `comparisons.data_axis`."""
     if axis.get("bins"):
         return hist.axis.Regular(int(axis["bins"]), axis["low"], axis["high"])
     return data_axis(data, max_bins)

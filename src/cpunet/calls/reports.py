@@ -12,6 +12,7 @@ import hist
 import numpy as np
 from matplotlib.figure import Figure
 
+from cpunet.analysis.chart_data import scored_axis
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS
@@ -116,9 +117,19 @@ class Report:
         return WhenAsked({name: partial(_draw, one) for name, one in self.drawn.items()})
 
     def hist(
-        self, peak: str, parameter: str = "current_amplitude", max_bins: int = MAX_BINS
+        self,
+        peak: str,
+        parameter: str = "current_amplitude",
+        max_bins: int | None = None,
     ) -> hist.Hist[Any]:
-        """Distributions of a parameter by method, in the bins in which they are scored.
+        """Distributions of a parameter by method.
+
+        Parameters
+        ----------
+        peak, parameter
+            Names of both.
+        max_bins
+            Maximum number of bins; None for the bins in which the parameter is scored.
 
         Returns
         -------
@@ -134,7 +145,13 @@ class Report:
         data = named(of_peak["data"], parameter, "parameter")
         there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
         methods = hist.axis.StrCategory(list(there), name="method")
-        axis = named_axis(data_axis(data, max_bins), parameter)
+        compared = self.metrics["peaks"][peak]["parameters"].get(parameter, {})
+        axis = (
+            scored_axis(data, compared.get("axis", {}), MAX_BINS)
+            if max_bins is None
+            else data_axis(data, max_bins)
+        )
+        axis = named_axis(axis, parameter)
         made: hist.Hist[Any] = hist.Hist(methods, axis)
         for method, values in there.items():
             made.fill(method, values[np.isfinite(values)])

@@ -197,18 +197,20 @@ def _refusal(side: str, message: str) -> Finding:
 
 def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
     """Check the conditions without which a training raises an error."""
-    asked: tuple[tuple[str, Callable[[], object]], ...] = (
+    asked: tuple[tuple[str, Callable[[], list[str] | None]], ...] = (
         ("sampling", lambda: require_same_sampling(sim, data)),
         ("energies", lambda: require_both_sides(sim, data, selection)),
     )
     for what, require in asked:
         try:
-            require()
+            notes = require()
         except CpunetError as error:
             yield replace(_refusal("", str(error)), what=what)
         else:
             if what == "sampling":
                 yield Finding(what, Level.FINE, f"every {data.dt_ns:g} ns")
+            for note in notes or ():
+                yield Finding(what, Level.WARNING, note.removeprefix("warning: "))
 
 
 def _count(one: InputSet, side: str) -> Finding:
