@@ -79,6 +79,15 @@ def test_statistics_are_plain_averages_over_the_batches():
         torch.testing.assert_close(norm.running_var, expected)
 
 
+def test_statistics_are_those_without_dropout():
+    pulses = torch.randn(40, 1, 50, generator=torch.Generator().manual_seed(0)) + 5
+    network = nn.Sequential(nn.Dropout(0.5), nn.BatchNorm1d(1)).eval()
+    refresh_batch_statistics(network, EpochSampler(pulses, 40, seed=3), 1)
+    torch.testing.assert_close(network[1].running_var, pulses.var().reshape(1))
+    assert network[0].p == 0.5
+    assert network(pulses).std().item() == pytest.approx(1, rel=1e-3)
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_all_else_is_left_as_it_was(training):
     network = nn.Sequential(nn.BatchNorm1d(1, momentum=0.3), nn.Conv1d(1, 1, 1))
