@@ -19,7 +19,14 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation.translator import REN
-from synthetic import SMALL_NETWORK, WITHOUT_CHAIN, after_pole, decay, phased_edges
+from synthetic import (
+    SMALL_NETWORK,
+    WITHOUT_CHAIN,
+    Listening,
+    after_pole,
+    decay,
+    phased_edges,
+)
 
 FAST = load_recipe(
     "fast",
@@ -157,6 +164,18 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
         train_run(*fast_sampled, tmp_path / "d", FAST, TrainOptions(init=chain))
     assert not any((tmp_path / name).exists() for name in "abcd")
+
+
+def test_pairs_are_a_stage_of_their_own(files, chain, tmp_path) -> None:
+    monitor = Listening()
+    options = TrainOptions(init=chain, device="cpu")
+    pairs = TINY.training.pairs.model_copy(update={"iterations": 2})
+    recipe = TINY.model_copy(
+        update={"training": TINY.training.model_copy(update={"pairs": pairs})}
+    )
+    train_run(files["sim"], files["one"], tmp_path / "run", recipe, options, monitor=monitor)
+    stages = list(monitor.stages.items())[-2:]
+    assert stages == [("Learning pairs", [2, 1, 1]), ("Training", [1, 1])]
 
 
 @pytest.mark.slow

@@ -17,12 +17,13 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.chain_step import ChainStep
+from cpunet.training.checkpoints import Checkpoint, read_checkpoints, write_checkpoint
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.loop import CheckpointHooks, train
+from cpunet.training.loop import CheckpointHooks, StoppedError, train
 from cpunet.training.network_gate import NetworkGate
 from cpunet.training.outside import Outside
-from cpunet.training.pairs import learn_pairs
+from cpunet.training.pairs import Pairs
 from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
@@ -154,6 +155,30 @@ def test_a_training_that_goes_on_ends_with_the_same_bits(sim, data, surroundings
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
 
 
+def test_stopped_on_pairs_and_resumed_from_a_file(sim, data, surroundings, tmp_path):
+    sides, done = (sim.waveforms, data, RECIPE), []
+    hooks = CheckpointHooks(
+        lambda state: write_checkpoint(tmp_path, Checkpoint(state, {})),
+        stop=lambda: len(done) == 2,
+        paired=done.append,
+    )
+    told = "stopped after 2 of 3 iterations on pairs; continue with --resume"
+    with pytest.raises(StoppedError, match=told):
+        train(*sides, seed=0, surroundings=surroundings, hooks=hooks)
+    kept = next(read_checkpoints(tmp_path))
+    assert (kept.state["iteration"], kept.state["pairs"]["iteration"]) == (0, 2)
+    again = CheckpointHooks(lambda _state: None, kept.state, paired=done.append)
+    resumed = train(*sides, seed=0, surroundings=surroundings, hooks=again).state_dict()
+    whole = train(*sides, seed=0, surroundings=surroundings).state_dict()
+    assert done == [1, 1, 1]
+    assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+
+
+def learn(pairs: Pairs) -> None:
+    while pairs.left:
+        pairs.advance()
+
+
 @pytest.mark.thorough
 def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
     torch.manual_seed(0)
@@ -167,7 +192,7 @@ def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
     model = CycleGan(recipe, surroundings).train()
     before = copy.deepcopy(model.ren.state_dict())
     sampler = EpochSampler(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
-    learn_pairs(model, sampler, recipe, surroundings, chain_step(model, surroundings))
+    learn(Pairs(model, sampler, recipe, surroundings, chain_step(model, surroundings)))
     assert all(
         torch.equal(value, before[name]) for name, value in model.ren.state_dict().items()
     )
@@ -184,7 +209,8 @@ def test_a_group_learns_pairs_from_the_gradients_of_all(sim, surroundings):
     torch.manual_seed(0)
     model = CycleGan(RECIPE, surroundings).train()
     sampler = EpochSampler(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
-    learn_pairs(model, sampler, RECIPE, surroundings, chain_step(model, surroundings), Pair())
+    behind = chain_step(model, surroundings)
+    learn(Pairs(model, sampler, RECIPE, surroundings, behind, Pair()))
     assert len(asked) == RECIPE.training.pairs.iterations
     assert all(map(all, asked))
 

@@ -26,6 +26,20 @@ def make_step(recipe) -> Step:
     return Step(CycleGan(recipe).train(), recipe.cyclegan.training)
 
 
+def test_rates_rise_from_zero_where_the_start_is_near(tiny, batches):
+    recipe = tiny(
+        "generator.width=4", "training.iterations=8", "training.decay_start=4",
+        "training.rate_generators=1e-3", "training.rate_discriminators=2e-3",
+    )  # fmt: skip
+    step = Step(CycleGan(recipe).train(), recipe.cyclegan.training, warmup=4)
+    rates = []
+    for iteration in range(8):
+        rates.append([schedule.get_last_lr()[0] for schedule in step.schedules])
+        step(iteration, *batches)
+    expected = np.array([0.25, 0.5, 0.75, 1, 1, 0.75, 0.5, 0.25])
+    np.testing.assert_allclose(rates, expected[:, None] * [1e-3, 2e-3, 2e-3])
+
+
 def deterministic(step: Step) -> Step:
     """Without latent noise the losses do not depend on the order of the draws."""
     for network in (step.model.ren, step.model.iren):

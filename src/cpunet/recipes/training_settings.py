@@ -36,11 +36,13 @@ class PairsConfig(Config):
     """Supervised steps before the adversarial ones, see `cpunet.training.pairs`.
 
     With a chain, or a matched run to start from, simulated pulses are translated by it, and the
-    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.
+    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.  After
+    those of a matched run, the rates of the CycleGAN rise from zero over ``warmup`` iterations.
     """
 
     iterations: Count
     rate: Positive
+    warmup: Annotated[int, Field(ge=0)] = 0
 
 
 class TrainingConfig(Config):

@@ -79,6 +79,12 @@ def _discriminator(config: GruConfig | ConvConfig) -> Discriminator:
     return GruDiscriminator(config)
 
 
+def load_optimiser(optimiser: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Restore an optimiser from a file, whose keys are text instead of numbers."""
+    by_number = {int(number): value for number, value in state["state"].items()}
+    optimiser.load_state_dict(state | {"state": by_number})
+
+
 class Step:
     """One training iteration: generators always, discriminators at their interval.
 
@@ -99,6 +105,10 @@ class Step:
         Noise and preparation of translations before a discriminator sees them; None for none.
     chain
         Passes with a matched chain, if there is one.
+    warmup
+        Number of iterations in which the learning rates rise from zero, for networks that
+        start near their goal: the first steps of Adam are as long as its rate, whatever the
+        gradients (Ma and Yarats 2021, arXiv:1910.04209).
     """
 
     def __init__(
@@ -110,13 +120,14 @@ class Step:
         group: ProcessGroup = ALONE,
         outside: Outside | None = None,
         chain: ChainStep | None = None,
+        warmup: int = 0,
     ) -> None:
         self.model = model
         self.outside, self.chain = outside, chain
         # of the discriminators, if this iteration updates them
         self.accuracy: dict[str, Tensor] = {}
         self._right = torch.empty(0, dtype=torch.bool)
-        self.config = config
+        self.config, self.warmup = config, warmup
         self.group = group
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
@@ -145,7 +156,7 @@ class Step:
             for network in (model.discriminator_data, model.discriminator_sim)
         ]
         self.schedules = [
-            LambdaLR(o, self._rate_factor) for o in (self.generators, *self.discriminators)
+            LambdaLR(o, self._rising) for o in (self.generators, *self.discriminators)
         ]
 
     def state_dict(self) -> dict[str, Any]:
@@ -159,9 +170,7 @@ class Step:
         """Restore the state of a step with the same settings."""
         optimisers = (self.generators, *self.discriminators)
         for optimiser, own in zip(optimisers, state["optimisers"], strict=True):
-            # the keys of a file are text, but the optimisers number their parameters
-            by_number = {int(number): value for number, value in own["state"].items()}
-            optimiser.load_state_dict(own | {"state": by_number})
+            load_optimiser(optimiser, own)
         for schedule, own in zip(self.schedules, state["schedules"], strict=True):
             schedule.load_state_dict(own)
 
@@ -169,6 +178,11 @@ class Step:
         """Constant, then linear to zero at the end (paper, section 3.4.2)."""
         decay = max(1, self.config.iterations - self.config.decay_start)
         return min(1.0, max(0.0, (self.config.iterations - iteration) / decay))
+
+    def _rising(self, iteration: int) -> float:
+        """The factor above, after a linear rise in the first iterations."""
+        rise = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
+        return rise * self._rate_factor(iteration)
 
     def __call__(
         self, iteration: int, sim: Tensor, data: Tensor, rows: Tensor | None = None

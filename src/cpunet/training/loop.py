@@ -19,7 +19,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.group_norm import share_norms
-from cpunet.training.pairs import learn_pairs
+from cpunet.training.pairs import Pairs
 from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.start import match_skips
@@ -29,7 +29,8 @@ from cpunet.training.surroundings import NONE, Surroundings
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
 Entry = tuple[int, float, dict[str, Tensor], dict[str, Tensor]]
-State = dict[str, Any]  # dicts and lists of tensors, numbers and text; has "iteration"
+# dicts and lists of tensors, numbers and text; has "iteration", and "pairs" while these last
+State = dict[str, Any]
 
 
 class StoppedError(CpunetError):
@@ -44,18 +45,21 @@ class CheckpointHooks:
     ----------
     save
         Called with the state every ``checkpoint_interval`` iterations, after the last one and
-        before a stop, always after the listener has received all earlier records.  The tensors
-        change again once it returns.
+        before a stop, always after the listener has received all earlier records; on the way
+        through `pairs` as well.  The tensors change again once it returns.
     start
         State to continue from; the same in all processes of a group.
     stop
         Called after each iteration; True to stop there.  A group stops if it is True in any
         process.
+    paired
+        Called with the number of iterations on pairs since the last call.
     """
 
     save: Callable[[State], None]
     start: State | None = None
     stop: Callable[[], bool] = lambda: False
+    paired: Callable[[int], None] = lambda _steps: None
 
 
 NOTHING_KEPT = CheckpointHooks(lambda _state: None)
@@ -127,14 +131,25 @@ def train(
         ]
         share_norms(model, group)
         if hooks.start is None:
-            _begin(model, samplers, recipe, surroundings, behind, init, group)
+            _begin(model, samplers, recipe, behind, init)
         group.follow(model.state_dict().values())
-        step = Step(model, config, group=group, outside=surroundings.outside, chain=behind)
-        training = _Training(step, samplers, device)
-        if group.size > 1:
-            _reseed(seed, group.rank, 0)
+        step = Step(
+            model,
+            config,
+            group=group,
+            outside=surroundings.outside,
+            chain=behind,
+            warmup=0 if surroundings.teacher is None else config.pairs.warmup,
+        )
+        pairs = Pairs(model, samplers[0], recipe, surroundings, behind, group)
+        training = _Training(step, samplers, device, pairs)
         if hooks.start is not None:
             training.load_state_dict(hooks.start, seed)
+        if training.iteration == 0:
+            _learn_pairs(training, hooks)
+            group.follow(model.state_dict().values())
+            if group.size > 1:
+                _reseed(seed, group.rank, 0)
         try:
             _iterate(training, listener if group.leads else None, hooks)
         except _DivergenceError as error:
@@ -153,18 +168,15 @@ def _begin(
     model: CycleGan,
     samplers: list[EpochSampler],
     recipe: Recipe,
-    surroundings: Surroundings,
     behind: ChainStep | None,
     init: Callable[[CycleGan], None] | None,
-    group: ProcessGroup,
 ) -> None:
-    """Initialise the generators: from given weights or in closed form, then with pairs."""
+    """Initialise the generators: from given weights or in closed form."""
     if init is not None:
         init(model)
     elif behind is None:
         sim, data = (sampler.pulses for sampler in samplers)
         match_skips(model, sim, data, recipe.preparation.samples_before)
-    learn_pairs(model, samplers[0], recipe, surroundings, behind, group)
 
 
 class _DivergenceError(Exception):
@@ -174,8 +186,10 @@ class _DivergenceError(Exception):
 class _Training:
     """Everything that changes from iteration to iteration."""
 
-    def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
-        self.step, self.samplers = step, samplers
+    def __init__(
+        self, step: Step, samplers: list[EpochSampler], device: str, pairs: Pairs
+    ) -> None:
+        self.step, self.samplers, self.pairs = step, samplers, pairs
         self.model, self.config, self.group = step.model, step.config, step.group
         self.device = torch.device(device)
         model, config = self.model, self.config
@@ -210,7 +224,8 @@ class _Training:
             {where: states[rank] for where, states in of_all.items()}
             for rank in range(self.group.size)
         ]
-        return {
+        pairs = {} if self.iteration else {"pairs": self.pairs.state_dict()}
+        return pairs | {
             "iteration": self.iteration,
             "model": self.model.state_dict(),
             "averages": [averaged.state_dict() for averaged in self.averages],
@@ -222,6 +237,10 @@ class _Training:
     def load_state_dict(self, state: State, seed: int) -> None:
         """Restore the state of a training with the same pulses, settings and seed."""
         self.iteration = state["iteration"]
+        if "pairs" in state:
+            self.pairs.load_state_dict(state["pairs"])
+        else:
+            self.pairs.skip()
         self.model.load_state_dict(state["model"])
         for averaged, own in zip(self.averages, state["averages"], strict=True):
             averaged.load_state_dict(own)
@@ -236,6 +255,30 @@ class _Training:
         torch.set_rng_state(random[rank]["cpu"])
         if self.device.type == "cuda" and "cuda" in random[rank]:
             torch.cuda.set_rng_state(random[rank]["cuda"], self.device)
+
+
+def _learn_pairs(training: _Training, hooks: CheckpointHooks) -> None:
+    """Do the supervised steps that are left, if there are any."""
+    pairs, interval = training.pairs, training.config.checkpoint_interval
+    while pairs.left:
+        pairs.advance()
+        hooks.paired(1)
+        stop = training.group.any(hooks.stop())
+        if stop or pairs.iteration % interval == 0:
+            _save(training, hooks)
+        if stop:
+            raise StoppedError(
+                f"stopped after {pairs.iteration} of {pairs.count} iterations on pairs; "
+                "continue with --resume"
+            )
+    pairs.skip()
+
+
+def _save(training: _Training, hooks: CheckpointHooks) -> None:
+    _require_finite_weights(training)
+    state = training.state_dict()
+    if training.group.leads:
+        hooks.save(state)
 
 
 def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHooks) -> None:
@@ -255,10 +298,7 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
             if listener is not None:
                 listener(records)
         if keep:
-            _require_finite_weights(training)
-            state = training.state_dict()
-            if training.group.leads:
-                hooks.save(state)
+            _save(training, hooks)
         if stop:
             raise StoppedError(
                 f"stopped after {done} of {config.iterations} iterations; "

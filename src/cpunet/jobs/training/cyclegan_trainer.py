@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import nn
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions, losses_shown
 from cpunet.recipes.schema import Recipe
 from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.held_out import Kept
 from cpunet.training.judges import judges_noted
-from cpunet.training.loop import CheckpointHooks, Listener, Record, train
+from cpunet.training.loop import CheckpointHooks, Listener, Record, State, train
 from cpunet.training.network_gate import NetworkGate
+from cpunet.training.pairs import number_of_pairs
 from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import read_losses, weights_sha256
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
@@ -75,18 +77,17 @@ class CycleGanTrainer:
         run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
         state = share_state(job.group, run.begin(resume=job.options.resume))
         start = self._start(job)
-        left = self.steps - (state["iteration"] if state else 0)
         with (
             losses_shown(job.folder, wanted=job.options.tensorboard) as show,
-            job.monitor.stage("Training", left) as advance,
+            _Stages(job.monitor, start, self.steps, state) as stages,
         ):
 
             def listen(records: list[Record]) -> None:
                 run.log(records)
                 show(records)
-                advance(len(records))
+                stages.trained(len(records))
 
-            hooks = CheckpointHooks(run.save, state, job.stop)
+            hooks = CheckpointHooks(run.save, state, job.stop, stages.paired)
             model, kept = self._trained(job, start, hooks, listen)
         run.finish()
         if kept is not None and not kept.kept:
@@ -135,6 +136,43 @@ class CycleGanTrainer:
         if gate is None or surroundings.chain is None:
             return model, None
         return model, gate.judge(model, surroundings.chain)
+
+
+class _Stages(ExitStack):
+    """Show the stages of a training one after the other: iterations on pairs, and its own."""
+
+    def __init__(
+        self, monitor: Monitor, start: NetworkStart, steps: int, state: State | None
+    ) -> None:
+        super().__init__()
+        self._monitor = monitor
+        self._steps = steps - (state["iteration"] if state else 0)
+        self._pairs = number_of_pairs(start.recipe, start.surroundings)
+        if state is not None:
+            done = state["pairs"]["iteration"] if "pairs" in state else self._pairs
+            self._pairs -= done
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        self._begin()
+        return self
+
+    def _begin(self) -> None:
+        of_pairs = ("Learning pairs", self._pairs)
+        stage = of_pairs if self._pairs else ("Training", self._steps)
+        self._advance = self.enter_context(self._monitor.stage(*stage))
+
+    def paired(self, steps: int) -> None:
+        """Count iterations on pairs; after the last one the next stage begins."""
+        self._advance(steps)
+        self._pairs -= steps
+        if not self._pairs:
+            self.close()
+            self._begin()
+
+    def trained(self, steps: int) -> None:
+        """Count iterations of the training."""
+        self._advance(steps)
 
 
 def _fingerprint(job: TrainingJob) -> dict[str, Any]:
