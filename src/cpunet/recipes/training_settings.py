@@ -36,13 +36,11 @@ class PairsConfig(Config):
     """Supervised steps before the adversarial ones, see `cpunet.training.pairs`.
 
     With a chain, or a matched run to start from, simulated pulses are translated by it, and the
-    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.  After
-    those of a matched run, the rates of the CycleGAN rise from zero over ``warmup`` iterations.
+    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.
     """
 
     iterations: Count
     rate: Positive
-    warmup: Annotated[int, Field(ge=0)] = 0
 
 
 class TrainingConfig(Config):
@@ -51,6 +49,7 @@ class TrainingConfig(Config):
     The final generators are running averages of the trained ones, with
     ``average_decay`` per iteration (0: the last weights, as in the paper); their
     batch-norm statistics are computed again over ``statistics_batches``.
+    After a start from another run, the rates rise from zero over ``warmup`` iterations.
     ``instance_noise`` is the RMS of white noise added to all that the discriminators
     see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
     paper): translations have no electronic noise, and a discriminator that recognises
@@ -66,6 +65,7 @@ class TrainingConfig(Config):
     method: Literal["cyclegan"]
     iterations: Count
     decay_start: Annotated[int, Field(ge=0, le=100_000_000)]
+    warmup: Annotated[int, Field(ge=0, le=100_000_000)] = 0
     batch_size: Annotated[int, Field(ge=2, le=100_000)]
     rate_generators: Positive
     rate_discriminators: Positive

@@ -139,7 +139,7 @@ def train(
             group=group,
             outside=surroundings.outside,
             chain=behind,
-            warmup=0 if surroundings.teacher is None else config.pairs.warmup,
+            warmup=0 if init is None and surroundings.teacher is None else config.warmup,
         )
         pairs = Pairs(model, samplers[0], recipe, surroundings, behind, group)
         training = _Training(step, samplers, device, pairs)
