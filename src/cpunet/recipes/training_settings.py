@@ -65,7 +65,7 @@ class TrainingConfig(Config):
     method: Literal["cyclegan"]
     iterations: Count
     decay_start: Annotated[int, Field(ge=0, le=100_000_000)]
-    warmup: Annotated[int, Field(ge=0, le=100_000_000)] = 0
+    warmup: Annotated[int, Field(ge=0, le=100_000_000)]
     batch_size: Annotated[int, Field(ge=2, le=100_000)]
     rate_generators: Positive
     rate_discriminators: Positive

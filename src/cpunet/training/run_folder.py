@@ -123,7 +123,12 @@ _LATER: dict[str, tuple[str, dict[str, Any]]] = {
     "generator": ("fast_decays_us", {"free_decays": False}),
     "training": (
         "discriminator_interval",
-        {"noise": "none", "pairs": {"iterations": 1, "rate": 1e-3}, "held_out": 0.0},
+        {
+            "noise": "none",
+            "pairs": {"iterations": 1, "rate": 1e-3},
+            "held_out": 0.0,
+            "warmup": 0,
+        },
     ),
 }
 # settings of a former loss for networks that correct a chain
