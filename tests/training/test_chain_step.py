@@ -10,6 +10,7 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.errors import CpunetError
 from cpunet.networks.chain_unet import UNetCorrection
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
@@ -172,6 +173,20 @@ def test_stopped_on_pairs_and_resumed_from_a_file(sim, data, surroundings, tmp_p
     whole = train(*sides, seed=0, surroundings=surroundings).state_dict()
     assert done == [1, 1, 1]
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+
+
+def test_pairs_that_diverge_are_told_and_not_kept(sim, data, surroundings, monkeypatch):
+    def diverge(pairs: Pairs) -> None:
+        pairs.iteration += 1
+        torch.nn.init.constant_(pairs.model.iren.outlet.bias, float("nan"))
+
+    monkeypatch.setattr(Pairs, "advance", diverge)
+    kept = []
+    hooks = CheckpointHooks(kept.append, stop=lambda: True)
+    told = r"training diverged: iren.outlet.bias is not finite after iteration 0 on pairs \(seed"
+    with pytest.raises(CpunetError, match=told):
+        train(sim.waveforms, data, RECIPE, seed=0, surroundings=surroundings, hooks=hooks)
+    assert not kept
 
 
 def learn(pairs: Pairs) -> None:

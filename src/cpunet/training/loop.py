@@ -145,12 +145,12 @@ def train(
         training = _Training(step, samplers, device, pairs)
         if hooks.start is not None:
             training.load_state_dict(hooks.start, seed)
-        if training.iteration == 0:
-            _learn_pairs(training, hooks)
-            group.follow(model.state_dict().values())
-            if group.size > 1:
-                _reseed(seed, group.rank, 0)
         try:
+            if training.iteration == 0:
+                _learn_pairs(training, hooks)
+                group.follow(model.state_dict().values())
+                if group.size > 1:
+                    _reseed(seed, group.rank, 0)
             _iterate(training, listener if group.leads else None, hooks)
         except _DivergenceError as error:
             raise CpunetError(
@@ -332,9 +332,9 @@ def _require_finite_weights(training: _Training) -> None:
     """Do not save a state with non-finite weights: losses are one iteration behind them."""
     for name, value in training.model.state_dict().items():
         if not bool(torch.isfinite(value).all()):
-            raise _DivergenceError(
-                f"{name} is not finite after iteration {training.iteration - 1}"
-            )
+            done, on_pairs = training.iteration, training.pairs.iteration
+            where = f"iteration {done - 1}" if done else f"iteration {on_pairs - 1} on pairs"
+            raise _DivergenceError(f"{name} is not finite after {where}")
 
 
 def _sampler_seeds(seed: int) -> Iterator[int]:
