@@ -183,7 +183,7 @@ def test_pairs_that_diverge_are_told_and_not_kept(sim, data, surroundings, monke
     monkeypatch.setattr(Pairs, "advance", diverge)
     kept = []
     hooks = CheckpointHooks(kept.append, stop=lambda: True)
-    told = r"training diverged: iren.outlet.bias is not finite after iteration 0 on pairs \(seed"
+    told = r"training diverged: iren.outlet.bias is not finite after iteration 0 on pairs"
     with pytest.raises(CpunetError, match=told):
         train(sim.waveforms, data, RECIPE, seed=0, surroundings=surroundings, hooks=hooks)
     assert not kept
