@@ -163,6 +163,20 @@ def test_code_is_never_kept_where_others_can_write(
     assert code_folder(shared) is None
 
 
+def test_threads_can_be_lowered_and_raised_again():
+    program = (
+        "import numba, torch\nfrom cpunet.kernels import use_threads\n"
+        "for count in (1, 3, 9):\n"
+        "    use_threads(count)\n"
+        "    print(numba.get_num_threads(), torch.get_num_threads())"
+    )
+    given = os.environ | {"NUMBA_NUM_THREADS": "4"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given
+    )
+    assert done.stdout.splitlines() == ["1 1", "3 3", "4 9"]
+
+
 PARALLEL = """
 from numba import prange
 from cpunet.kernels import kernel

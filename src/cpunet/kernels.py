@@ -28,6 +28,7 @@ from typing import IO, Any, TypeVar, overload
 import numba
 import platformdirs
 import threadpoolctl
+from numba.core import config
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from cpunet.errors import CpunetError
@@ -85,7 +86,7 @@ def use_threads(count: int) -> None:
 
     torch.set_num_threads(count)
     start_threads()
-    numba.set_num_threads(min(count, numba.get_num_threads()))
+    numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
 
 
 @contextmanager

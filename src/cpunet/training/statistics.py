@@ -7,7 +7,7 @@ more than its spread. After the training the averages are computed again over th
 generator's own input side (Wu and Johnson 2021, arXiv:2105.07576, section 3).
 
 Dropout is off meanwhile, as in a translation: with it the variance at the batch norms behind
-it is larger, here by a tenth and more (Li et al. 2019, CVPR, "variance shift").
+it is larger, here by up to a sixth (Li et al. 2019, CVPR, "variance shift").
 """
 
 from __future__ import annotations
