@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.torch import load_file
+from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_simulated
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import write_run
 from cpunet.translation.translator import REN
 from synthetic import (
     SMALL_NETWORK,
@@ -28,17 +31,15 @@ from synthetic import (
     phased_edges,
 )
 
-FAST = load_recipe(
-    "fast",
-    [
-        "training.components=4",
-        "training.squares=2",
-        "training.start_factors=[1]",
-        "training.ringing_mhz=[]",
-        "generator.slow_ns=[]",
-        "generator.fast_decays_us=[]",
-    ],
+SHORT = (
+    "training.components=4",
+    "training.squares=2",
+    "training.start_factors=[1]",
+    "training.ringing_mhz=[]",
+    "generator.slow_ns=[]",
+    "generator.fast_decays_us=[]",
 )
+FAST = load_recipe("fast", SHORT)
 TINY = load_recipe(
     "small",
     [
@@ -132,6 +133,28 @@ def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> N
     near = np.sqrt(np.sum(np.square(poles(tmp_path / "warm"))))
     assert near == pytest.approx(np.sqrt(np.sum(np.square(poles(tmp_path / "cold")))), rel=0.03)
     assert near > 1.2 * np.sqrt(np.sum(np.square(poles(chain))))
+
+
+@pytest.mark.thorough
+def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
+    files, chain, tmp_path
+) -> None:
+    recipe = load_recipe("fast", [*SHORT, "generator.drift_terms=1"])
+    generator = ResponseGenerator(recipe.matching.generator, 16.0)
+    known = REN.load(chain).backend.chain
+    generator.set_noise(known.noise)
+    generator.response.load_state_dict(known.response.state_dict(), strict=False)
+    generator.response.drift.stretch.data.fill_(0.01)
+    model = nn.ModuleDict({"ren": generator})
+    (tmp_path / "near").mkdir()
+    write_run(tmp_path / "near", model, recipe, json.loads((chain / "run.json").read_text()))
+    start = TrainOptions(init=tmp_path / "near", device="cpu")
+    alone = train_run(files["sim"], files["one"], tmp_path / "alone", FAST, start)
+    assert "drift_stretch" not in alone["fit"]["parameters"]
+    free = load_recipe("fast", [*SHORT, "training.drift_terms=1"])
+    goes_on = train_run(files["sim"], files["one"], tmp_path / "free", free, start)
+    assert abs(goes_on["fit"]["parameters"]["drift_stretch"]) < 0.05  # none is true
+    assert REN.load(tmp_path / "free").backend.chain.response.drift is not None
 
 
 def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None:

@@ -242,6 +242,44 @@ def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> No
     assert per_moment > 3 * near.fit.chi_square / near.fit.moments
 
 
+def faster(fine: Pulses, factor: float) -> Pulses:
+    """The same charge, collected in a time shorter by this factor."""
+    samples = np.arange(fine.waveforms.shape[1])
+    end = (fine.waveforms >= 0.999).argmax(axis=1)
+    values = [
+        np.interp(at + factor * (samples - at), samples, row)
+        for at, row in zip(end, fine.waveforms, strict=True)
+    ]
+    return fine.with_waveforms(np.array(values, np.float32))
+
+
+DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringing_mhz=[]")
+
+
+def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
+    """The readout is then the true one, and not what makes up for the drift."""
+    short = simulated(faster(charge(N, seed=1), 1.25))
+    response, fit = problem.fit(0, *DRIFT, sim=short)
+    assert fit.chi_square < GOOD_FIT * fit.moments
+    numbers = response.describe()
+    error = fit.errors["drift.stretch.1"]
+    assert error < 0.03
+    assert abs(numbers["drift_stretch"] - 0.25) < 4 * error
+    true_rise = rise_ns(CHAIN.step_response(np.arange(4000.0)))
+    assert learned_rise_ns(response) == pytest.approx(true_rise, rel=0.02)
+    assert numbers["slow_400_ns"] == pytest.approx(0.065, rel=0.1)
+
+    alone, poor = problem.fit(0, *DRIFT[1:], sim=short)  # as in fast
+    assert alone.drift is None
+    assert poor.chi_square > 3 * GOOD_FIT * poor.moments
+
+
+def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> None:
+    response, fit = problem.fit(0, "training.drift_terms=2")
+    assert response.drift is None
+    assert fit == near.fit
+
+
 @pytest.mark.slow  # the next but one finds one, too
 def test_a_ringing_is_found_where_there_is_one() -> None:
     ringing = {"frequency_MHz": 6.0, "fraction": 0.25, "damping_ns": 160.0}

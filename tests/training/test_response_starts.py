@@ -22,7 +22,7 @@ PHYSICS = "_with_wrong_physics"
     ("chi_square", "onset_is_off", "expected"),
     [
         (1.01, True, [PHYSICS]),
-        (1.01, False, [*SEARCHES, "_refined"]),
+        (1.01, False, [*SEARCHES, "_determined"]),
         (0.99, True, [*SEARCHES, PHYSICS]),
     ],
 )
@@ -31,7 +31,7 @@ def test_nothing_else_is_tried_for_another_detector(
 ):
     """If the onset is off, too; `chi_square` is in units of `response_fit.ANOTHER_DETECTOR`."""
     called: list[str] = []
-    problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None))
+    problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None, drift=None))
     found = SimpleNamespace(cost=20 * chi_square * response_fit.ANOTHER_DETECTOR)
 
     def replace(name: str, result: Any) -> None:
@@ -39,7 +39,7 @@ def test_nothing_else_is_tried_for_another_detector(
 
     for name in SEARCHES:
         replace(name, (problem, found))
-    for name in (PHYSICS, "_refined"):
+    for name in (PHYSICS, "_determined"):
         replace(name, name)
     asked = {
         "PulseSets": SimpleNamespace(bands=lambda _most=None: []),
@@ -47,7 +47,7 @@ def test_nothing_else_is_tried_for_another_detector(
         "ResponseProblem": None,
         "best_start": (problem, found),
         "is_poor": True,
-        "_onset_is_off": onset_is_off,
+        "onset_is_off": onset_is_off,
     }
     for name, answer in asked.items():
         monkeypatch.setattr(response_fit, name, lambda *_, answer=answer, **__: answer)

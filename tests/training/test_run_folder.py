@@ -70,8 +70,19 @@ def test_recipes_of_earlier_versions_are_read(tmp_path):
     recipe = load_recipe("fast")
     write_run(tmp_path, nn.ModuleDict({"ren": nn.Linear(2, 2)}), recipe, INFO)
     text = (tmp_path / "recipe.yaml").read_text()
-    assert "free_decays: false" in text
-    (tmp_path / "recipe.yaml").write_text(text.replace("  free_decays: false\n", ""))
+    for later in ("  free_decays: false\n", "  drift_terms: 0\n"):
+        assert later in text
+        text = text.replace(later, "")
+    (tmp_path / "recipe.yaml").write_text(text)
+    assert read_recipe(tmp_path) == recipe
+
+
+def test_chains_of_earlier_versions_of_small_are_read(tmp_path):
+    recipe = load_recipe("small")
+    write_run(tmp_path, nn.ModuleDict({"ren": nn.Linear(2, 2)}), recipe, INFO)
+    text = (tmp_path / "recipe.yaml").read_text()
+    assert text.count("    drift_terms: 0\n") == 2
+    (tmp_path / "recipe.yaml").write_text(text.replace("    drift_terms: 0\n", ""))
     assert read_recipe(tmp_path) == recipe
 
 

@@ -41,6 +41,20 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def stretched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, and charges drift for a tenth longer than simulated."""
+    also = ["generator.poles_ns=[50]", "generator.decay_us=60", "generator.drift_terms=1"]
+    recipe = load_recipe("fast", also)
+    generator = ResponseGenerator(recipe.matching.generator, 16.0)
+    generator.response.drift.stretch.data.fill_(0.1)
+    folder = tmp_path_factory.mktemp("stretched")
+    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+    model = nn.ModuleDict({"ren": generator})
+    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
+    return folder
+
+
 def fine_charge(n_samples: int, dt_ns: float, seed: int = 0) -> np.ndarray:
     """Charge (r, z, samples * FINE) of logistic edges at different times; two are outside."""
     rng = np.random.default_rng(seed)
@@ -94,6 +108,27 @@ def test_a_template_is_responded_to_in_its_place(chain, dt_ns):
     nothing, codes = translate(np.zeros_like(charge))
     assert not nothing.any()
     assert not codes.any()
+
+
+@pytest.mark.parametrize("dt_ns", [1.0, 16.0])
+def test_stretched_templates_keep_their_begin(chain, stretched, dt_ns):
+    """They are summed by time, which counts from the begin of the drift."""
+    time = dt_ns * np.arange(int(3000 / dt_ns))
+
+    def drifting(long_ns: np.ndarray) -> np.ndarray:
+        along = np.clip(time / long_ns[:, np.newaxis], 0, 1)
+        return (along**3 * (10 - 15 * along + 6 * along**2)).astype(np.float32)
+
+    long_ns = np.array([400.0, 900.0, 1700.0])
+    found, _ = TemplateTranslator(REN.load(stretched), dt_ns)(drifting(long_ns))
+    expected, _ = TemplateTranslator(REN.load(chain), dt_ns)(drifting(1.1 * long_ns))
+    # the begin is known to a sample, of which a tenth is what it may be off
+    steepest = np.abs(np.diff(expected, axis=1)).max()
+    assert np.abs(found - expected).max() < 0.2 * steepest + 1e-3
+    assert (
+        np.abs(TemplateTranslator(REN.load(chain), dt_ns)(drifting(long_ns))[0] - found).max()
+        > 0.05
+    )
 
 
 def test_schema_and_all_else_stay(chain, tmp_path):

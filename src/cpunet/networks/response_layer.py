@@ -13,6 +13,7 @@ import scipy.fft
 import torch
 from torch import Tensor, nn
 
+from cpunet.networks.drift_clock import DriftClock
 from cpunet.recipes.network_settings import ResponseConfig
 
 # Padding of a window in samples, so that delayed pulses stay within the record.
@@ -69,6 +70,7 @@ class ElectronicsResponse(nn.Module):
         # weights of sine and cosine; frequency in MHz and damping in ns
         self.ringing = nn.Parameter(torch.zeros(len(rings), dtype=torch.float64))
         self.log_ringing = log(rings)
+        self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
 
     def forward(self, windows: Tensor) -> Tensor:
         """Apply the response to prepared simulated pulses.
@@ -85,11 +87,19 @@ class ElectronicsResponse(nn.Module):
         """
         length = record_length(windows.shape[1])
         padded = padded_length(length)
+        windows = self.drifted(windows)
         current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
         current = nn.functional.pad(current, (PADDING_BEFORE, 0))
         spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
         signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
         return signal
+
+    def drifted(self, windows: Tensor) -> Tensor:
+        """Simulated pulses with their drift stretched, as they enter the readout."""
+        if self.drift is None:
+            return windows
+        stretched: Tensor = self.drift(windows, dt_ns=float(self.dt_ns))
+        return stretched
 
     def transfer(self, padded: int) -> Tensor:
         """Response to a step of charge at sample 0, as a spectrum of `padded` samples.
@@ -153,6 +163,7 @@ class ElectronicsResponse(nn.Module):
             | {"decay_us": float(self.log_decay_us.exp())}
             | self._fast_decays()
             | self._ringing()
+            | ({} if self.drift is None else self.drift.describe())
         )
 
     def _fast_decays(self) -> dict[str, float]:

@@ -8,6 +8,9 @@ from pydantic import Field, model_validator
 
 from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
+# parameters that stretch the simulated drift, see `cpunet.networks.drift_clock`
+DriftTerms = Annotated[int, Field(ge=0, le=2)]
+
 
 class PunetConfig(Config):
     """The Positional U-Net (paper, section 2.2.1).
@@ -30,7 +33,8 @@ class ResponseConfig(Config):
     times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
     ``ringing_ns`` are initial values of the frequency and the damping of a ringing; there is
     none if ``ringing_mhz`` is null.  With ``free_decays`` the ``fast_decays_us`` are initial
-    values of free times, too.
+    values of free times, too.  ``drift_terms`` is the number of parameters that stretch the
+    simulated drift, see `cpunet.networks.drift_clock`; 0 for the drift as simulated.
     """
 
     name: Literal["response"]
@@ -41,6 +45,7 @@ class ResponseConfig(Config):
     free_decays: bool
     ringing_mhz: Positive | None
     ringing_ns: Positive
+    drift_terms: DriftTerms
 
 
 class ResidualConfig(Config):

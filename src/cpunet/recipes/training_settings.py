@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples
+from cpunet.recipes.network_settings import DriftTerms
 
 _Number = Annotated[int, Field(ge=1, le=1000)]
 
@@ -100,9 +101,11 @@ class MatchingConfig(Config):
     these.  The valley is searched for with ``search_pulses`` of each side, in fits of at most
     ``steps`` iterations.  A fit that ends in the wrong valley is started again with the
     response's poles times the next of ``start_factors``; the best of all is kept.  If it is
-    still poor, a ringing at one of ``ringing_mhz`` is tried.  Finally, all pulses are compared,
-    optimally weighted, with ``noise_sets`` draws of the noise each and the components in
-    ``conditional_bins`` of the current amplitude.
+    still poor, a ringing at one of ``ringing_mhz`` is tried.  If pulses begin differently than
+    simulated, up to ``drift_terms`` parameters that stretch the drift are tried first.
+    Finally, all pulses are compared with ``noise_sets`` draws of the noise each, optimally
+    weighted (unless the drift was stretched), with the components in ``conditional_bins`` of
+    the current amplitude.
     """
 
     method: Literal["matching"]
@@ -122,12 +125,13 @@ class MatchingConfig(Config):
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]
+    drift_terms: DriftTerms
     noise_sets: _Number
 
     @property
     def iterations(self) -> int:
-        """Maximum number of steps of the training: all starts, a ringing, and two last fits."""
-        return self.steps * (len(self.start_factors) + 3)
+        """Maximum number of steps: all starts, stretches, a ringing, and two last fits."""
+        return self.steps * (len(self.start_factors) + self.drift_terms + 3)
 
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:

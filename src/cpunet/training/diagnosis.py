@@ -45,7 +45,7 @@ class Part:
 ONSET_PART = Part(
     "the onset",
     "no readout shapes it: the physics simulated are not those of the detector",
-    "cpunet calibrate finds temperature, impurities and clouds",
+    "--recipe best stretches the drift; cpunet calibrate finds temperature and impurities",
 )
 PARTS = {
     "onset": ONSET_PART,
@@ -135,6 +135,33 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
             "simulated; see the fit"
         ]
     return []
+
+
+def stretched(parameters: Mapping[str, float]) -> list[str]:
+    """Say in words that the simulated drift was stretched, if it was.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+
+    Examples
+    --------
+    >>> stretched({"drift_stretch": 0.052})
+    ['charges drift for 5.2 % longer than simulated; cpunet calibrate finds out why']
+    """
+    stretch = parameters.get("drift_stretch")
+    if stretch is None:
+        return []
+    change = parameters.get("drift_stretch_per_us", 0.0)
+    size = f"charges drift for {_longer(stretch + change)} than simulated"
+    if change:
+        size += f" in the last microsecond, {_longer(stretch)} near its end"
+    return [f"{size}; cpunet calibrate finds out why"]
+
+
+def _longer(stretch: float) -> str:
+    return f"{100 * abs(stretch):.1f} % {'longer' if stretch > 0 else 'shorter'}"
 
 
 def _part(name: str) -> str:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -31,15 +30,14 @@ from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
     GOOD_FIT,
     best_start,
+    drift_if_better,
     free_decay_if_better,
     from_known,
     is_poor,
+    onset_is_off,
     ringing_if_better,
 )
 
-# Sample from the half maximum up to which drift alone shapes a pulse, and pull above which this
-# part disagrees with the simulation.
-ONSET, OFF = -15, 4.0
 # Chi-square per moment above which, with such an onset, nothing else is tried: simulation and
 # data are from different detectors.  A ringing missing from the response results in 50.
 ANOTHER_DETECTOR = 100.0
@@ -172,11 +170,14 @@ def fit_response(
     near = None if known is None else from_known(first, known, training, told, listener)
     problem, found = near or best_start(first, config, training, told, listener)
     everything = sets.bands()
+    if problem.response.drift is not None:
+        problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
+        problem, found = drift_if_better(problem, found, training, listener)
     if not is_poor(problem, found):
-        fit = _refined(problem, found, everything, training, listener)
+        fit = _determined(problem, found, everything, training, listener)
         if not fit.poor:
             return problem.response, fit
-    elif found.cost > ANOTHER_DETECTOR * problem.moments and _onset_is_off(problem, training):
+    elif found.cost > ANOTHER_DETECTOR * problem.moments and onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
     if is_poor(problem, found):
@@ -184,19 +185,26 @@ def fit_response(
     if is_poor(problem, found):
         own = problem.response.config
         problem, found = ringing_if_better(problem, found, own, training, listener)
-    if is_poor(problem, found) and _onset_is_off(problem, training):
+    if is_poor(problem, found) and onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
-    return problem.response, _refined(problem, found, everything, training, listener)
+    return problem.response, _determined(problem, found, everything, training, listener)
 
 
-def _refined(
+def _determined(
     problem: ResponseProblem,
     found: Minimum,
     bands: Sequence[Band],
     training: MatchingConfig,
     listener: Listener | None,
 ) -> Fit:
-    """Determine the response within its valley from all pulses."""
+    """Determine the response within its valley from all pulses.
+
+    Optimal weights trust the shapes of the pulses to a thousandth.  A simulation whose drift
+    had to be stretched is not as good as that, so the moments alone are compared there.
+    """
+    if problem.response.drift is not None:
+        whole, end = _checked(problem, bands, training, listener)
+        return _fit(whole, end.covariance, found.steps + end.steps)
     compared, steps = ResponseProblem(problem.response, bands), found.steps
     for _ in range(ROUNDS):
         covariance = refine(problem, bands, training.conditional_bins)
@@ -251,18 +259,6 @@ def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
         amplitude_shift=shift,
         amplitude_shift_error=shift_error,
     )
-
-
-def _onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
-    """Whether pulses begin differently than simulated, which physics can cause, but no readout.
-
-    If only later parts are off, the data contain effects that no readout chain has, such as
-    remains of earlier pulses in their tails, and the edge can still be trusted.
-    """
-    onset = {f"samples {a} to {b}" for a, b in pairwise(training.segments) if b <= ONSET}
-    pulls = problem.pulls(problem.parameters.vector())
-    named = zip(problem.names, pulls, strict=True)
-    return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
 
 
 def _counted(listener: Listener) -> Listener:

@@ -18,6 +18,9 @@ from cpunet.training.translated import Translated
 # that half of the charge may be slow, and that the main decay dominates.
 TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.3
 TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # steps of the finite differences
+# The same for the stretch of the drift, and for its change per us.
+STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
+STRETCH = "drift.stretch"
 
 
 class Parameters:
@@ -48,6 +51,9 @@ class Parameters:
         self.high = -self.low
         times = [label.startswith("log") for label in self.labels]
         self.steps = np.where(times, TIME_STEP, WEIGHT_STEP)
+        stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
+        self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
+        self.steps[stretched] = STRETCH_STEPS[: len(stretched)]
 
     def vector(self) -> Values:
         """Parameters as one vector."""

@@ -1,7 +1,8 @@
 """Starting points of the fit of a response, and extensions if the fit is poor.
 
 A fit only finds the minimum of the valley that it starts in.  There are therefore several
-starts and, if the fit is poor, a fast decay with a free time and a ringing.
+starts and, if the fit is poor, a stretch of the simulated drift, a fast decay with a free time
+and a ringing.
 """
 
 from __future__ import annotations
@@ -9,13 +10,16 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator
+from itertools import pairwise
+
+import torch
 
 from cpunet.electronics.drawn_remains import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
-from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.response_problem import STRETCH, ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
 
 # Chi-square per moment, with as many pulses as are used to search for the valley, below which a
@@ -26,6 +30,8 @@ HOPELESS_FIT = 20.0
 # A ringing or free decay must lower chi-square to this fraction.  A ringing is tried from a
 # higher expected one: derivatives far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
+# A term that stretches the drift must lower chi-square by this much, four standard deviations.
+STRETCHES = 16.0
 # Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
@@ -34,6 +40,9 @@ SLOWEST_NS = 800.0
 # Minimum relative error of a main decay known from remains of earlier pulses: these are fitted
 # with one exponential, and a readout may have more.
 MIN_DECAY_ERROR = 0.01
+# Sample from the half maximum up to which drift alone shapes a pulse, and pull above which this
+# part disagrees with the simulation.
+ONSET, OFF = -15, 4.0
 
 
 def is_poor(problem: ResponseProblem, found: Minimum) -> bool:
@@ -81,8 +90,8 @@ def best_start(
 ) -> tuple[ResponseProblem, Minimum]:
     """Fit from one start after another, until a fit is good or hopeless, or all are done.
 
-    If the first fit is poor, a fast decay with a free time is tried before other starts, with
-    the main decay constrained to its known value, if any.
+    If the first fit is poor, a stretch of the drift and a fast decay with a free time are tried
+    before other starts, the latter with the main decay constrained to its known value, if any.
     """
     best: tuple[ResponseProblem, Minimum] | None = None
     dt_ns = float(first.response.dt_ns)
@@ -90,6 +99,8 @@ def best_start(
         start = start_response(config, dt_ns, factor, first.slope)
         problem = first.of(start)
         found = levenberg_marquardt(problem, training.steps, listener)
+        if best is None and is_poor(problem, found) and onset_is_off(problem, training):
+            problem, found = drift_if_better(problem, found, training, listener)
         if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
             problem, found = free_decay_if_better(problem, found, training, decay, listener)
         if best is None or found.cost < best[1].cost:
@@ -98,6 +109,36 @@ def best_start(
             break  # there is no other valley to search for
     assert best is not None  # the recipe has at least one start
     return best
+
+
+def onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
+    """Whether pulses begin differently than simulated, which physics can cause, but no readout.
+
+    If only later parts are off, the data contain effects that no readout chain has, such as
+    remains of earlier pulses in their tails, and the edge can still be trusted.
+    """
+    onset = {f"samples {a} to {b}" for a, b in pairwise(training.segments) if b <= ONSET}
+    pulls = problem.pulls(problem.parameters.vector())
+    named = zip(problem.names, pulls, strict=True)
+    return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
+
+
+def drift_if_better(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Stretch the simulated drift by one more parameter if that lowers chi-square clearly."""
+    terms = problem.response.config.drift_terms + 1
+    if terms > training.drift_terms:
+        return problem, found
+    tried = problem.of(with_drift_terms(problem.response, terms))
+    again = levenberg_marquardt(tried, training.steps, listener, coarse=terms == 1)
+    steps = found.steps + again.steps
+    if again.cost < found.cost - STRETCHES:
+        return tried, again._replace(steps=steps)
+    return problem, found._replace(steps=steps)
 
 
 def free_decay_if_better(
@@ -156,6 +197,8 @@ def _free_decay_start(
         slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
     response = start_response(config, dt_ns, 1.0, slope, decay)
     response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
+    if response.drift is not None and problem.response.drift is not None:
+        response.drift.load_state_dict(problem.response.drift.state_dict())
     response.log_fast_decays_us.data.fill_(math.log(fast_us))
     response.decay_weights.data.fill_(share)
     return problem.of(response)
@@ -216,6 +259,19 @@ def ringing_if_better(
         if not is_poor(*best):
             break
     return best[0], best[1]._replace(steps=steps)
+
+
+def with_drift_terms(response: ElectronicsResponse, terms: int) -> ElectronicsResponse:
+    """A copy of a response with this many parameters of the drift, new ones at 0."""
+    more = response.config.model_copy(update={"drift_terms": terms})
+    copied = ElectronicsResponse(more, float(response.dt_ns))
+    state = response.state_dict()
+    stretch = state.pop(STRETCH, torch.empty(0))
+    copied.load_state_dict(state, strict=False)
+    if copied.drift is not None:
+        copied.drift.stretch.data[: len(stretch)] = stretch[:terms]
+    copied.decay_known = response.decay_known
+    return copied
 
 
 def start_response(

@@ -105,10 +105,12 @@ def read_recipe(run: Path) -> Recipe:
 
 def _completed(settings: Any) -> Any:
     """Add settings that recipes of earlier versions do not have."""
-    for part, (known_by, added) in _LATER.items():
+    for part, known_by, added in _LATER:
         own = settings.get(part) if isinstance(settings, dict) else None
         if isinstance(own, dict) and known_by in own:
             settings = settings | {part: added | own}
+    if isinstance(settings, dict) and isinstance(settings.get("chain"), dict):
+        settings = settings | {"chain": _completed(settings["chain"])}
     if isinstance(settings, dict) and isinstance(own := settings.get("generator"), dict):
         residual = own.get("residual")
         if isinstance(residual, dict) and residual.keys() >= _FORMER_RESIDUAL:
@@ -118,10 +120,12 @@ def _completed(settings: Any) -> Any:
     return settings
 
 
-# by part of a recipe: a setting that identifies its kind, and settings added later
-_LATER: dict[str, tuple[str, dict[str, Any]]] = {
-    "generator": ("fast_decays_us", {"free_decays": False}),
-    "training": (
+# part of a recipe, a setting that identifies its kind, and settings added later
+_LATER: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("generator", "fast_decays_us", {"free_decays": False, "drift_terms": 0}),
+    ("training", "conditional_bins", {"drift_terms": 0}),
+    (
+        "training",
         "discriminator_interval",
         {
             "noise": "none",
@@ -130,7 +134,7 @@ _LATER: dict[str, tuple[str, dict[str, Any]]] = {
             "warmup": 0,
         },
     ),
-}
+)
 # settings of a former loss for networks that correct a chain
 _FORMER_RESIDUAL = {"projections", "amplitude_weight", "size_weight", "slope_weight"}
 

@@ -145,9 +145,11 @@ class Translated:
     noise: Noise
     moments: Moments
     weights: Values
+    # of each block, first pulse and number, for one stretch of the drift
     _spectra: dict[tuple[int, int], npt.NDArray[np.complex64]] = field(
         default_factory=dict, init=False, repr=False
     )
+    _stretch: list[float] = field(default_factory=list, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.sim)
@@ -202,12 +204,16 @@ class Translated:
     ) -> list[tuple[tuple[Values, ...], float]]:
         """Same as `sums`, for each block of `size` pulses in their order."""
         transfer = self._transfer(response)
+        stretch = [] if response.drift is None else response.drift.stretch.tolist()
+        if stretch != self._stretch:
+            self._spectra.clear()
+            self._stretch[:] = stretch
         threads = torch.get_num_threads()
 
         def one(first: int) -> tuple[tuple[Values, ...], float]:
             found = [
                 (of(readings), float(readings.weights.sum()))
-                for readings in self._block(transfer, first, size, cut=cut, draws=draws)
+                for readings in self._block(response, transfer, first, size, cut, draws)
             ]
             sums = zip(*(totals for totals, _ in found), strict=True)
             return tuple(np.sum(np.stack(each), axis=0) for each in sums), sum(
@@ -228,16 +234,16 @@ class Translated:
 
     def _block(
         self,
+        response: ElectronicsResponse,
         transfer: npt.NDArray[np.complex64],
         first: int,
         size: int,
-        *,
         cut: bool,
         draws: int | None,
     ) -> Iterator[Readings]:
         """Readings of one block of pulses, draw by draw."""
         preparation = self.moments.preparation
-        spectrum = self._spectrum(first, size) * transfer
+        spectrum = self._spectrum(response, first, size) * transfer
         padded = padded_length(self.length)
         records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
         plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(
@@ -250,11 +256,16 @@ class Translated:
             weights = self.weights[first : first + size]
             yield self.moments.read(noisy, last, cut=cut, weights=weights)
 
-    def _spectrum(self, first: int, size: int) -> npt.NDArray[np.complex64]:
+    def _spectrum(
+        self, response: ElectronicsResponse, first: int, size: int
+    ) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
         sim = self.sim[first : first + size]
         if (kept := self._spectra.get((first, len(sim)))) is not None:
             return kept
+        if response.drift is not None:
+            with torch.no_grad():
+                sim = response.drifted(torch.from_numpy(np.ascontiguousarray(sim))).numpy()
         current = np.zeros((len(sim), self.length), np.float32)
         current[:, PADDING_BEFORE] = sim[:, 0]
         np.subtract(

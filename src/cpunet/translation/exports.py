@@ -60,7 +60,7 @@ class NetworkGraph(PositionalUNet):
 
 
 class ChainGraph(nn.Module):
-    """A readout chain as a matrix, with a trained residual if there is one.
+    """A readout chain as a matrix, with a stretch of the drift and a residual if there are any.
 
     The chain is linear.  A product with its responses to single samples gives the same
     records as its Fourier transforms, which few formats support.
@@ -70,8 +70,11 @@ class ChainGraph(nn.Module):
 
     def __init__(self, chain: ResponseGenerator, length: int) -> None:
         super().__init__()
+        readout = copy.deepcopy(chain.response)
+        self.drift, readout.drift = readout.drift, None
+        self.dt_ns = float(readout.dt_ns)
         with torch.inference_mode():
-            matrix = chain.response(torch.eye(length, device=chain.response.dt_ns.device))
+            matrix = readout(torch.eye(length, device=readout.dt_ns.device))
         self.register_buffer("matrix", matrix.clone().cpu())
         self.residual: RecordCorrection | None = None
         if isinstance(chain, HybridGenerator) and bool(chain.residual.used):
@@ -79,6 +82,8 @@ class ChainGraph(nn.Module):
 
     def forward(self, windows: Tensor) -> Tensor:
         """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
+        if self.drift is not None:
+            windows = self.drift(windows, dt_ns=self.dt_ns)
         records = windows @ self.matrix
         if self.residual is None:
             return records

@@ -86,6 +86,8 @@ class TemplateTranslator:
             self.chain = copy.deepcopy(backend.chain)
             network = isinstance(self.chain, HybridGenerator) and bool(self.chain.residual.used)
             self.chain.response.dt_ns.fill_(dt_ns)
+            if self.chain.response.drift is not None:
+                self.chain.response.drift.keeps_begin = True  # templates are summed by time
         if network and not same:
             raise CpunetError(
                 f"templates sampled every {dt_ns:g} ns, but the run's network knows "

@@ -39,7 +39,7 @@ from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.regular_files import read_text
-from cpunet.training.diagnosis import beyond
+from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
@@ -255,7 +255,7 @@ def _told(run: _Learned) -> dict[str, Any]:
 def _doubts(run: _Learned) -> list[str]:
     """Reasons why the numbers of a run do not describe a readout alone."""
     causes = run.fit.get("causes")
-    found = beyond(run.parameters)
+    found = beyond(run.parameters) + stretched(run.parameters)
     if isinstance(causes, list) and causes:
         found.insert(
             0,

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.response_problem import Parameters
+from cpunet.training.response_problem import STRETCH, Parameters
 
 Numbers = dict[str, float]
 
@@ -78,6 +78,9 @@ def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) ->
             sources[name] = (f"log_ringing.{i + 1}", value)
     for i, tau in enumerate(response.slow_ns.tolist()):
         sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
+    if response.drift is not None:
+        for i, name in enumerate(response.drift.describe()):
+            sources[name] = (f"{STRETCH}.{i + 1}", 1.0)
     free = response.config.free_decays
     for i, tau in enumerate(response.fast_times_us.tolist()):
         name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"

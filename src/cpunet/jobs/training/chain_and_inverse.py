@@ -19,11 +19,12 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.diagnosis import beyond, diagnosis
+from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.residual import fit_residual
 from cpunet.training.response_fit import fit_response
+from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run_folder import load_network, read_recipe
 
 
@@ -112,6 +113,9 @@ def match(
         monitor.note(f"warning: {note}")
 
     if known is not None:
+        allowed = recipe.matching.training.drift_terms
+        if known.config.drift_terms > allowed:
+            known = with_drift_terms(known, allowed)
         recipe = _with_config(recipe, known.config)
     response, fit = fit_response(
         sides.sim,
@@ -138,7 +142,7 @@ def match(
     causes = diagnosis(fit.pulls) if fit.poor else []
     for number, cause in enumerate(causes, 1):
         monitor.note(f"  {number}. {cause}")
-    for found in beyond(response.describe()):
+    for found in beyond(response.describe()) + stretched(response.describe()):
         monitor.note(f"warning: {found}")
     recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
