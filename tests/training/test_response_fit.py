@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +29,11 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit, translated
 from cpunet.training.half_maximum_alignment import at_half_maximum
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_problem import Band, ResponseProblem
-from cpunet.training.response_starts import GOOD_FIT
+from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
+from cpunet.training.response_starts import GOOD_FIT, drift_if_needed, with_drift_terms
 from cpunet.training.translated import Noise, Translated
 from synthetic import drifting, two_sites
 
@@ -350,6 +352,36 @@ def test_derivatives_leave_the_response_as_it_is(asked: ResponseProblem) -> None
     columns = asked.derivatives(vector, asked.deviations(vector), [0, 2])
     assert columns.shape == (asked.moments, 2)
     np.testing.assert_array_equal(asked.parameters.vector(), vector)
+
+
+def test_records_are_stretched_as_the_layer_stretches(asked: ResponseProblem) -> None:
+    """And what is kept of one stretch is not used for the next."""
+    more = asked.of(with_drift_terms(asked.response, 1))
+    vector = more.parameters.vector()
+    as_simulated, plain = more.pulls(vector), asked.pulls(asked.parameters.vector())
+    np.testing.assert_allclose(as_simulated, plain, atol=1e-3)
+    vector[more.parameters.labels.index(STRETCH)] = 0.1
+    found = more.pulls(vector)
+    band = asked.bands[0]
+    with torch.no_grad():
+        longer = more.response.drifted(torch.from_numpy(band.sim.sim)).numpy()
+    by_hand = Band(band.name, dataclasses.replace(band.sim, sim=longer), band.rows)
+    expected = asked.of(asked.response, [by_hand]).pulls(asked.parameters.vector())
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert np.abs(found - plain).max() > 1
+
+
+def test_a_needless_stretch_is_taken_out(asked: ResponseProblem) -> None:
+    """It may have stood in for a ringing that was found later."""
+    training = RECIPE.training
+    simulated = asked.of(copy.deepcopy(asked.response))
+    plain = levenberg_marquardt(simulated, 5, None, coarse=False)
+    stretched = asked.of(with_drift_terms(asked.response, 1))
+    found = levenberg_marquardt(stretched, 5, None, coarse=False)
+    problem, again = drift_if_needed(stretched, found, training, None)
+    assert problem.response.drift is None
+    assert again.cost < plain.cost + 16
+    assert drift_if_needed(simulated, plain, training, None) == (simulated, plain)
 
 
 def test_threads_do_not_change_a_bit(asked: ResponseProblem, monkeypatch) -> None:

@@ -29,8 +29,10 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
     GOOD_FIT,
+    HOPELESS_FIT,
     best_start,
     drift_if_better,
+    drift_if_needed,
     free_decay_if_better,
     from_known,
     is_poor,
@@ -170,21 +172,24 @@ def fit_response(
     near = None if known is None else from_known(first, known, training, told, listener)
     problem, found = near or best_start(first, config, training, told, listener)
     everything = sets.bands()
-    if problem.response.drift is not None:
-        problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
-        problem, found = drift_if_better(problem, found, training, listener)
-    if not is_poor(problem, found):
+    stretched = problem.response.drift is not None
+    if not stretched and not is_poor(problem, found):
         fit = _determined(problem, found, everything, training, listener)
         if not fit.poor:
             return problem.response, fit
     elif found.cost > ANOTHER_DETECTOR * problem.moments and onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
+    if stretched and found.cost < HOPELESS_FIT * problem.moments:  # else a ringing is first
+        problem, found = drift_if_better(problem, found, training, listener)
     if is_poor(problem, found):
         problem, found = free_decay_if_better(problem, found, training, told, listener)
     if is_poor(problem, found):
         own = problem.response.config
         problem, found = ringing_if_better(problem, found, own, training, listener)
+    if stretched or (is_poor(problem, found) and onset_is_off(problem, training)):
+        problem, found = drift_if_better(problem, found, training, listener)
+        problem, found = drift_if_needed(problem, found, training, listener)
     if is_poor(problem, found) and onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     return problem.response, _determined(problem, found, everything, training, listener)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
+import numpy as np
 import torch
 
 from cpunet.electronics.drawn_remains import KnownDecay
@@ -31,7 +32,8 @@ HOPELESS_FIT = 20.0
 # higher expected one: derivatives far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
 # A term that stretches the drift must lower chi-square by this much, four standard deviations.
-STRETCHES = 16.0
+# One that is 0 within this many of its own is not needed.
+STRETCHES, SURE = 16.0, 3.0
 # Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
@@ -139,6 +141,28 @@ def drift_if_better(
     if again.cost < found.cost - STRETCHES:
         return tried, again._replace(steps=steps)
     return problem, found._replace(steps=steps)
+
+
+def drift_if_needed(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Take the drift as simulated if what stretches it is 0 within its errors.
+
+    It may have been added before a ringing was found.
+    """
+    parameters = problem.parameters
+    stretch = [i for i, label in enumerate(parameters.labels) if label == STRETCH]
+    errors = np.sqrt(np.diagonal(found.covariance)[stretch])
+    if not stretch or (np.abs(parameters.vector()[stretch]) > SURE * errors).any():
+        return problem, found
+    simulated = problem.of(with_drift_terms(problem.response, 0))
+    again = levenberg_marquardt(simulated, training.steps, listener, coarse=False)
+    if again.cost < found.cost + STRETCHES:
+        return simulated, again._replace(steps=found.steps + again.steps)
+    return problem, found
 
 
 def free_decay_if_better(

@@ -100,6 +100,8 @@ def export_legend_pars(
     refuse_existing(out, *given, force=force)
     info = read_info(run)
     told = describe_responses([run])["runs"][0]
+    for doubt in told["doubts"]:
+        monitor.note(f"warning: {doubt}")
     known = known_detector(run, info)
     name = detector or known or EVERY_DETECTOR
     ae = None if report is None else _against_energy(report, info)
