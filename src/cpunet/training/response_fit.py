@@ -45,6 +45,8 @@ from cpunet.training.response_starts import (
 ANOTHER_DETECTOR = 100.0
 # Pulses of each side with which a poor fit is examined.
 CHECKED = 4096
+# Chi-square per moment above which a fast decay is tried beside a stretch of the drift.
+HIDDEN = 1.2
 # Rounds of optimal weights; those of the second are evaluated at the result of the first.
 ROUNDS = 2
 
@@ -182,7 +184,8 @@ def fit_response(
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
     if stretched and found.cost < HOPELESS_FIT * problem.moments:  # else a ringing is first
         problem, found = drift_if_better(problem, found, training, listener)
-    if is_poor(problem, found):
+    # a stretch hides some of what another decay does
+    if is_poor(problem, found) or (stretched and found.cost > HIDDEN * problem.moments):
         problem, found = free_decay_if_better(problem, found, training, told, listener)
     if is_poor(problem, found):
         own = problem.response.config
