@@ -15,6 +15,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training import response_fit, response_starts
 
 SEARCHES = ["_checked", "free_decay_if_better", "ringing_if_better"]
+DRIFT = ["drift_if_better", "drift_if_needed"]
 PHYSICS = "_with_wrong_physics"
 
 
@@ -23,7 +24,7 @@ PHYSICS = "_with_wrong_physics"
     [
         (1.01, True, [PHYSICS]),
         (1.01, False, [*SEARCHES, "_determined"]),
-        (0.99, True, [*SEARCHES, PHYSICS]),
+        (0.99, True, [*SEARCHES, *DRIFT, PHYSICS]),
     ],
 )
 def test_nothing_else_is_tried_for_another_detector(
@@ -37,7 +38,7 @@ def test_nothing_else_is_tried_for_another_detector(
     def replace(name: str, result: Any) -> None:
         monkeypatch.setattr(response_fit, name, lambda *_, **__: called.append(name) or result)
 
-    for name in SEARCHES:
+    for name in (*SEARCHES, *DRIFT):
         replace(name, (problem, found))
     for name in (PHYSICS, "_determined"):
         replace(name, name)
