@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_remains import DrawnRemains, KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
@@ -174,28 +174,40 @@ def fit_response(
     near = None if known is None else from_known(first, known, training, told, listener)
     problem, found = near or best_start(first, config, training, told, listener)
     everything = sets.bands()
-    stretched = problem.response.drift is not None
-    if not stretched and not is_poor(problem, found):
+    if problem.response.drift is None and not is_poor(problem, found):
         fit = _determined(problem, found, everything, training, listener)
         if not fit.poor:
             return problem.response, fit
     elif found.cost > ANOTHER_DETECTOR * problem.moments and onset_is_off(problem, training):
         return problem.response, _with_wrong_physics(problem, found, training, listener)
     problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
+    problem, found = _extended(problem, found, training, told, listener)
+    if is_poor(problem, found) and onset_is_off(problem, training):
+        return problem.response, _with_wrong_physics(problem, found, training, listener)
+    return problem.response, _determined(problem, found, everything, training, listener)
+
+
+def _extended(
+    problem: ResponseProblem,
+    found: Minimum,
+    training: MatchingConfig,
+    decay: KnownDecay | None,
+    listener: Listener | None,
+) -> tuple[ResponseProblem, Minimum]:
+    """Extend the response by what brings a poor or stretched fit closer."""
+    stretched = problem.response.drift is not None
     if stretched and found.cost < HOPELESS_FIT * problem.moments:  # else a ringing is first
         problem, found = drift_if_better(problem, found, training, listener)
     # a stretch hides some of what another decay does
     if is_poor(problem, found) or (stretched and found.cost > HIDDEN * problem.moments):
-        problem, found = free_decay_if_better(problem, found, training, told, listener)
+        problem, found = free_decay_if_better(problem, found, training, decay, listener)
     if is_poor(problem, found):
         own = problem.response.config
         problem, found = ringing_if_better(problem, found, own, training, listener)
     if stretched or (is_poor(problem, found) and onset_is_off(problem, training)):
         problem, found = drift_if_better(problem, found, training, listener)
         problem, found = drift_if_needed(problem, found, training, listener)
-    if is_poor(problem, found) and onset_is_off(problem, training):
-        return problem.response, _with_wrong_physics(problem, found, training, listener)
-    return problem.response, _determined(problem, found, everything, training, listener)
+    return problem, found
 
 
 def _determined(
