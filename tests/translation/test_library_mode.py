@@ -29,30 +29,29 @@ R, Z = np.arange(3.0), np.arange(4.0)
 FINE = 8  # samples of the charge to one of a template
 
 
-@pytest.fixture(scope="module")
-def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(folder: Path, *overrides: str, stretch: float = 0.0) -> Path:
     """A run, sampled every 16 ns, that knows a pole of 50 ns and a decay of 60 µs."""
-    recipe = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
+    known = ["generator.poles_ns=[50]", "generator.decay_us=60", *overrides]
+    recipe = load_recipe("fast", known)
     generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    folder = tmp_path_factory.mktemp("chain")
+    if generator.response.drift is not None:
+        generator.response.drift.stretch.data.fill_(stretch)
     info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
     model = nn.ModuleDict({"ren": generator})
     write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
     return folder
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture(scope="module")
 def stretched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, and charges drift for a tenth longer than simulated."""
-    also = ["generator.poles_ns=[50]", "generator.decay_us=60", "generator.drift_terms=1"]
-    recipe = load_recipe("fast", also)
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    generator.response.drift.stretch.data.fill_(0.1)
     folder = tmp_path_factory.mktemp("stretched")
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+    return written(folder, "generator.drift_terms=1", stretch=0.1)
 
 
 def fine_charge(n_samples: int, dt_ns: float, seed: int = 0) -> np.ndarray:
