@@ -42,10 +42,10 @@ SHORT = ("training.steps=4", "training.ringing_mhz=[]")
 RECIPE = load_recipe("fast", ONE_START)
 
 
-def charge(n: int, seed: int, slowest: float = 3.0) -> np.ndarray:
+def charge(n: int, seed: int, slowest: float = 3.0, faster: float = 1.0) -> np.ndarray:
     """Charge of two sites with logistic edges, finely sampled."""
     rng = np.random.default_rng(seed)
-    time = (np.arange(225 * FINE) + 0.5) / FINE
+    time = 60 + faster * ((np.arange(225 * FINE) + 0.5) / FINE - 60)
 
     def site() -> np.ndarray:
         place = rng.uniform(60, 110, (n, 1))
@@ -231,6 +231,31 @@ def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> 
     said = [note for note in monitor.warnings if "poor fit" in note]
     assert len(said) == 1
     assert f"chi-square is {fit['chi_square'] / fit['moments']:.1f} per moment" in said[0]
+
+
+@pytest.mark.thorough
+def test_a_stretched_drift_is_told_and_translated(
+    run: Run, files: Files, tmp_path: Path
+) -> None:
+    sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.4), FINE))
+    monitor = Listening()
+    recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
+    info = train_run(
+        sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"), monitor=monitor
+    )
+    fit = info["fit"]
+    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
+    assert fit["parameters"]["drift_stretch"] == pytest.approx(0.4, abs=0.08)
+    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
+    assert any(note.startswith("warning: charges drift for") for note in monitor.notes)
+    assert "longer than simulated" in fit["verdict"]
+    # what is translated rises as the data do
+    clean = REN.load(tmp_path / "run").translate(
+        sampled(charge(N, 1, faster=1.4), FINE), noise=False
+    )
+    truth = REN.load(run.folder).translate(sampled(charge(N, 1), FINE), noise=False)
+    steps = [np.sort(np.diff(pulses).max(axis=1)) for pulses in (clean, truth)]
+    np.testing.assert_allclose(*steps, rtol=0.03)
 
 
 @pytest.mark.thorough

@@ -142,7 +142,8 @@ def match(
     causes = diagnosis(fit.pulls) if fit.poor else []
     for number, cause in enumerate(causes, 1):
         monitor.note(f"  {number}. {cause}")
-    for found in beyond(response.describe()) + stretched(response.describe()):
+    longer = stretched(response.describe())
+    for found in beyond(response.describe()) + longer:
         monitor.note(f"warning: {found}")
     recipe = _with_config(recipe, response.config)
     ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
@@ -171,7 +172,7 @@ def match(
     told = {
         "parameters": response.describe(),
         **asdict(fit),
-        "verdict": fit.verdict,
+        "verdict": "; ".join([fit.verdict, *longer]),
         "causes": causes,
         "in_no_band": {"sim": beside[0], "data": beside[1]},
         "noise": {
