@@ -20,6 +20,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training import response_starts
 from cpunet.training.run_folder import write_run
 from cpunet.translation.translator import REN
 from synthetic import (
@@ -137,7 +138,7 @@ def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> N
 
 @pytest.mark.thorough
 def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
-    files, chain, tmp_path
+    files, chain, tmp_path, monkeypatch
 ) -> None:
     recipe = load_recipe("fast", [*SHORT, "generator.drift_terms=1"])
     generator = ResponseGenerator(recipe.matching.generator, 16.0)
@@ -152,8 +153,10 @@ def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
     alone = train_run(files["sim"], files["one"], tmp_path / "alone", FAST, start)
     assert "drift_stretch" not in alone["fit"]["parameters"]
     free = load_recipe("fast", [*SHORT, "training.drift_terms=1"])
+    # none is true, and whether it is then taken out again is up to chance
+    monkeypatch.setattr(response_starts, "SURE", 0.0)
     goes_on = train_run(files["sim"], files["one"], tmp_path / "free", free, start)
-    assert abs(goes_on["fit"]["parameters"]["drift_stretch"]) < 0.05  # none is true
+    assert abs(goes_on["fit"]["parameters"]["drift_stretch"]) < 0.05
     assert REN.load(tmp_path / "free").backend.chain.response.drift is not None
 
 

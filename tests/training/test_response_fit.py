@@ -27,7 +27,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training import response_fit, translated
+from cpunet.training import response_fit, response_starts, translated
 from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.levenberg_marquardt import Minimum
 from cpunet.training.moments import Moments, Readings
@@ -274,6 +274,15 @@ def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     alone, poor = problem.fit(0, *DRIFT[1:], sim=short)  # as in fast
     assert alone.drift is None
     assert poor.chi_square > 3 * GOOD_FIT * poor.moments
+
+
+@pytest.mark.thorough
+def test_a_drift_of_another_detector_is_not_stretched(problem: Problem, monkeypatch) -> None:
+    monkeypatch.setattr(response_starts, "MAX_STRETCH", 0.05)
+    short = simulated(faster(charge(N, seed=1), 1.25))
+    response, fit = problem.fit(0, *DRIFT, sim=short)
+    assert response.drift is None
+    assert fit.poor
 
 
 def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> None:

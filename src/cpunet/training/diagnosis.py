@@ -45,8 +45,10 @@ class Part:
 ONSET_PART = Part(
     "the onset",
     "no readout shapes it: the physics simulated are not those of the detector",
-    "--recipe best stretches the drift; cpunet calibrate finds temperature and impurities",
+    "cpunet calibrate finds temperature and impurities",
 )
+# a remedy that comes before it, in recipes that do not stretch by themselves
+STRETCH = "--recipe best stretches the drift; "
 PARTS = {
     "onset": ONSET_PART,
     "edge": Part(
@@ -101,11 +103,20 @@ def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
     return {part: off[part] for part in sorted(off, key=order, reverse=True)}
 
 
-def diagnosis(pulls: Mapping[str, float]) -> list[str]:
-    """One line for each part that is off: by how much, why, and what to try."""
+def diagnosis(pulls: Mapping[str, float], *, stretches: bool = False) -> list[str]:
+    """One line for each part that is off: by how much, why, and what to try.
+
+    Parameters
+    ----------
+    pulls
+        Pulls of the moments by name, from a fit.
+    stretches
+        Whether the fit could stretch the drift.
+    """
     return [
-        f"{PARTS[part].name} is off by {size:.0f} σ: {PARTS[part].cause}; "
-        f"try: {PARTS[part].remedy}"
+        f"{PARTS[part].name} is off by {size:.0f} σ: {PARTS[part].cause}; try: "
+        + (STRETCH if part == "onset" and not stretches else "")
+        + PARTS[part].remedy
         for part, size in parts_off(pulls).items()
     ]
 

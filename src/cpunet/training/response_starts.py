@@ -32,8 +32,9 @@ HOPELESS_FIT = 20.0
 # higher expected one: derivatives far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
 # A term that stretches the drift must lower chi-square by this much, four standard deviations.
-# One that is 0 within this many of its own is not needed.
-STRETCHES, SURE = 16.0, 3.0
+# One that is 0 within this many of its own is not needed.  Drift that is longer or shorter by
+# more than a third is that of another detector.
+STRETCHES, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
 # Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
@@ -138,7 +139,9 @@ def drift_if_better(
     tried = problem.of(with_drift_terms(problem.response, terms))
     again = levenberg_marquardt(tried, training.steps, listener, coarse=terms == 1)
     steps = found.steps + again.steps
-    if again.cost < found.cost - STRETCHES:
+    drift = tried.response.drift
+    sane = drift is not None and float(drift.stretch.detach().abs().max()) < MAX_STRETCH
+    if sane and again.cost < found.cost - STRETCHES:
         return tried, again._replace(steps=steps)
     return problem, found._replace(steps=steps)
 

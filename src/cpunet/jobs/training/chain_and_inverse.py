@@ -139,7 +139,8 @@ def match(
             f"and {beside[1]} measured pulses"
         )
     monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
-    causes = diagnosis(fit.pulls) if fit.poor else []
+    stretches = recipe.matching.training.drift_terms > 0
+    causes = diagnosis(fit.pulls, stretches=stretches) if fit.poor else []
     for number, cause in enumerate(causes, 1):
         monitor.note(f"  {number}. {cause}")
     longer = stretched(response.describe())
