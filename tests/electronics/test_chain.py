@@ -89,6 +89,14 @@ def test_ornl_decays_as_measured():
     assert 0.93 <= 0.80 / after <= 0.97
 
 
+def test_a_changed_copy_has_its_own_response():
+    chain = read_electronics("ornl")
+    before = chain.step_response(50.0)
+    slower = chain.model_copy(update={"bandwidth_poles_ns": (200.0,)})
+    assert slower.step_response(50.0) == changed("ornl", bandwidth_poles_ns=[200]).step_response(50)
+    assert slower.step_response(50.0) < before
+
+
 def test_only_the_ringing_preset_rings():
     rings = read_electronics("ringing").step_response(T_NS)
     quiet = read_electronics("legend200").step_response(T_NS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -293,7 +292,7 @@ class Electronics(_Figures):
         times["decays.tau_us"] = 1e3 * min(part.tau_us for part in self.decays)
         return times
 
-    @cached_property
+    @property
     def transfer(self) -> Exponentials:
         r"""Linear part of the chain as a sum of exponentials.
 
