@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cpunet.electronics.remains_fit import fit_rate
 from cpunet.electronics.remains_law import RemainsLaw, energies_at
+from cpunet.errors import CpunetError
 
 TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
 
@@ -34,3 +36,20 @@ def test_density_is_that_of_drawn_remains(rate_khz: float):
 def test_energies_follow_their_quantiles():
     drawn = energies_at(np.random.default_rng(2).random(20_000), TH228)
     assert np.quantile(drawn, np.linspace(0, 1, 11)) == pytest.approx(TH228, rel=0.05)
+
+
+@pytest.mark.parametrize("error_kev", [0.3, 3.0])
+def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
+    law, rng = RemainsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
+    energies = energies_at(rng.random(8000), TH228)
+    measured = law.draw(8000, rng) + rng.normal(0, error_kev, 8000)
+    found = fit_rate(measured, error_kev, 54.6, energies)
+    assert found.recorded
+    assert found.law.rate_khz == pytest.approx(1.5, abs=3 * found.rate_error_khz)
+    assert found.sigma_kev == pytest.approx(error_kev, rel=0.05)
+
+
+def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
+    endless = RemainsLaw(0.02, 1e12, TH228)
+    with pytest.raises(CpunetError, match="give a lower rate or a shorter decay"):
+        endless.draw(1000, np.random.default_rng(1))

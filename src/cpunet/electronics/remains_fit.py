@@ -27,7 +27,9 @@ Function = Callable[[FloatArray], float]
 # Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
-LEAST_GRID, MOST_GRID = 1024, 16384  # points of the density
+# Points of the density. It is periodic, so the grid must hold all energies, also in steps of
+# small errors: down to 0.15 keV.
+LEAST_GRID, MOST_GRID = 1024, 131_072
 STEPS_OF_SIGMA = 4.0
 NEGLIGIBLE = 8.8  # standard deviations in u: exp(-8.8²/2) is 1.5e-17
 ROOM = 10.0  # standard deviations of room on either side

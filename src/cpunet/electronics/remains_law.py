@@ -27,9 +27,11 @@ import scipy.fft
 import scipy.special
 
 from cpunet.electronics.exponentials import FloatArray
+from cpunet.errors import CpunetError
 
 # After this many decay times the remainder is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
+MOST_EXPECTED = 10_000.0  # maximum expected number of pulses before a trace, for memory
 _MIN_KEV = 1e-3
 _ENERGIES = 64  # energies that represent a spectrum in sums over it
 
@@ -188,8 +190,19 @@ def earlier_pulses(
     tuple
         Index of the trace, energy in keV and time in us (0 to `longest_us`) of each pulse,
         all of shape ``(pulses,)``.
+
+    Raises
+    ------
+    CpunetError
+        If more than `MOST_EXPECTED` pulses are expected for a trace.
     """
-    counts = rng.poisson(rate_khz * 1e-3 * longest_us, size=n)
+    expected = rate_khz * 1e-3 * longest_us
+    if expected > MOST_EXPECTED:
+        raise CpunetError(
+            f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
+            f"than {MOST_EXPECTED:g}; give a lower rate or a shorter decay"
+        )
+    counts = rng.poisson(expected, size=n)
     row = np.repeat(np.arange(n), counts)
     kev = energies_at(rng.random(len(row)), energies_kev)
     return row, kev, rng.uniform(0, longest_us, size=len(row))

@@ -41,7 +41,8 @@ def gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) -> 
         baselines.append(np.array(raw.waveforms[:, : int(samples)]))
         energies.append(raw.energy_kev)
         height = prepared.pulses.waveforms.max(axis=1) * prepared.scale
-        heights.append(height / prepared.pulses.energy_kev)
+        with np.errstate(divide="ignore"):  # an energy of 0 is left out by `_gain`
+            heights.append(height / prepared.pulses.energy_kev)
         scales.append(prepared.scale)
         slopes.append(prepared.tail_slope)
         if sum(map(len, baselines)) >= most:
