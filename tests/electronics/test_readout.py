@@ -77,6 +77,10 @@ def test_noise_cut_from_baselines_is_theirs(tmp_path):
     assert level > 1.9
     with pytest.raises(CpunetError, match="shorter than the record"):
         read_baselines(path, 2001, 16)
+    white[17, 3] = np.nan
+    write_pulses(tmp_path / "broken.lh5", Pulses.of(white, dt_ns=16, energy_kev=np.zeros(50)))
+    with pytest.raises(CpunetError, match="baseline 17 is not finite; leave it out"):
+        read_baselines(tmp_path / "broken.lh5", 1200, 16)
 
 
 def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
