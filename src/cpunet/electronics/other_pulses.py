@@ -29,8 +29,8 @@ class OtherPulses:
     n_piled
         Number of additional pulses within each trace.
     piled_kev, piled_ns
-        Energy of the largest additional pulse, and its start relative to the trace's own
-        pulse in ns (negative: before it). NaN where there is none.
+        Energy of the largest additional pulse, and its start after `n_pre` samples in ns
+        (negative: before them). NaN where there is none.
     """
 
     added_kev: FloatArray
