@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy.typing as npt
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.recipes.base import Config, Fraction, NonNegative, Positive, Samples
@@ -19,18 +19,14 @@ MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
 _Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
-class _Figures(Config):
-    model_config = ConfigDict(allow_inf_nan=False)
-
-
-class SlowPart(_Figures):
+class SlowPart(Config):
     """A `fraction` of the charge that arrives with the time constant `tau_ns`."""
 
     fraction: Fraction
     tau_ns: Positive
 
 
-class Ringing(_Figures):
+class Ringing(Config):
     r"""Damped oscillation added to a unit step.
 
     .. math:: f\, e^{-t / \tau_d} \sin(2 \pi \nu t)
@@ -44,14 +40,14 @@ class Ringing(_Figures):
     damping_ns: Positive
 
 
-class Decay(_Figures):
+class Decay(Config):
     """A `fraction` of the step that decays with the time constant `tau_us`."""
 
     fraction: _Share
     tau_us: Positive
 
 
-class NonLinearity(_Figures):
+class NonLinearity(Config):
     r"""Departures from a linear chain.
 
     Parameters
@@ -67,14 +63,14 @@ class NonLinearity(_Figures):
     slew_kev_per_ns: Positive | None
 
 
-class NoiseLine(_Figures):
+class NoiseLine(Config):
     """A narrow line in the noise: its frequency and its fraction of the noise power."""
 
     frequency_MHz: Positive
     power_fraction: Fraction
 
 
-class NoiseSpectrum(_Figures):
+class NoiseSpectrum(Config):
     r"""Shape of the noise power spectrum.
 
     A flat continuum with a high-frequency roll-off and a low-frequency excess,
@@ -98,7 +94,7 @@ class NoiseSpectrum(_Figures):
         return self
 
 
-class Noise(_Figures):
+class Noise(Config):
     """Noise with an RMS of `rms_kev`, independent of the pulse energy.
 
     It is drawn from a spectrum or cut from measured baselines. `baselines_file` holds
@@ -117,26 +113,26 @@ class Noise(_Figures):
         return self
 
 
-class EarlierPulses(_Figures):
+class EarlierPulses(Config):
     """Pulses before the record, a Poisson process. Their tails lie under the traces."""
 
     rate_kHz: _Rate
 
 
-class PileUp(_Figures):
+class PileUp(Config):
     """Second pulses within the record, a Poisson process."""
 
     rate_kHz: _Rate
 
 
-class Hum(_Figures):
+class Hum(Config):
     """Mains hum: a sine under every trace with a random phase."""
 
     frequency_Hz: Positive
     amplitude_kev: Positive
 
 
-class Wander(_Figures):
+class Wander(Config):
     r"""A baseline that wanders slowly: an Ornstein-Uhlenbeck process under every trace.
 
     Its covariance is :math:`\sigma^2 e^{-|t - t'| / T}`, with the RMS :math:`\sigma` of
@@ -147,7 +143,7 @@ class Wander(_Figures):
     rms_kev: Positive
 
 
-class Electronics(_Figures):
+class Electronics(Config):
     """A readout chain.
 
     Parameters

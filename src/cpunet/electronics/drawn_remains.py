@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.baseline_tails import tail_shape
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
@@ -221,10 +222,10 @@ def passing(
     if len(templates) < MIN_TEMPLATES:
         return None
     raw = np.stack(templates[:TEMPLATES])
-    time_us = np.arange(raw.shape[1]) * remains.dt_ns * 1e-3
-    unit = remains.adc_per_kev * np.exp(-time_us / remains.decay_us)
+    shape = tail_shape(raw.shape[1], remains.dt_ns, remains.decay_us)
+    unit = (remains.adc_per_kev * shape).astype(np.float32)
     shares = []
     for kev in SIZES_KEV:
-        lifted = Pulses.of(raw + np.float32(kev) * unit.astype(np.float32), dt_ns=remains.dt_ns)
+        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=remains.dt_ns)
         shares.append(len(apply_cuts(prepare(lifted, config, "measured"), cuts)) / len(raw))
     return tuple(share / max(shares[0], 1e-9) for share in np.minimum.accumulate(shares))

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 import scipy.special
 
 from cpunet.electronics.exponentials import FloatArray
@@ -87,43 +86,6 @@ class RemainsLaw:
         ratio = _some(self.energies_kev) / np.asarray(kev, float)[..., np.newaxis]
         lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
         return np.asarray(-np.expm1(-self.expected * lives), float)
-
-    def density(
-        self, step_kev: float, n: int, sigma_kev: float
-    ) -> tuple[FloatArray, FloatArray]:
-        r"""Probability density of a measured remainder, summed over all pulses, per keV.
-
-        .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du
-
-        Parameters
-        ----------
-        step_kev, n
-            Step in keV and number of points of the grid. Its first quarter lies below 0.
-        sigma_kev
-            Standard deviation of the measurement in keV, at least a few steps of the grid.
-
-        Returns
-        -------
-        tuple
-            Values in keV and the density at them, both of shape ``(n,)``.
-
-        Examples
-        --------
-        Its mean is that of Campbell's theorem.
-
-        >>> law = RemainsLaw(1.0, 100.0, (300.0, 300.0))
-        >>> kev, density = law.density(1.0, 4096, 5.0)
-        >>> round(float(kev @ density), 2), round(law.mean_kev, 2)
-        (30.0, 30.0)
-        """
-        u = 2 * np.pi * scipy.fft.rfftfreq(n, step_kev)
-        per_pulse = characteristic_exponents(u, _some(self.energies_kev)).mean(axis=1)
-        exponent = self.expected * per_pulse - 0.5 * (sigma_kev * u) ** 2
-        first = n // 4
-        shifted = np.exp(exponent + 1j * u * first * step_kev)
-        density = scipy.fft.irfft(np.conj(shifted), n) / step_kev
-        kev = np.asarray((np.arange(n) - first) * step_kev, float)
-        return kev, np.asarray(np.maximum(density, 0.0), float)
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw the remainder in keV, summed over all earlier pulses, for `n` traces."""
