@@ -8,8 +8,15 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Samples of padding around a window, so that it can be cut anew if noise moves the maximum.
+# Samples of padding around a window, so that it can be cut anew if noise moves the maximum and
+# delayed pulses stay within the record. A window of 800 becomes a record of 1400, a fast length
+# of the FFT.
 PADDING_BEFORE, PADDING_AFTER = 200, 400
+
+
+def record_length(window: int) -> int:
+    """Number of samples of the record that a window of `window` samples becomes."""
+    return PADDING_BEFORE + window + PADDING_AFTER
 
 
 def extended(
@@ -51,6 +58,6 @@ def extended(
 
 
 def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Extend prepared windows to PADDING_BEFORE + config.length + PADDING_AFTER samples."""
-    length = PADDING_BEFORE + config.length + PADDING_AFTER
-    return extended(windows, config, dt_ns, length, PADDING_BEFORE + config.samples_before)
+    """Extend prepared windows to records, see `record_length`."""
+    before = PADDING_BEFORE + config.samples_before
+    return extended(windows, config, dt_ns, record_length(config.length), before)
