@@ -124,6 +124,7 @@ def test_slew_and_quadratic_bend_tall_pulses_more():
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),
         ({"colour": "blue"}, "colour"),
+        ({"trigger_jitter_ns": 1e12}, "trigger_jitter_ns"),  # would be followed for ages
     ],
 )
 def test_impossible_chains_name_the_field(tmp_path: Path, values: dict, field: str):

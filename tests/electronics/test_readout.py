@@ -163,6 +163,15 @@ def test_hum_is_a_wave_of_its_size():
     assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
 
 
+def test_wandering_slower_than_anything_is_a_level():
+    quiet = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 0)
+    chain = quiet.disturbed(wander=Wander(time_us=1e20, rms_kev=20))
+    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
+    added_kev = draw_other_pulses(steps, chain, np.random.default_rng(1)).added_kev
+    assert added_kev[:, 0].std() == pytest.approx(20, rel=0.1)
+    assert np.ptp(added_kev, axis=1).max() < 1e-3
+
+
 def test_wandering_is_recovered_from_levels_and_their_changes():
     quiet = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 0)
     chain = quiet.disturbed(wander=Wander(time_us=200, rms_kev=20))

@@ -122,7 +122,7 @@ class BaselineNoise:
             )
         if not np.ptp(flat, axis=1).any():
             raise CpunetError(
-                "the baselines are constant: there is no noise to learn; give measured traces"
+                "most baselines are constant: there is no noise to learn; give measured traces"
             )
         continuum, lines = spectrum(flat)
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))

@@ -16,6 +16,7 @@ REFERENCE_KEV = 2614.5
 
 _Share = Annotated[float, Field(gt=0, le=1)]
 MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
+MAX_JITTER_NS = 1e6  # longer than records; traces are followed from the start of the pulse
 _Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
@@ -202,7 +203,7 @@ class Electronics(Config):
     noise: Noise
     baseline_mean_adc: NonNegative
     baseline_spread_adc: NonNegative
-    trigger_jitter_ns: NonNegative
+    trigger_jitter_ns: Annotated[float, Field(ge=0, le=MAX_JITTER_NS)]
     earlier_pulses: EarlierPulses
     pile_up: PileUp
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
