@@ -45,6 +45,15 @@ def test_step_is_that_of_the_rational_transfer_function(taus: list[float], fract
     assert np.abs(chain.step(t) - expected).max() < 1e-4
 
 
+@given(st.lists(st.integers(0, 12), min_size=1, max_size=8))
+def test_times_stay_in_order_and_far_enough_apart_for_residues(steps: list[int]):
+    taus = 40 * (1 + 5e-4 * np.array(steps))
+    moved = np.array(moved_apart(taus.tolist()))
+    assert (np.diff(np.sort(moved)) > 0.9e-3 * 40).all()
+    assert (np.diff(moved[np.argsort(taus, kind="stable")]) > 0).all()
+    assert np.abs(moved - taus).max() < 5e-3 * 40
+
+
 @pytest.mark.parametrize("name", electronics_names())
 def test_impulse_is_the_derivative_of_the_step(name: str):
     chain = read_electronics(name)
