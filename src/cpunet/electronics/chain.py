@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -284,7 +285,7 @@ class Electronics(Config):
             times["overshoot.tau_ns"] = self.overshoot.tau_ns
         if self.ringing:
             # an oscillation is resolved if one radian of it is
-            times["ringing.frequency_MHz"] = 1e3 / (2 * 3.1416 * self.ringing.frequency_MHz)
+            times["ringing.frequency_MHz"] = 1e3 / (2 * math.pi * self.ringing.frequency_MHz)
             times["ringing.damping_ns"] = self.ringing.damping_ns
         times["decays.tau_us"] = 1e3 * min(part.tau_us for part in self.decays)
         return times

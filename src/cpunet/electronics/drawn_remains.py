@@ -171,8 +171,8 @@ class SameNoise:
 
     def __init__(self, noise: BaselineNoise | TraceNoise) -> None:
         self._noise = noise
-        self._asked: tuple[Any, bytes, int] | None = None  # arguments of the last draw
-        self._drawn: tuple[FloatArray, Any] | None = None  # and the state after it
+        # arguments of the last draw, its result, and the state of the generator after it
+        self._last: tuple[Any, FloatArray, Any] | None = None
 
     @property
     def dt_ns(self) -> float:
@@ -184,13 +184,10 @@ class SameNoise:
     ) -> FloatArray:
         """Draw like the noise itself; repeat the last draw for the same generator state."""
         asked = (rng.bit_generator.state, energy_kev.tobytes(), length)
-        if self._drawn is None or asked != self._asked:
-            self._asked = asked
-            self._drawn = (
-                self._noise.draw(energy_kev, length, rng),
-                rng.bit_generator.state,
-            )
-        drawn, rng.bit_generator.state = self._drawn
+        if self._last is None or self._last[0] != asked:
+            drawn = self._noise.draw(energy_kev, length, rng)
+            self._last = asked, drawn, rng.bit_generator.state
+        _, drawn, rng.bit_generator.state = self._last
         return drawn.copy()
 
 

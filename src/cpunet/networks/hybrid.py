@@ -64,13 +64,11 @@ class EdgeResidual(RecordCorrection):
         self.down = block(width, 2 * width)
         self.up = block(3 * width, width)
         self.outlet = nn.Conv1d(width, FOLD, 1)
-        nn.init.zeros_(self.outlet.weight)
-        if self.outlet.bias is not None:
-            nn.init.zeros_(self.outlet.bias)
         self.register_buffer("position", positional_map(width, steps, 0), persistent=False)
         self.register_buffer("taper", taper(BEFORE + AFTER, RAMP), persistent=False)
         # whether there is anything to add: a network of zeros is not run
         self.register_buffer("used", torch.zeros((), dtype=torch.bool))
+        self.clear()
 
     def clear(self) -> None:
         """Make the correction exactly zero."""
