@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import tail_slope
 from cpunet.recipes.schema import PreparationConfig
 
 # Samples of padding around a window, so that it can be cut anew if noise moves the maximum and
@@ -46,13 +46,13 @@ def extended(
     result[:, inside] = windows[:, time[inside]]
     late = time >= config.length
     if late.any():
-        measured = prepare(Pulses.of(windows, dt_ns=dt_ns), config, "measured")
-        per_sample = np.zeros(len(windows))
-        per_sample[measured.index] = measured.tail_slope * dt_ns * 1e-6
+        # 0 for a tail that is not positive; a window need not be aligned
+        slope = np.nan_to_num(tail_slope(windows, dt_ns, config.decay_fit_samples))
         # the mean of the last samples is the level at their centre
         since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
         end = windows[:, -config.tail_samples :].mean(axis=1)
-        result[:, late] = end[:, np.newaxis] * np.exp(per_sample[:, np.newaxis] * since)
+        decay = np.exp(slope[:, np.newaxis] * dt_ns * 1e-6 * since)
+        result[:, late] = end[:, np.newaxis] * decay
     result[np.isnan(windows).any(axis=1)] = np.nan
     return result
 
