@@ -154,6 +154,16 @@ def test_drawn_noise_has_the_density_it_is_drawn_from() -> None:
     np.testing.assert_allclose(found.mean(axis=0)[positive], wanted, rtol=0.05)
 
 
+@pytest.mark.parametrize("end", [0, -1])
+def test_noise_at_either_end_of_the_spectrum_has_its_power(end: int) -> None:
+    """A level of each trace, or samples of alternating sign."""
+    density = np.zeros(GRID // 2 + 1)
+    density[end] = GRID
+    drawn = of_density(density).draw(np.ones(1500), 3000, np.random.default_rng(15))
+    assert of_density(density).rms == pytest.approx(1)
+    assert drawn.std() == pytest.approx(1, rel=0.08)
+
+
 def test_white_noise_of_different_pulses_has_nothing_in_common() -> None:
     white = of_density(np.ones(GRID // 2 + 1))
     drawn = white.draw(np.ones(300), 1400, np.random.default_rng(5))
@@ -250,6 +260,21 @@ def test_beginnings_of_windows_show_the_fast_part() -> None:
     drawn = noise.draw(np.ones(400), 1200, rng) / TO_PREPARED
     for lag in (1, 3, 8):
         assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
+
+
+@pytest.mark.parametrize("samples", [6, 20, 37, 38])
+def test_short_beginnings_of_many_windows_have_one_kind_of_noise(samples: int) -> None:
+    white = np.random.default_rng(14).normal(size=(100, 800))
+    windows = Pulses.of(white, dt_ns=DT_NS, energy_kev=np.full(100, 1000.0))
+    noise = BaselineNoise.from_windows(windows, samples)
+    assert noise.rms == pytest.approx(1000, rel=0.15)
+    with pytest.raises(CpunetError, match="the baselines have 5 samples; the noise needs 6"):
+        BaselineNoise.from_windows(windows, 5)
+
+
+def test_traces_without_noise_are_refused() -> None:
+    with pytest.raises(CpunetError, match="most baselines are constant"):
+        BaselineNoise.from_traces(on_baselines(np.zeros((100, 1200))), CONFIG)
 
 
 def test_windows_without_energies_are_refused() -> None:

@@ -45,6 +45,15 @@ def test_step_is_that_of_the_rational_transfer_function(taus: list[float], fract
     assert np.abs(chain.step(t) - expected).max() < 1e-4
 
 
+@given(st.lists(st.integers(0, 12), min_size=1, max_size=8))
+def test_times_stay_in_order_and_far_enough_apart_for_residues(steps: list[int]):
+    taus = 40 * (1 + 5e-4 * np.array(steps))
+    moved = np.array(moved_apart(taus.tolist()))
+    assert (np.diff(np.sort(moved)) > 0.9e-3 * 40).all()
+    assert (np.diff(moved[np.argsort(taus, kind="stable")]) > 0).all()
+    assert np.abs(moved - taus).max() < 5e-3 * 40
+
+
 @pytest.mark.parametrize("name", electronics_names())
 def test_impulse_is_the_derivative_of_the_step(name: str):
     chain = read_electronics(name)
@@ -89,6 +98,14 @@ def test_ornl_decays_as_measured():
     assert 0.93 <= 0.80 / after <= 0.97
 
 
+def test_a_changed_copy_has_its_own_response():
+    chain = read_electronics("ornl")
+    before = chain.step_response(50.0)
+    slower = chain.model_copy(update={"bandwidth_poles_ns": (200.0,)})
+    read_anew = changed("ornl", bandwidth_poles_ns=[200])
+    assert slower.step_response(50.0) == read_anew.step_response(50.0) < before
+
+
 def test_only_the_ringing_preset_rings():
     rings = read_electronics("ringing").step_response(T_NS)
     quiet = read_electronics("legend200").step_response(T_NS)
@@ -116,6 +133,7 @@ def test_slew_and_quadratic_bend_tall_pulses_more():
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),
         ({"colour": "blue"}, "colour"),
+        ({"trigger_jitter_ns": 1e12}, "trigger_jitter_ns"),  # would be followed for ages
     ],
 )
 def test_impossible_chains_name_the_field(tmp_path: Path, values: dict, field: str):

@@ -77,6 +77,10 @@ def test_noise_cut_from_baselines_is_theirs(tmp_path):
     assert level > 1.9
     with pytest.raises(CpunetError, match="shorter than the record"):
         read_baselines(path, 2001, 16)
+    white[17, 3] = np.nan
+    write_pulses(tmp_path / "broken.lh5", Pulses.of(white, dt_ns=16, energy_kev=np.zeros(50)))
+    with pytest.raises(CpunetError, match="baseline 17 is not finite; leave it out"):
+        read_baselines(tmp_path / "broken.lh5", 1200, 16)
 
 
 def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
@@ -127,7 +131,8 @@ def test_remains_follow_the_law_and_all_decays_of_the_chain():
 
 
 def test_second_pulses_are_where_the_truth_says():
-    chain = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 30)
+    quiet = {"noise": {"rms_kev": 0.0, "spectrum": QUIET}, "trigger_jitter_ns": 200}
+    chain = changed("ornl", **quiet).disturbed(0, 30)
     steps = Pulses.of(np.ones((200, 900)), dt_ns=4, energy_kev=np.full(200, 1000.0))
     traces = read_out(steps, chain, seed=2)
     alone = np.flatnonzero((traces.n_piled == 1) & (traces.piled_ns > 1000))
@@ -135,8 +140,15 @@ def test_second_pulses_are_where_the_truth_says():
     adc = chain.gain_adc_per_kev
     own = adc * traces.true_energy_kev[:, None] * traces.response
     rest = (traces.waveforms - traces.baseline_adc[:, None] - own)[alone] / adc
-    begun = np.array([np.argmax(row > 0.3 * row.max()) for row in rest]) - chain.n_pre
-    assert begun * chain.dt_ns == pytest.approx(traces.piled_ns[alone], abs=150)
+
+    def rise_ns(rows: np.ndarray) -> np.ndarray:
+        """Interpolated time at which the traces rise through 0.3 of their maxima."""
+        level = 0.3 * rows.max(axis=1)
+        after = (rows > level[:, None]).argmax(axis=1)
+        low, high = (rows[np.arange(len(rows)), at] for at in (after - 1, after))
+        return chain.dt_ns * (after - (high - level) / (high - low))
+
+    assert rise_ns(rest) - rise_ns(own[alone]) == pytest.approx(traces.piled_ns[alone], abs=5)
     assert rest.max(axis=1) == pytest.approx(traces.piled_kev[alone], rel=0.03)
     assert np.isnan(traces.piled_kev[traces.n_piled == 0]).all()
 
@@ -149,6 +161,15 @@ def test_hum_is_a_wave_of_its_size():
     traces = read_out(steps, chain, seed=2)
     level = traces.waveforms[:, :400].mean(axis=1) - traces.baseline_adc
     assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
+
+
+def test_wandering_slower_than_anything_is_a_level():
+    quiet = changed("ornl", noise={"rms_kev": 0.0, "spectrum": QUIET}).disturbed(0, 0)
+    chain = quiet.disturbed(wander=Wander(time_us=1e20, rms_kev=20))
+    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
+    added_kev = draw_other_pulses(steps, chain, np.random.default_rng(1)).added_kev
+    assert added_kev[:, 0].std() == pytest.approx(20, rel=0.1)
+    assert np.ptp(added_kev, axis=1).max() < 1e-3
 
 
 def test_wandering_is_recovered_from_levels_and_their_changes():

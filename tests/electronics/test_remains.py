@@ -153,6 +153,15 @@ def test_slow_decays_are_told_by_their_levels():
     assert found.decay_us == pytest.approx(570, rel=0.05)
 
 
+def test_energies_of_zero_are_left_out(busy: RawTraces, found: Remains):
+    raw = as_pulses(busy)
+    energy = raw.energy_kev.copy()
+    energy[:5] = 0
+    blocks = in_blocks(Pulses.of(raw.waveforms, dt_ns=16, energy_kev=energy))
+    again = Remains.of_traces(blocks, PREPARATION)
+    assert again.adc_per_kev == pytest.approx(found.adc_per_kev, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -18,7 +18,7 @@ import scipy.cluster.vq
 import scipy.fft
 
 from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.noise_spectrum import spectrum
+from cpunet.electronics.noise_spectrum import FIRST_CLEAN_BIN, spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Prepared, prepare
@@ -35,6 +35,7 @@ SIGMA_PER_MAD = 1.4826
 # Baselines are clustered along directions in which their band powers spread this many times
 # more than those of baselines from a single spectrum.
 KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
+FIRST_OF_BANDS = 4  # bins below it hold residuals of the mean, and drifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +108,21 @@ class BaselineNoise:
 
     @classmethod
     def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
+        samples = baselines.shape[1]
+        if samples < 2 * FIRST_CLEAN_BIN:
+            raise CpunetError(
+                f"the baselines have {samples} samples; the noise needs "
+                f"{2 * FIRST_CLEAN_BIN} or more, so raise preparation.baseline_samples"
+            )
         flat = baselines[_flat(baselines)] if len(baselines) else baselines
         if len(flat) < MIN_N:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {n} traces; give more traces "
                 f"(at least {MIN_N} with known energy)"
+            )
+        if not np.ptp(flat, axis=1).any():
+            raise CpunetError(
+                "most baselines are constant: there is no noise to learn; give measured traces"
             )
         continuum, lines = spectrum(flat)
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
@@ -210,7 +221,12 @@ class BaselineNoise:
 
     def _sizes(self, densities: Values, long: int) -> FloatArray:
         """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
-        return np.asarray(np.sqrt(0.5 * long * self._at(densities, long)), np.float32)
+        variances = 0.5 * long * self._at(densities, long)
+        # these bins are real: all their power is in the real part
+        variances[:, 0] *= 2
+        if long % 2 == 0:
+            variances[:, -1] *= 2
+        return np.asarray(np.sqrt(variances), np.float32)
 
     def density_of(self, length: int) -> Values:
         """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
@@ -261,7 +277,8 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """
     one = np.zeros(len(flat), np.intp)
     kinds = min(KINDS, len(flat) // MIN_N)
-    if kinds < 2:
+    bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
+    if kinds < 2 or bins < BANDS:
         return one
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
@@ -288,8 +305,7 @@ def _band_powers(baselines: Values) -> Values:
     window = np.hanning(baselines.shape[1])
     centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
     power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-    # the first bins hold residuals of the mean, and drifts
-    bands = np.array_split(power[:, 4:], BANDS, axis=1)
+    bands = np.array_split(power[:, FIRST_OF_BANDS:], BANDS, axis=1)
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 

@@ -85,9 +85,9 @@ def mode(values: FloatArray) -> float:
     return float(ordered.mean())
 
 
-def lower_spread(values: FloatArray, centre: float) -> float:
-    """Standard deviation of the side below the centre, which remainders do not affect."""
-    below = centre - values[values <= centre]
+def lower_spread(values: FloatArray) -> float:
+    """Standard deviation of the side below 0, which remainders do not affect."""
+    below = -values[values <= 0]
     return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+import math
 from pathlib import Path
 from typing import Annotated
 
 import numpy.typing as npt
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.recipes.base import Config, Fraction, NonNegative, Positive, Samples
@@ -17,21 +17,18 @@ REFERENCE_KEV = 2614.5
 
 _Share = Annotated[float, Field(gt=0, le=1)]
 MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
+MAX_JITTER_NS = 1e6  # longer than records; traces are followed from the start of the pulse
 _Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
-class _Figures(Config):
-    model_config = ConfigDict(allow_inf_nan=False)
-
-
-class SlowPart(_Figures):
+class SlowPart(Config):
     """A `fraction` of the charge that arrives with the time constant `tau_ns`."""
 
     fraction: Fraction
     tau_ns: Positive
 
 
-class Ringing(_Figures):
+class Ringing(Config):
     r"""Damped oscillation added to a unit step.
 
     .. math:: f\, e^{-t / \tau_d} \sin(2 \pi \nu t)
@@ -45,14 +42,14 @@ class Ringing(_Figures):
     damping_ns: Positive
 
 
-class Decay(_Figures):
+class Decay(Config):
     """A `fraction` of the step that decays with the time constant `tau_us`."""
 
     fraction: _Share
     tau_us: Positive
 
 
-class NonLinearity(_Figures):
+class NonLinearity(Config):
     r"""Departures from a linear chain.
 
     Parameters
@@ -68,14 +65,14 @@ class NonLinearity(_Figures):
     slew_kev_per_ns: Positive | None
 
 
-class NoiseLine(_Figures):
+class NoiseLine(Config):
     """A narrow line in the noise: its frequency and its fraction of the noise power."""
 
     frequency_MHz: Positive
     power_fraction: Fraction
 
 
-class NoiseSpectrum(_Figures):
+class NoiseSpectrum(Config):
     r"""Shape of the noise power spectrum.
 
     A flat continuum with a high-frequency roll-off and a low-frequency excess,
@@ -99,7 +96,7 @@ class NoiseSpectrum(_Figures):
         return self
 
 
-class Noise(_Figures):
+class Noise(Config):
     """Noise with an RMS of `rms_kev`, independent of the pulse energy.
 
     It is drawn from a spectrum or cut from measured baselines. `baselines_file` holds
@@ -118,26 +115,26 @@ class Noise(_Figures):
         return self
 
 
-class EarlierPulses(_Figures):
+class EarlierPulses(Config):
     """Pulses before the record, a Poisson process. Their tails lie under the traces."""
 
     rate_kHz: _Rate
 
 
-class PileUp(_Figures):
+class PileUp(Config):
     """Second pulses within the record, a Poisson process."""
 
     rate_kHz: _Rate
 
 
-class Hum(_Figures):
+class Hum(Config):
     """Mains hum: a sine under every trace with a random phase."""
 
     frequency_Hz: Positive
     amplitude_kev: Positive
 
 
-class Wander(_Figures):
+class Wander(Config):
     r"""A baseline that wanders slowly: an Ornstein-Uhlenbeck process under every trace.
 
     Its covariance is :math:`\sigma^2 e^{-|t - t'| / T}`, with the RMS :math:`\sigma` of
@@ -148,7 +145,7 @@ class Wander(_Figures):
     rms_kev: Positive
 
 
-class Electronics(_Figures):
+class Electronics(Config):
     """A readout chain.
 
     Parameters
@@ -207,7 +204,7 @@ class Electronics(_Figures):
     noise: Noise
     baseline_mean_adc: NonNegative
     baseline_spread_adc: NonNegative
-    trigger_jitter_ns: NonNegative
+    trigger_jitter_ns: Annotated[float, Field(ge=0, le=MAX_JITTER_NS)]
     earlier_pulses: EarlierPulses
     pile_up: PileUp
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
@@ -288,12 +285,12 @@ class Electronics(_Figures):
             times["overshoot.tau_ns"] = self.overshoot.tau_ns
         if self.ringing:
             # an oscillation is resolved if one radian of it is
-            times["ringing.frequency_MHz"] = 1e3 / (2 * 3.1416 * self.ringing.frequency_MHz)
+            times["ringing.frequency_MHz"] = 1e3 / (2 * math.pi * self.ringing.frequency_MHz)
             times["ringing.damping_ns"] = self.ringing.damping_ns
         times["decays.tau_us"] = 1e3 * min(part.tau_us for part in self.decays)
         return times
 
-    @cached_property
+    @property
     def transfer(self) -> Exponentials:
         r"""Linear part of the chain as a sum of exponentials.
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.baseline_tails import tail_shape
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
@@ -170,8 +171,8 @@ class SameNoise:
 
     def __init__(self, noise: BaselineNoise | TraceNoise) -> None:
         self._noise = noise
-        self._asked: tuple[Any, bytes, int] | None = None  # arguments of the last draw
-        self._drawn: tuple[FloatArray, Any] | None = None  # and the state after it
+        # arguments of the last draw, its result, and the state of the generator after it
+        self._last: tuple[Any, FloatArray, Any] | None = None
 
     @property
     def dt_ns(self) -> float:
@@ -183,13 +184,10 @@ class SameNoise:
     ) -> FloatArray:
         """Draw like the noise itself; repeat the last draw for the same generator state."""
         asked = (rng.bit_generator.state, energy_kev.tobytes(), length)
-        if self._drawn is None or asked != self._asked:
-            self._asked = asked
-            self._drawn = (
-                self._noise.draw(energy_kev, length, rng),
-                rng.bit_generator.state,
-            )
-        drawn, rng.bit_generator.state = self._drawn
+        if self._last is None or self._last[0] != asked:
+            drawn = self._noise.draw(energy_kev, length, rng)
+            self._last = asked, drawn, rng.bit_generator.state
+        _, drawn, rng.bit_generator.state = self._last
         return drawn.copy()
 
 
@@ -221,10 +219,10 @@ def passing(
     if len(templates) < MIN_TEMPLATES:
         return None
     raw = np.stack(templates[:TEMPLATES])
-    time_us = np.arange(raw.shape[1]) * remains.dt_ns * 1e-3
-    unit = remains.adc_per_kev * np.exp(-time_us / remains.decay_us)
+    shape = tail_shape(raw.shape[1], remains.dt_ns, remains.decay_us)
+    unit = (remains.adc_per_kev * shape).astype(np.float32)
     shares = []
     for kev in SIZES_KEV:
-        lifted = Pulses.of(raw + np.float32(kev) * unit.astype(np.float32), dt_ns=remains.dt_ns)
+        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=remains.dt_ns)
         shares.append(len(apply_cuts(prepare(lifted, config, "measured"), cuts)) / len(raw))
     return tuple(share / max(shares[0], 1e-9) for share in np.minimum.accumulate(shares))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -125,17 +124,22 @@ def moved_apart(taus_ns: Sequence[float]) -> list[float]:
     >>> [round(tau, 3) for tau in moved_apart([40.0, 500.0, 40.0])]
     [39.98, 500.0, 40.02]
     """
-    order = np.argsort(taus_ns, kind="stable")
-    values = np.asarray(taus_ns, float)
-    result = values.copy()
-    groups: list[list[Any]] = []
-    for i in order:
-        if groups and values[i] < values[groups[-1][-1]] * (1 + _APART):
-            groups[-1].append(i)
-        else:
-            groups.append([i])
+    values = np.array(taus_ns, float)
+    groups: list[list[int]] = []
+    for i in np.argsort(values, kind="stable").tolist():
+        group = [i]
+        # the more values are in a group, the farther it reaches
+        while groups and (
+            _spread(values[group])[0] < (1 + _APART) * _spread(values[groups[-1]])[-1]
+        ):
+            group = groups.pop() + group
+        groups.append(group)
     for group in groups:
-        steps = np.arange(len(group)) - (len(group) - 1) / 2
-        if len(group) > 1:
-            result[group] = values[group].mean() * (1 + _APART * steps)
-    return [float(tau) for tau in result]
+        values[group] = _spread(values[group])
+    return [float(tau) for tau in values]
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """As many values as given, a relative `_APART` from one another, about the mean."""
+    steps = np.arange(len(values)) - (len(values) - 1) / 2
+    return np.asarray(values.mean() * (1 + _APART * steps), float)

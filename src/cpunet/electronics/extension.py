@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import tail_slope
 from cpunet.recipes.schema import PreparationConfig
 
-# Samples of padding around a window, so that it can be cut anew if noise moves the maximum.
+# Samples of padding around a window, so that it can be cut anew if noise moves the maximum and
+# delayed pulses stay within the record. A window of 800 becomes a record of 1400, a fast length
+# of the FFT.
 PADDING_BEFORE, PADDING_AFTER = 200, 400
+
+
+def record_length(window: int) -> int:
+    """Number of samples of the record that a window of `window` samples becomes."""
+    return PADDING_BEFORE + window + PADDING_AFTER
 
 
 def extended(
@@ -39,18 +46,18 @@ def extended(
     result[:, inside] = windows[:, time[inside]]
     late = time >= config.length
     if late.any():
-        measured = prepare(Pulses.of(windows, dt_ns=dt_ns), config, "measured")
-        per_sample = np.zeros(len(windows))
-        per_sample[measured.index] = measured.tail_slope * dt_ns * 1e-6
+        # 0 for a tail that is not positive; a window need not be aligned
+        slope = np.nan_to_num(tail_slope(windows, dt_ns, config.decay_fit_samples))
         # the mean of the last samples is the level at their centre
         since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
         end = windows[:, -config.tail_samples :].mean(axis=1)
-        result[:, late] = end[:, np.newaxis] * np.exp(per_sample[:, np.newaxis] * since)
+        decay = np.exp(slope[:, np.newaxis] * dt_ns * 1e-6 * since)
+        result[:, late] = end[:, np.newaxis] * decay
     result[np.isnan(windows).any(axis=1)] = np.nan
     return result
 
 
 def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Extend prepared windows to PADDING_BEFORE + config.length + PADDING_AFTER samples."""
-    length = PADDING_BEFORE + config.length + PADDING_AFTER
-    return extended(windows, config, dt_ns, length, PADDING_BEFORE + config.samples_before)
+    """Extend prepared windows to records, see `record_length`."""
+    before = PADDING_BEFORE + config.samples_before
+    return extended(windows, config, dt_ns, record_length(config.length), before)

@@ -112,7 +112,7 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
     Raises
     ------
     CpunetError
-        If the baselines are too short, have another sampling period, or are constant.
+        If baselines are too short, sampled differently, not finite, or constant.
     """
     source = open_pulses(path)
     if not np.isclose(source.dt_ns, dt_ns):
@@ -131,7 +131,11 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
         if sum(map(len, kept)) >= _MAX_BASELINES:
             break
     baselines = np.concatenate(kept) if kept else np.zeros((0, length), np.float32)
-    if not (np.isfinite(baselines).all() and baselines.std() > 0):
+    finite = np.isfinite(baselines).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise CpunetError(f"{path}: baseline {bad} is not finite; leave it out")
+    if not baselines.std() > 0:
         raise CpunetError(f"{path}: no baselines that vary; give another noise.baselines_file")
     return baselines
 

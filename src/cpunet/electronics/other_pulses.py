@@ -29,8 +29,8 @@ class OtherPulses:
     n_piled
         Number of additional pulses within each trace.
     piled_kev, piled_ns
-        Energy of the largest additional pulse, and its start relative to the trace's own
-        pulse in ns (negative: before it). NaN where there is none.
+        Energy of the largest additional pulse, and its start after `n_pre` samples in ns
+        (negative: before them). NaN where there is none.
     """
 
     added_kev: FloatArray
@@ -117,7 +117,7 @@ def _wander(
     n: int, length: int, dt_ns: float, wander: Wander, rng: np.random.Generator
 ) -> FloatArray:
     """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
-    kept = np.exp(-1e-3 * dt_ns / wander.time_us)
-    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(2 * np.log(kept))), (n, length))
+    lost = 1e-3 * dt_ns / wander.time_us
+    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(-2 * lost)), (n, length))
     steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # stationary from the start
-    return np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=1), float)
+    return np.asarray(lfilter([1.0], [1.0, -np.exp(-lost)], steps, axis=1), float)

@@ -40,8 +40,11 @@ class RawTraces:
         baseline and without earlier or second pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    remains_kev, n_piled, piled_kev, piled_ns
+    remains_kev, n_piled, piled_kev
         Properties of other pulses, see `cpunet.electronics.other_pulses.OtherPulses`.
+    piled_ns
+        Start of the largest additional pulse after that of the trace's own pulse in ns
+        (negative: before it). NaN where there is none.
     """
 
     waveforms: npt.NDArray[np.uint16]
@@ -89,7 +92,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     """
     energy, n = required_energy_kev(pulses), len(pulses)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
-    linear = linear_response(pulses, electronics, _shift_ns(electronics, n, clock))
+    shift_ns = _shift_ns(electronics, n, clock)
+    linear = linear_response(pulses, electronics, shift_ns)
     own_kev = energy[:, None] * linear
     other = draw_other_pulses(pulses, electronics, others)
     total_kev = own_kev + other.added_kev
@@ -126,7 +130,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         remains_kev=other.remains_kev,
         n_piled=other.n_piled,
         piled_kev=other.piled_kev,
-        piled_ns=other.piled_ns,
+        piled_ns=other.piled_ns - shift_ns,
     )
 
 

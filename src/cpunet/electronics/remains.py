@@ -29,7 +29,7 @@ from cpunet.electronics.baseline_tails import (
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_fit import RateFit, fit_rate
 from cpunet.electronics.remains_law import RemainsLaw
-from cpunet.electronics.remains_traces import gathered
+from cpunet.electronics.remains_traces import Gathered, gathered
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
@@ -144,26 +144,21 @@ class Remains:
         """
         seen = gathered(blocks, config, MOST)
         decay = decay_us or seen.tail_decay_us
-        mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay)
-        broadest = widest(width)
-        quiet = width <= broadest
+        mean, left, quiet, broadest = _read(seen, decay)
         level = mode(mean[quiet])
-        tilted = left > LARGE * lower_spread(left[quiet], 0.0)
+        tilted = left > LARGE * lower_spread(left[quiet])
         large = seen.baselines[quiet & tilted] - level
         coupled = lifted(large, left[quiet & tilted])
         own = own_decay_us(large, seen.dt_ns) if coupled else None
         error: float | None = None
         if own is not None and decay_us is None:
             decay, error = own
-            mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay)
-            broadest = widest(width)
-            quiet = width <= broadest
-        height = (
-            tail_shape(seen.baselines.shape[1], seen.dt_ns, decay).mean() * seen.adc_per_kev
-        )
+            mean, left, quiet, broadest = _read(seen, decay)
+        samples = seen.baselines.shape[1]
+        height = tail_shape(samples, seen.dt_ns, decay).mean() * seen.adc_per_kev
         of_slope, of_level = left / seen.adc_per_kev, (mean - level) / height
-        slope_error = lower_spread(of_slope[quiet], 0.0)
-        level_error = lower_spread(of_level[quiet], 0.0) if coupled else np.inf
+        slope_error = lower_spread(of_slope[quiet])
+        level_error = lower_spread(of_level[quiet]) if coupled else np.inf
         weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
@@ -181,7 +176,7 @@ class Remains:
             adc_per_kev=seen.adc_per_kev,
             widest_adc=broadest,
             fit=fit,
-            samples=seen.baselines.shape[1],
+            samples=samples,
             dt_ns=seen.dt_ns,
         )
 
@@ -240,6 +235,15 @@ class Remains:
         heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
         less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
         return raw.with_waveforms(less)
+
+
+def _read(
+    seen: Gathered, decay_us: float
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
+    """Mean of each baseline, remainder, whether it holds no other pulse, and largest RMS."""
+    mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay_us)
+    broadest = widest(width)
+    return mean, left, width <= broadest, broadest
 
 
 def _require_empty(fit: RateFit) -> None:

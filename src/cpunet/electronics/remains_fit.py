@@ -27,7 +27,9 @@ Function = Callable[[FloatArray], float]
 # Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
-LEAST_GRID, MOST_GRID = 1024, 16384  # points of the density
+# Points of the density. It is periodic, so the grid must hold all energies, also in steps of
+# small errors: down to 0.15 keV.
+LEAST_GRID, MOST_GRID = 1024, 131_072
 STEPS_OF_SIGMA = 4.0
 NEGLIGIBLE = 8.8  # standard deviations in u: exp(-8.8²/2) is 1.5e-17
 ROOM = 10.0  # standard deviations of room on either side
@@ -74,7 +76,10 @@ def fit_rate(
     .. math:: \ln L = \sum_i \ln\left[(1 - \epsilon)\, p(x_i) + \epsilon u\right],
 
     where :math:`p` is the density of the law convolved with the noise and :math:`u` a uniform
-    density for a small fraction :math:`\epsilon` of outliers.
+    density for a small fraction :math:`\epsilon` of outliers. With the characteristic function
+    :math:`\varphi` of the law, and apart from the wings of the noise,
+
+    .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du .
 
     Parameters
     ----------
@@ -90,14 +95,12 @@ def fit_rate(
     known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
     highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
     likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
-    candidates = [_Candidate.learned(likelihood)]
+    best = _Candidate.best(likelihood)
     if len(known):
         own = np.histogram(np.log(known), _edges(likelihood.energies))[0] / len(known)
-        candidates.insert(0, _Candidate.recorded(likelihood, own))
-    best = candidates[0]
-    for other in candidates[1:]:
-        if other.log_likelihood > best.log_likelihood + WORTH:
-            best = other
+        recorded = _Candidate.best(likelihood, own)
+        if best.log_likelihood <= recorded.log_likelihood + WORTH:
+            best = recorded
     expected, error = best.expected
     energies = _quantiles(likelihood.energies, best.weights)
     return RateFit(
@@ -194,18 +197,11 @@ class _Candidate:
     log_likelihood: float
 
     @classmethod
-    def recorded(cls, likelihood: _Likelihood, weights: FloatArray) -> _Candidate:
-        return cls._best(likelihood, weights, (0.0, np.log(likelihood.sigma)))
-
-    @classmethod
-    def learned(cls, likelihood: _Likelihood) -> _Candidate:
-        more = (MEDIAN[0], WIDTH[0])
-        return cls._best(likelihood, None, (0.0, np.log(likelihood.sigma), *more))
-
-    @classmethod
-    def _best(
-        cls, likelihood: _Likelihood, fixed: FloatArray | None, rest: Sequence[float]
-    ) -> _Candidate:
+    def best(cls, likelihood: _Likelihood, fixed: FloatArray | None = None) -> _Candidate:
+        """Fit with fixed weights of the energies, or with a log-normal spectrum."""
+        rest = [0.0, np.log(likelihood.sigma)]
+        if fixed is None:
+            rest += [MEDIAN[0], WIDTH[0]]
         found = min(
             (
                 _minimum(lambda v: -_value(likelihood, fixed, v), (start, *rest))

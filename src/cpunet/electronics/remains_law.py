@@ -23,13 +23,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 import scipy.special
 
 from cpunet.electronics.exponentials import FloatArray
+from cpunet.errors import CpunetError
 
 # After this many decay times the remainder is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
+MOST_EXPECTED = 10_000.0  # maximum expected number of pulses before a trace, for memory
 _MIN_KEV = 1e-3
 _ENERGIES = 64  # energies that represent a spectrum in sums over it
 
@@ -85,43 +86,6 @@ class RemainsLaw:
         ratio = _some(self.energies_kev) / np.asarray(kev, float)[..., np.newaxis]
         lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
         return np.asarray(-np.expm1(-self.expected * lives), float)
-
-    def density(
-        self, step_kev: float, n: int, sigma_kev: float
-    ) -> tuple[FloatArray, FloatArray]:
-        r"""Probability density of a measured remainder, summed over all pulses, per keV.
-
-        .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du
-
-        Parameters
-        ----------
-        step_kev, n
-            Step in keV and number of points of the grid. Its first quarter lies below 0.
-        sigma_kev
-            Standard deviation of the measurement in keV, at least a few steps of the grid.
-
-        Returns
-        -------
-        tuple
-            Values in keV and the density at them, both of shape ``(n,)``.
-
-        Examples
-        --------
-        Its mean is that of Campbell's theorem.
-
-        >>> law = RemainsLaw(1.0, 100.0, (300.0, 300.0))
-        >>> kev, density = law.density(1.0, 4096, 5.0)
-        >>> round(float(kev @ density), 2), round(law.mean_kev, 2)
-        (30.0, 30.0)
-        """
-        u = 2 * np.pi * scipy.fft.rfftfreq(n, step_kev)
-        per_pulse = characteristic_exponents(u, _some(self.energies_kev)).mean(axis=1)
-        exponent = self.expected * per_pulse - 0.5 * (sigma_kev * u) ** 2
-        first = n // 4
-        shifted = np.exp(exponent + 1j * u * first * step_kev)
-        density = scipy.fft.irfft(np.conj(shifted), n) / step_kev
-        kev = np.asarray((np.arange(n) - first) * step_kev, float)
-        return kev, np.asarray(np.maximum(density, 0.0), float)
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw the remainder in keV, summed over all earlier pulses, for `n` traces."""
@@ -188,8 +152,19 @@ def earlier_pulses(
     tuple
         Index of the trace, energy in keV and time in us (0 to `longest_us`) of each pulse,
         all of shape ``(pulses,)``.
+
+    Raises
+    ------
+    CpunetError
+        If more than `MOST_EXPECTED` pulses are expected for a trace.
     """
-    counts = rng.poisson(rate_khz * 1e-3 * longest_us, size=n)
+    expected = rate_khz * 1e-3 * longest_us
+    if expected > MOST_EXPECTED:
+        raise CpunetError(
+            f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
+            f"than {MOST_EXPECTED:g}; give a lower rate or a shorter decay"
+        )
+    counts = rng.poisson(expected, size=n)
     row = np.repeat(np.arange(n), counts)
     kev = energies_at(rng.random(len(row)), energies_kev)
     return row, kev, rng.uniform(0, longest_us, size=len(row))

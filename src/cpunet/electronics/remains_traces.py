@@ -33,15 +33,16 @@ def gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) -> 
     """Read blocks until there are enough traces."""
     baselines: list[npt.NDArray[np.float32]] = []
     energies, heights, scales, slopes = [], [], [], []
-    samples = dt_ns = 0.0
+    samples, dt_ns = 0, 0.0
     for raw in blocks:
         prepared = prepare(raw, config, "measured")
         samples = samples or _length(raw, prepared, config)
         dt_ns = raw.dt_ns
-        baselines.append(np.array(raw.waveforms[:, : int(samples)]))
+        baselines.append(np.array(raw.waveforms[:, :samples]))
         energies.append(raw.energy_kev)
         height = prepared.pulses.waveforms.max(axis=1) * prepared.scale
-        heights.append(height / prepared.pulses.energy_kev)
+        with np.errstate(divide="ignore"):  # an energy of 0 is left out by `_gain`
+            heights.append(height / prepared.pulses.energy_kev)
         scales.append(prepared.scale)
         slopes.append(prepared.tail_slope)
         if sum(map(len, baselines)) >= most:
@@ -54,7 +55,7 @@ def gathered(blocks: Iterable[Pulses], config: PreparationConfig, most: int) -> 
         np.concatenate(energies),
         _gain(np.concatenate(heights)),
         _tail_decay_us(slope[scale >= np.median(scale)]),
-        float(dt_ns),
+        dt_ns,
     )
 
 

@@ -86,7 +86,7 @@ class SecondPulses:
         expected = rate_khz * 1e-6 * record_ns
         if expected > MOST_EXPECTED:
             raise CpunetError(
-                f"--pile-up-khz {rate_khz:g}: {expected:.3g} pulses in a record of "
+                f"pile-up at {rate_khz:g} kHz: {expected:.3g} pulses in a record of "
                 f"{1e-3 * record_ns:.3g} us, more than {MOST_EXPECTED:g}; give a lower rate"
             )
         row, kev, time_us = earlier_pulses(n, rate_khz, 1e-3 * record_ns, energies_kev, rng)

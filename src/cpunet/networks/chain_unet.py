@@ -11,8 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from cpunet.networks.hybrid import RecordCorrection, half_sample
-from cpunet.networks.linear_inverse import LinearInverse, stretch
+from cpunet.networks.hybrid import RecordCorrection, half_sample, taper
+from cpunet.networks.linear_inverse import LinearInverse, stretch, with_stretch
 from cpunet.networks.positional_unet import PositionalUNet
 
 RAMP = 24  # samples over which a correction goes to zero at either end
@@ -42,10 +42,7 @@ class UNetCorrection(RecordCorrection):
         super().__init__()
         self.unet = unet
         self.before, self.after, self.tail_level = before, after, tail_level
-        samples = torch.arange(before + after)
-        edge = torch.minimum(samples + 0.5, before + after - 0.5 - samples)
-        taper = torch.sin(0.5 * torch.pi * (edge / RAMP).clamp(max=1)) ** 2
-        self.register_buffer("taper", taper, persistent=False)
+        self.register_buffer("taper", taper(before + after, RAMP), persistent=False)
 
     def forward(self, records: Tensor) -> Tensor:
         """Correct noise-free records of any height, shape (batch, samples)."""
@@ -62,9 +59,8 @@ class UNetCorrection(RecordCorrection):
         # again, with the gradient of a cycle through the records
         inside = stretch(records, sample, -self.before, self.after) / height
         added = self.added(inside)
-        index = sample[:, None] + torch.arange(-self.before, self.after, device=records.device)
-        index = index.clamp(0, records.shape[1] - 1)
-        return records.scatter_add(1, index, added * height), added
+        changed = with_stretch(records, sample, -self.before, self.after, added * height)
+        return changed, added
 
     def added(self, inside: Tensor) -> Tensor:
         """Correction for stretches of prepared height, shape (batch, before + after)."""

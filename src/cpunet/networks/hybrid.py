@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.linear_inverse import stretch, with_stretch
 from cpunet.networks.positional_unet import SLOPE, positional_map
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes.network_settings import ResidualConfig
@@ -64,13 +64,11 @@ class EdgeResidual(RecordCorrection):
         self.down = block(width, 2 * width)
         self.up = block(3 * width, width)
         self.outlet = nn.Conv1d(width, FOLD, 1)
-        nn.init.zeros_(self.outlet.weight)
-        if self.outlet.bias is not None:
-            nn.init.zeros_(self.outlet.bias)
         self.register_buffer("position", positional_map(width, steps, 0), persistent=False)
-        self.register_buffer("taper", _taper(), persistent=False)
+        self.register_buffer("taper", taper(BEFORE + AFTER, RAMP), persistent=False)
         # whether there is anything to add: a network of zeros is not run
         self.register_buffer("used", torch.zeros((), dtype=torch.bool))
+        self.clear()
 
     def clear(self) -> None:
         """Make the correction exactly zero."""
@@ -104,9 +102,7 @@ class EdgeResidual(RecordCorrection):
             sample = half_sample(records, height, at)
             inside = stretch(records, sample, -BEFORE, AFTER) / height
         added = self.correction(inside)
-        index = sample[:, None] + torch.arange(-BEFORE, AFTER, device=records.device)
-        index = index.clamp(0, records.shape[1] - 1)
-        return records.scatter_add(1, index, added * height), added
+        return with_stretch(records, sample, -BEFORE, AFTER, added * height), added
 
     def correction(self, inside: Tensor) -> Tensor:
         """Correction for stretches of height 1, shape (batch, BEFORE + AFTER).
@@ -160,8 +156,8 @@ def _folded(stretches: Tensor) -> Tensor:
     return folded.transpose(1, 2)
 
 
-def _taper() -> Tensor:
-    """1 except near the ends, where it goes to zero smoothly."""
-    samples = torch.arange(BEFORE + AFTER)
-    edge = torch.minimum(samples + 0.5, BEFORE + AFTER - 0.5 - samples)
-    return torch.sin(0.5 * torch.pi * (edge / RAMP).clamp(max=1)) ** 2
+def taper(length: int, ramp: int) -> Tensor:
+    """1 except within `ramp` samples of either end, where it goes to zero smoothly."""
+    samples = torch.arange(length)
+    edge = torch.minimum(samples + 0.5, length - 0.5 - samples)
+    return torch.sin(0.5 * torch.pi * (edge / ramp).clamp(max=1)) ** 2

@@ -13,11 +13,13 @@ import scipy.fft
 import torch
 from torch import Tensor, nn
 
+# exported again: records of all methods begin and end at the same samples of a window
+from cpunet.electronics.extension import PADDING_AFTER as PADDING_AFTER
+from cpunet.electronics.extension import PADDING_BEFORE as PADDING_BEFORE
+from cpunet.electronics.extension import record_length as record_length
 from cpunet.networks.drift_clock import DriftClock
 from cpunet.recipes.network_settings import ResponseConfig
 
-# Padding of a window in samples, so that delayed pulses stay within the record.
-PADDING_BEFORE, PADDING_AFTER = 200, 400
 # Charge is zero before a window and constant after it, but decays outlast the record: their
 # kernel is cut, and the transform is long enough to avoid wrap-around.
 _MIN_FACTOR = 1.6
@@ -193,11 +195,6 @@ def _spline(frequency: Tensor) -> Tensor:
     """
     spline: Tensor = torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
     return spline
-
-
-def record_length(samples: int) -> int:
-    """Length of the record of a window of this length, in samples."""
-    return PADDING_BEFORE + samples + PADDING_AFTER
 
 
 def padded_length(length: int) -> int:

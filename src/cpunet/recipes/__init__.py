@@ -12,15 +12,14 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
 from cpunet.regular_files import is_there, read_text
-from cpunet.yaml_files import MAX_BYTES, parsed, shown
+from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_names
+
+_FOLDER = files("cpunet.recipes")
 
 
 def recipe_names() -> list[str]:
     """Names of the recipes that come with the package."""
-    folder = files("cpunet.recipes")
-    return sorted(
-        f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml")
-    )
+    return yaml_names(_FOLDER)
 
 
 def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
@@ -45,7 +44,7 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     (40, 16)
     """
     if name in recipe_names():
-        text = (files("cpunet.recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+        text = (_FOLDER / f"{name}.yaml").read_text("utf-8")
     elif is_there(name):
         try:
             text = read_text(name, MAX_BYTES)

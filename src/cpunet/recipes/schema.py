@@ -115,7 +115,8 @@ class SearchConfig(Config):
 
     @model_validator(mode="after")
     def _one_kind(self) -> SearchConfig:
-        if (self.choices is None) == (self.low is None or self.high is None):
+        ends = [end for end in (self.low, self.high) if end is not None]
+        if len(ends) != (2 if self.choices is None else 0):
             raise ValueError("give either low and high, or choices")
         if self.low is not None and self.high is not None:
             if not self.low < self.high:

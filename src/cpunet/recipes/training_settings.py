@@ -113,7 +113,7 @@ class MatchingConfig(Config):
     after: Samples
     baseline: tuple[Samples, Samples]
     level_samples: Samples
-    segments: Annotated[tuple[int, ...], Field(max_length=1000)]
+    segments: Annotated[tuple[int, ...], Field(min_length=2, max_length=1000)]
     components: _Number
     squares: _Number
     amplitude_bins: _Number
@@ -135,10 +135,9 @@ class MatchingConfig(Config):
 
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:
-        first, *rest = self.segments
-        if sorted({*self.segments}) != [*self.segments] or not rest:
-            raise ValueError("segments must be two samples or more, in rising order")
-        if first < -self.before or rest[-1] > self.after:
+        if sorted({*self.segments}) != [*self.segments]:
+            raise ValueError("segments must be in rising order")
+        if self.segments[0] < -self.before or self.segments[-1] > self.after:
             raise ValueError("segments must lie within before and after")
         if not self.baseline[0] > self.baseline[1]:
             raise ValueError("baseline goes from more samples before the edge to fewer")

@@ -26,10 +26,9 @@ from cpunet.electronics.baseline_methods.superpulses import (
 from cpunet.electronics.baseline_methods.window_response import (
     Spectrum,
     currents,
-    frequencies_mhz,
-    record_length,
     respond,
 )
+from cpunet.electronics.extension import record_length
 from cpunet.pulses.container import FloatArray
 
 MOST = 2000  # maximum number of pulses of either dataset in the fit
@@ -112,7 +111,7 @@ class GaussExp:
 
 def _transfer(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spectrum:
     """Fourier transform of the kernel at the frequencies of a record."""
-    omega = 2e-3 * np.pi * frequencies_mhz(length, dt_ns)  # 1/ns
+    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
     gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
     return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from cpunet.electronics.baseline_methods.base import check_sets, check_windows
-from cpunet.electronics.baseline_methods.window_response import PADDING_AFTER, PADDING_BEFORE
+from cpunet.electronics.extension import PADDING_AFTER, PADDING_BEFORE
 from cpunet.pulses.container import FloatArray
 
 

@@ -18,11 +18,10 @@ import scipy.signal
 from cpunet.electronics.baseline_methods.base import Values, check_sets, check_windows
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.electronics.baseline_methods.window_response import (
-    PADDING_BEFORE,
     currents,
     integrated,
-    record_length,
 )
+from cpunet.electronics.extension import PADDING_BEFORE, record_length
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray

@@ -25,12 +25,11 @@ from cpunet.electronics.baseline_methods.superpulses import (
     without_decay,
 )
 from cpunet.electronics.baseline_methods.window_response import (
-    PADDING_BEFORE,
     Spectrum,
     currents,
-    record_length,
     respond,
 )
+from cpunet.electronics.extension import PADDING_BEFORE, record_length
 from cpunet.pulses.container import FloatArray
 
 MOST = 4000  # maximum number of pulses of either dataset

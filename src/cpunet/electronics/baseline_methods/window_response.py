@@ -13,19 +13,11 @@ import scipy.fft
 import scipy.signal
 
 from cpunet.electronics.baseline_methods.base import Values
+from cpunet.electronics.extension import PADDING_BEFORE, record_length
 from cpunet.electronics.finishing import blocks
 from cpunet.pulses.container import FloatArray
 
 Spectrum = npt.NDArray[np.complex128]
-
-# Samples of padding. A window of 800 becomes a record of 1400, a fast length of the FFT.
-PADDING_BEFORE = 200
-PADDING_AFTER = 400
-
-
-def record_length(window: int) -> int:
-    """Number of samples of the record that a window of `window` samples becomes."""
-    return PADDING_BEFORE + window + PADDING_AFTER
 
 
 def currents(windows: FloatArray) -> Values:
@@ -36,17 +28,6 @@ def currents(windows: FloatArray) -> Values:
         windows.astype(float), axis=1, prepend=0.0
     )
     return record
-
-
-def frequencies_mhz(length: int, dt_ns: float) -> Values:
-    """Frequencies in MHz of the real FFT of `length` samples."""
-    return np.asarray(scipy.fft.rfftfreq(length, dt_ns * 1e-3), float)
-
-
-def filtered(current: Values, transfer: Spectrum) -> Values:
-    """Apply a kernel, given by its transfer function over the record, to currents."""
-    spectrum = scipy.fft.rfft(current, axis=1) * transfer
-    return np.asarray(scipy.fft.irfft(spectrum, current.shape[1], axis=1), float)
 
 
 def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Values:
@@ -94,8 +75,10 @@ def respond(
     numpy.ndarray
         Records, float32, shape ``(n, record_length(length))``.
     """
-    records = np.empty((len(windows), record_length(windows.shape[1])), np.float32)
+    length = record_length(windows.shape[1])
+    records = np.empty((len(windows), length), np.float32)
     for rows in blocks(len(windows)):
-        current = filtered(currents(windows[rows]), transfer)
+        spectrum = scipy.fft.rfft(currents(windows[rows]), axis=1) * transfer
+        current = scipy.fft.irfft(spectrum, length, axis=1)
         records[rows] = integrated(current, tail_slope_per_ms, dt_ns)
     return records

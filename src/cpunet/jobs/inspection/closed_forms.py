@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cpunet.analysis.response_figure import Chain, Numbers, align_ns
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.noise_traces import noise_power
 from cpunet.networks.kept_noise import NOISE_BINS
@@ -44,7 +44,9 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
 
 def true_chain_of(electronics: Electronics) -> Chain:
     """The closed form of a true chain; its nonlinearity is left out."""
-    endless = electronics.model_dump() | {"decays": [{"fraction": 1, "tau_us": _FOREVER_US}]}
+    endless = electronics.model_copy(
+        update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
+    )
     frequency = density = None
     spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
     if spectrum is not None:
@@ -55,8 +57,7 @@ def true_chain_of(electronics: Electronics) -> Chain:
     return Chain(
         f"true response ({electronics.name})",
         electronics.transfer,
-        # constructed anew, since a copy would keep the cached transfer function
-        Electronics.model_validate(endless).transfer,
+        endless.transfer,
         frequency,
         density,
     )

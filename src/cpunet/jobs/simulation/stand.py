@@ -98,7 +98,7 @@ def make_stand(
     ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
     included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
     baseline, 2 pile-up, 4 saturated; ``remains_kev``, ``n_piled``, ``piled_kev``,
-    ``piled_ns``, see `cpunet.electronics.other_pulses`) and ``stand.json``, its provenance.
+    ``piled_ns``, see `cpunet.electronics.readout`) and ``stand.json``, its provenance.
 
     Parameters
     ----------
