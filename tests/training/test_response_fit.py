@@ -27,13 +27,13 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training import response_fit, response_starts, translated
+from cpunet.training import response_starts, translated
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.half_maximum_alignment import at_half_maximum
-from cpunet.training.levenberg_marquardt import Minimum
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
-from cpunet.training.response_starts import GOOD_FIT, drift_if_needed, with_drift_terms
+from cpunet.training.response_starts import drift_if_needed, with_drift_terms
 from cpunet.training.translated import Noise, Translated
 from synthetic import drifting, two_sites
 
@@ -261,8 +261,12 @@ DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringi
 def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     """The readout is then the true one, and not what makes up for the drift."""
     short = simulated(faster(charge(N, seed=1), 1.25))
-    response, fit = problem.fit(0, *DRIFT, sim=short)
+    steps: list[int] = []
+    response, fit = problem.fit(
+        0, *DRIFT, sim=short, listener=lambda step, _chi_square: steps.append(step)
+    )
     assert fit.chi_square < GOOD_FIT * fit.moments
+    assert fit.steps == len(steps)  # those of all fits
     numbers = response.describe()
     error = fit.errors["drift.stretch.1"]
     assert error < 0.03
@@ -388,16 +392,15 @@ def test_a_needless_stretch_is_taken_out(asked: ResponseProblem) -> None:
     stretched.parameters.set(vector)
     residuals = stretched.residuals(vector)
 
-    def known_to(error: float) -> tuple[ResponseProblem, Minimum]:
-        found = Minimum(float(residuals @ residuals), 3, np.eye(len(vector)) * error**2)
-        return drift_if_needed(stretched, found, RECIPE.training, None)
+    def known_to(error: float) -> Fitted:
+        cost = float(residuals @ residuals)
+        found = Fitted(stretched, cost, np.eye(len(vector)) * error**2)
+        return drift_if_needed(found, Fitter(RECIPE.training))
 
-    problem, found = known_to(0.001)
-    assert problem.response.drift is None
-    assert found.steps > 3
-    assert known_to(0.0005)[0] is stretched
-    found = Minimum(1.0, 1, np.eye(len(vector) - 1))
-    assert drift_if_needed(asked, found, RECIPE.training, None) == (asked, found)
+    assert known_to(0.001).problem.response.drift is None
+    assert known_to(0.0005).problem is stretched
+    simulated = Fitted(asked, 1.0, np.eye(len(vector) - 1))
+    assert drift_if_needed(simulated, Fitter(RECIPE.training)) is simulated
 
 
 def test_threads_do_not_change_a_bit(asked: ResponseProblem, monkeypatch) -> None:
@@ -448,9 +451,13 @@ def test_energies_are_needed(problem: Problem) -> None:
         problem.fit(0, sim=unknown)
 
 
-def test_steps_of_several_fits_are_one_count() -> None:
-    told: list[tuple[int, float]] = []
-    counted = response_fit._counted(lambda *step: told.append(step))
-    for step, chi_square in ((1, 9.0), (2, 5.0), (1, 8.0)):  # the last of another start
-        counted(step, chi_square)
-    assert told == [(1, 9.0), (2, 5.0), (3, 8.0)]
+def test_steps_of_several_fits_are_one_count(asked: ResponseProblem) -> None:
+    told: list[int] = []
+    fitter = Fitter(
+        RECIPE.training.model_copy(update={"steps": 2}),
+        listener=lambda step, _chi_square: told.append(step),
+    )
+    for _ in range(2):
+        fitter.fit(asked.of(copy.deepcopy(asked.response)), coarse=False)
+    assert told == list(range(1, fitter.steps + 1))
+    assert fitter.steps > 2
