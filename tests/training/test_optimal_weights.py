@@ -13,6 +13,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Moments
@@ -130,6 +131,22 @@ def test_the_amplitude_is_right_after_it_and_wrong_before(band: Band) -> None:
     refine(near, [band], 6)
     shift, error = amplitude_shift(near.response, [band])
     assert abs(shift) < 3 * error
+
+
+@pytest.mark.parametrize("poles_ns", [(66.0, 44.0), (80.0, 80.0), (150.0, 150.0)])
+def test_an_amplitude_that_is_far_off_is_told_as_it_is(
+    band: Band, poles_ns: tuple[float, float]
+) -> None:
+    """Also where no translated amplitude is one of the data's."""
+    pulses = torch.from_numpy(charge(2))
+    with torch.no_grad():
+        translated, true = (
+            np.log(current_amplitude(response(poles, 0.05)(pulses).numpy()))
+            for poles in (poles_ns, (60.0, 40.0))
+        )
+    shift, error = amplitude_shift(response(poles_ns, 0.05), [band])
+    assert shift == pytest.approx((true - translated).mean(), rel=0.05)
+    assert 0 < error < 0.01
 
 
 def test_functions_are_components_in_bins_of_the_amplitude(band: Band) -> None:
