@@ -15,6 +15,7 @@ from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
+from cpunet.training import optimal_weights
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Moments
 from cpunet.training.optimal_weights import ConditionalFunctions, refine
@@ -83,6 +84,20 @@ def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
     together = np.array([0.6, 0.4, 0, 0])
     assert np.sqrt(together @ covariance @ together) < 0.003
     assert abs(together @ (found - truth)) < 0.01
+
+
+def test_the_order_of_the_pulses_does_not_matter(band: Band, monkeypatch) -> None:
+    """Weights come from some of them, which are spread over the file."""
+    monkeypatch.setattr(optimal_weights, "FOR_WEIGHTS", 400)
+    steepness = np.diff(band.sim.sim, axis=1).max(axis=1)
+    sim = band.sim.of(np.argsort(steepness))
+    in_order = replace(band, sim=sim)
+    one, other = (ResponseProblem(response((63.0, 39.0), 0.045), [b]) for b in (band, in_order))
+    errors, same = (np.sqrt(refine(near, near.bands, 6).diagonal()) for near in (one, other))
+    np.testing.assert_allclose(same, errors, rtol=0.1)
+    np.testing.assert_array_less(
+        np.abs(other.parameters.vector() - one.parameters.vector()), errors
+    )
 
 
 def test_poles_are_told_apart_from_where_they_are_equal(band: Band) -> None:

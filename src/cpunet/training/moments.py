@@ -26,6 +26,7 @@ from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training._record_kernels import Window, project, read_records
 
 Values = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
 
 SIGMA_PER_MAD = 1.4826
 MIN_N = 200  # minimum number of pulses for a covariance of about a hundred moments
@@ -64,7 +65,7 @@ class Readings:
     def __len__(self) -> int:
         return len(self.linear)
 
-    def __getitem__(self, rows: npt.NDArray[np.bool_] | slice) -> Readings:
+    def __getitem__(self, rows: npt.NDArray[np.bool_] | Rows | slice) -> Readings:
         return Readings(self.linear[rows], self.log_amplitude[rows], self.weights[rows])
 
 
@@ -117,7 +118,7 @@ class Moments:
             If there are too few pulses.
         """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
-        some = whole[np.linspace(0, len(whole) - 1, min(len(whole), DRAWN)).astype(int)]
+        some = whole[spread(len(whole), DRAWN)]
         level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0
         window = _window(config, preparation, level, preparation.samples_before + 1)
         aligned, slopes, log_amplitude = _read_windows(windows[some], window, preparation)
@@ -239,7 +240,7 @@ class Moments:
         return float(self.centres[-1])
 
     def _of_windows(
-        self, windows: FloatArray, whole: npt.NDArray[np.intp], window: Window, least: float
+        self, windows: FloatArray, whole: Rows, window: Window, least: float
     ) -> Readings:
         """Readings of the prepared measured pulses that are used."""
         linear, log_amplitude = [], []
@@ -252,6 +253,11 @@ class Moments:
             log_amplitude.append(logs[usable])
         logs = np.concatenate(log_amplitude)
         return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
+
+
+def spread(n: int, most: int) -> Rows:
+    """Rows of at most `most` of `n` pulses, spread over all: files can be in any order."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)
 
 
 def _window(
