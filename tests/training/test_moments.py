@@ -11,6 +11,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.training.edge_functions import EdgeFunctions
 from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import MIN_N, Moments
 from synthetic import two_sites
@@ -157,6 +158,23 @@ def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -
     np.testing.assert_allclose(
         found.values[:, :stretches], moments.values[good, :stretches], atol=0.1
     )
+
+
+@pytest.mark.parametrize(
+    ("short", "segments"),
+    [({"before": 40}, (-40, 0, 300)), ({"after": 40, "level_samples": 20}, (-100, 0, 40))],
+)
+def test_a_window_that_ends_near_the_edge_has_amplitudes_too(windows, short, segments) -> None:
+    config = CONFIG.model_copy(update={**short, "segments": segments})
+    found = Moments.of_data(windows, config, PREPARATION)
+    aligned, _ = at_half_maximum(
+        torch.from_numpy(windows), found.level, 401, config, PREPARATION.tail_level
+    )
+    wanted = np.median(np.log(current_amplitude(aligned.numpy())))
+    assert np.median(found.data.log_amplitude) == pytest.approx(wanted, abs=0.01)
+    recipe = load_recipe("best").model_copy(update={"training": config})
+    values = EdgeFunctions(windows, recipe).of_windows(windows[:5])
+    assert torch.isfinite(values).all()
 
 
 @pytest.mark.parametrize("n", [1, 50, MIN_N - 1])
