@@ -13,7 +13,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.edge_functions import EdgeFunctions
 from cpunet.training.half_maximum_alignment import at_half_maximum
-from cpunet.training.moments import MIN_N, Moments
+from cpunet.training.moments import BLOCK, MIN_N, Moments
 from synthetic import two_sites
 
 RECIPE = load_recipe("fast")
@@ -24,13 +24,13 @@ LAST = BEFORE + PREPARATION.samples_before + 100
 N = 500
 
 
-def prepared(n: int = N, seed: int = 0, noise: float = 8e-4) -> FloatArray:
+def prepared(n: int = N, seed: int = 0, noise: float = 8e-4, width: float = 4) -> FloatArray:
     """Windows of two-site pulses with logistic edges, a decay and white noise."""
     rng = np.random.default_rng(seed)
     time = np.arange(1200)[np.newaxis]
 
     def site() -> np.ndarray:
-        return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / 4))
+        return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / width))
 
     record = two_sites(rng, n, site, single=0, least=0)
     record *= np.exp(-np.maximum(time - 520, 0) * DT_NS * 1e-3 / DECAY_US)
@@ -175,6 +175,14 @@ def test_a_window_that_ends_near_the_edge_has_amplitudes_too(windows, short, seg
     recipe = load_recipe("best").model_copy(update={"training": config})
     values = EdgeFunctions(windows, recipe).of_windows(windows[:5])
     assert torch.isfinite(values).all()
+
+
+@pytest.mark.parametrize("first", ["steep", "slow"])
+def test_the_order_of_the_data_does_not_leave_pulses_out(first: str) -> None:
+    """Pulses are read in blocks, and most of one block can be much steeper than the rest."""
+    steep, slow = prepared(BLOCK - 200, width=3), prepared(900, seed=1, width=30)
+    ordered = np.concatenate([steep, slow] if first == "steep" else [slow, steep])
+    assert Moments.of_data(ordered, CONFIG, PREPARATION).left_out == 0
 
 
 @pytest.mark.parametrize("n", [1, 50, MIN_N - 1])

@@ -12,14 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-
-Values = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
+from cpunet.training.moments import Rows, Values
 
 # Ratio of the limits of a band; the next is used only if no band of the one before is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
