@@ -88,7 +88,7 @@ def test_every_moment_has_a_name_of_its_own(moments) -> None:
 
 
 def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows) -> None:
-    aligned, _ = at_half_maximum(
+    aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
     )
     first, stop = CONFIG.segments[6:8]
@@ -114,7 +114,7 @@ def test_principal_components_are_uncorrelated_with_unit_variance() -> None:
 def test_the_density_of_the_current_amplitude_is_that_of_its_definition(
     moments, windows
 ) -> None:
-    aligned, _ = at_half_maximum(
+    aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
     )
     amplitude = np.log(current_amplitude(aligned.numpy()))
@@ -167,7 +167,7 @@ def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -
 def test_a_window_that_ends_near_the_edge_has_amplitudes_too(windows, short, segments) -> None:
     config = CONFIG.model_copy(update={**short, "segments": segments})
     found = Moments.of_data(windows, config, PREPARATION)
-    aligned, _ = at_half_maximum(
+    aligned = at_half_maximum(
         torch.from_numpy(windows), found.level, 401, config, PREPARATION.tail_level
     )
     wanted = np.median(np.log(current_amplitude(aligned.numpy())))

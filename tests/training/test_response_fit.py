@@ -422,7 +422,7 @@ def test_records_are_those_of_the_response(asked: ResponseProblem) -> None:
     records = band.sim.noise.add(np.float32(records), 0, 0)
     last = PADDING_BEFORE + RECIPE.preparation.samples_before + translated.DELAY
     config, level = RECIPE.matching.training, RECIPE.preparation.tail_level
-    aligned, _ = at_half_maximum(torch.from_numpy(records), moments.level, last, config, level)
+    aligned = at_half_maximum(torch.from_numpy(records), moments.level, last, config, level)
     expected = (aligned - torch.from_numpy(moments.mean)) @ torch.from_numpy(moments.components)
     amplitude = np.log(current_amplitude(aligned.numpy()))
     seen: list[Readings] = []

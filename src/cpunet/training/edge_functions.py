@@ -107,7 +107,7 @@ class EdgeFunctions:
 
     def _aligned(self, records: Tensor, last: int) -> Tensor:
         level = self.preparation.tail_level
-        found = at_half_maximum(records, self.level, last, self.training, level)[0]
+        found = at_half_maximum(records, self.level, last, self.training, level)
         return found[torch.isfinite(found).all(dim=1)]
 
     def _read(self, aligned: Tensor) -> Readings:
