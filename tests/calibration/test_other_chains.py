@@ -34,9 +34,9 @@ def decay_free(monkeypatch):
     """Stubs of the fits; what they are called with."""
     called = []
 
-    def fit(plain, training, decay, listener):
-        called.append(decay)
-        return SimpleNamespace(response=OTHER), None
+    def fit(plain, fitter):
+        called.append(fitter.decay)
+        return SimpleNamespace(problem=SimpleNamespace(response=OTHER))
 
     monkeypatch.setattr(other_chains, "_at_these_physics", lambda *_: None)
     monkeypatch.setattr(other_chains, "with_free_decay", fit)

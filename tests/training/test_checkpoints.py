@@ -294,6 +294,17 @@ def test_a_training_that_died_is_finished(sets, recipe, out, whole):
     assert not beside(out).exists()
 
 
+def test_a_training_that_stopped_on_pairs_goes_on_with_them(tmp_path):
+    def begun(notes: list[str], *, resume: bool) -> UnfinishedRun:
+        run = UnfinishedRun(tmp_path, {}, {}, notes.append)
+        run.begin(resume=resume)
+        return run
+
+    begun([], resume=False).save({"iteration": 0, "pairs": {"iteration": 7}})
+    begun(notes := [], resume=True)
+    assert notes == ["going on after 7 iterations on pairs"]
+
+
 def test_without_resume_nothing_is_lost(sets, recipe, out):
     before = content(beside(out))
     with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; continue"):

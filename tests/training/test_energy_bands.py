@@ -104,6 +104,14 @@ def test_spectra_that_do_not_overlap_are_refused() -> None:
         energy_bands(continuum(900, 300, 500, 1, 1), continuum(800, 900, 1500, 1, 2), PEAKS)
 
 
+def test_lines_of_other_energies_are_no_spectrum_in_common() -> None:
+    """Energies can be those of a table, so that all pulses of a line have the same."""
+    sim = np.full(300, 1100.0)
+    data = np.r_[np.full(300, 1000.0), np.full(300, 1200.0)]
+    with pytest.raises(CpunetError, match=r"^300 simulated and 600 measured pulses; 200 of"):
+        energy_bands(sim, data, PEAKS)
+
+
 def test_a_band_is_named_by_its_energies() -> None:
     (band,) = energy_bands(np.linspace(1000, 1200, 500), np.linspace(1000, 1200, 400), {})
     assert isinstance(band, EnergyBand)

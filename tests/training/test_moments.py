@@ -11,8 +11,9 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.training.edge_functions import EdgeFunctions
 from cpunet.training.half_maximum_alignment import at_half_maximum
-from cpunet.training.moments import MIN_N, Moments
+from cpunet.training.moments import BLOCK, MIN_N, Moments
 from synthetic import two_sites
 
 RECIPE = load_recipe("fast")
@@ -23,13 +24,13 @@ LAST = BEFORE + PREPARATION.samples_before + 100
 N = 500
 
 
-def prepared(n: int = N, seed: int = 0, noise: float = 8e-4) -> FloatArray:
+def prepared(n: int = N, seed: int = 0, noise: float = 8e-4, width: float = 4) -> FloatArray:
     """Windows of two-site pulses with logistic edges, a decay and white noise."""
     rng = np.random.default_rng(seed)
     time = np.arange(1200)[np.newaxis]
 
     def site() -> np.ndarray:
-        return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / 4))
+        return 1 / (1 + np.exp(-(time - rng.uniform(500, 540, (n, 1))) / width))
 
     record = two_sites(rng, n, site, single=0, least=0)
     record *= np.exp(-np.maximum(time - 520, 0) * DT_NS * 1e-3 / DECAY_US)
@@ -87,7 +88,7 @@ def test_every_moment_has_a_name_of_its_own(moments) -> None:
 
 
 def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows) -> None:
-    aligned, _ = at_half_maximum(
+    aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
     )
     first, stop = CONFIG.segments[6:8]
@@ -113,7 +114,7 @@ def test_principal_components_are_uncorrelated_with_unit_variance() -> None:
 def test_the_density_of_the_current_amplitude_is_that_of_its_definition(
     moments, windows
 ) -> None:
-    aligned, _ = at_half_maximum(
+    aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
     )
     amplitude = np.log(current_amplitude(aligned.numpy()))
@@ -157,6 +158,31 @@ def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -
     np.testing.assert_allclose(
         found.values[:, :stretches], moments.values[good, :stretches], atol=0.1
     )
+
+
+@pytest.mark.parametrize(
+    ("short", "segments"),
+    [({"before": 40}, (-40, 0, 300)), ({"after": 40, "level_samples": 20}, (-100, 0, 40))],
+)
+def test_a_window_that_ends_near_the_edge_has_amplitudes_too(windows, short, segments) -> None:
+    config = CONFIG.model_copy(update={**short, "segments": segments})
+    found = Moments.of_data(windows, config, PREPARATION)
+    aligned = at_half_maximum(
+        torch.from_numpy(windows), found.level, 401, config, PREPARATION.tail_level
+    )
+    wanted = np.median(np.log(current_amplitude(aligned.numpy())))
+    assert np.median(found.data.log_amplitude) == pytest.approx(wanted, abs=0.01)
+    recipe = load_recipe("best").model_copy(update={"training": config})
+    values = EdgeFunctions(windows, recipe).of_windows(windows[:5])
+    assert torch.isfinite(values).all()
+
+
+@pytest.mark.parametrize("first", ["steep", "slow"])
+def test_the_order_of_the_data_does_not_leave_pulses_out(first: str) -> None:
+    """Pulses are read in blocks, and most of one block can be much steeper than the rest."""
+    steep, slow = prepared(BLOCK - 200, width=3), prepared(900, seed=1, width=30)
+    ordered = np.concatenate([steep, slow] if first == "steep" else [slow, steep])
+    assert Moments.of_data(ordered, CONFIG, PREPARATION).left_out == 0
 
 
 @pytest.mark.parametrize("n", [1, 50, MIN_N - 1])

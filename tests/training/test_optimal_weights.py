@@ -13,7 +13,9 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
+from cpunet.training import optimal_weights
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Moments
 from cpunet.training.optimal_weights import ConditionalFunctions, refine
@@ -84,6 +86,20 @@ def test_the_chain_is_found_from_nearby_within_its_errors(band: Band) -> None:
     assert abs(together @ (found - truth)) < 0.01
 
 
+def test_the_order_of_the_pulses_does_not_matter(band: Band, monkeypatch) -> None:
+    """Weights come from some of them, which are spread over the file."""
+    monkeypatch.setattr(optimal_weights, "FOR_WEIGHTS", 400)
+    steepness = np.diff(band.sim.sim, axis=1).max(axis=1)
+    sim = band.sim.of(np.argsort(steepness))
+    in_order = replace(band, sim=sim)
+    one, other = (ResponseProblem(response((63.0, 39.0), 0.045), [b]) for b in (band, in_order))
+    errors, same = (np.sqrt(refine(near, near.bands, 6).diagonal()) for near in (one, other))
+    np.testing.assert_allclose(same, errors, rtol=0.1)
+    np.testing.assert_array_less(
+        np.abs(other.parameters.vector() - one.parameters.vector()), errors
+    )
+
+
 def test_poles_are_told_apart_from_where_they_are_equal(band: Band) -> None:
     """Where they are equal, derivatives with their difference vanish."""
     near = ResponseProblem(response((49.0, 48.9), 0.05), [band])
@@ -130,6 +146,22 @@ def test_the_amplitude_is_right_after_it_and_wrong_before(band: Band) -> None:
     refine(near, [band], 6)
     shift, error = amplitude_shift(near.response, [band])
     assert abs(shift) < 3 * error
+
+
+@pytest.mark.parametrize("poles_ns", [(66.0, 44.0), (80.0, 80.0), (150.0, 150.0)])
+def test_an_amplitude_that_is_far_off_is_told_as_it_is(
+    band: Band, poles_ns: tuple[float, float]
+) -> None:
+    """Also where no translated amplitude is one of the data's."""
+    pulses = torch.from_numpy(charge(2))
+    with torch.no_grad():
+        translated, true = (
+            np.log(current_amplitude(response(poles, 0.05)(pulses).numpy()))
+            for poles in (poles_ns, (60.0, 40.0))
+        )
+    shift, error = amplitude_shift(response(poles_ns, 0.05), [band])
+    assert shift == pytest.approx((true - translated).mean(), rel=0.05)
+    assert 0 < error < 0.01
 
 
 def test_functions_are_components_in_bins_of_the_amplitude(band: Band) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +13,10 @@ from cpunet.electronics.drawn_remains import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit, response_starts
+from cpunet.training.fitter import Fitted, Fitter
+from cpunet.training.response_problem import ResponseProblem
 
-SEARCHES = ["_checked", "free_decay_if_better", "ringing_if_better"]
+SEARCHES = ["_with_more", "free_decay_if_better", "ringing_if_better"]
 DRIFT = ["drift_if_better", "drift_if_needed"]
 PHYSICS = "_with_wrong_physics"
 
@@ -33,21 +35,21 @@ def test_nothing_else_is_tried_for_another_detector(
     """If the onset is off, too; `chi_square` is in units of `response_fit.ANOTHER_DETECTOR`."""
     called: list[str] = []
     problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None, drift=None))
-    found = SimpleNamespace(cost=20 * chi_square * response_fit.ANOTHER_DETECTOR)
+    cost = 20 * chi_square * response_fit.ANOTHER_DETECTOR
+    found = Fitted(cast(ResponseProblem, problem), cost, np.eye(1))
 
     def replace(name: str, result: Any) -> None:
         monkeypatch.setattr(response_fit, name, lambda *_, **__: called.append(name) or result)
 
     for name in (*SEARCHES, *DRIFT):
-        replace(name, (problem, found))
+        replace(name, found)
     for name in (PHYSICS, "_determined"):
         replace(name, name)
     asked = {
         "PulseSets": SimpleNamespace(bands=lambda _most=None: []),
         "ElectronicsResponse": None,
         "ResponseProblem": None,
-        "best_start": (problem, found),
-        "is_poor": True,
+        "best_start": found,
         "onset_is_off": onset_is_off,
     }
     for name, answer in asked.items():
@@ -72,7 +74,7 @@ def test_a_known_response_starts_with_the_main_decay_that_fits(
     class Problem:
         """A chi-square that knows the main decay."""
 
-        slope = -16e-3 / 100.0  # of the tails, per sample
+        moments, slope = 1, -16e-3 / 100.0  # the slope of the tails is per sample
 
         def __init__(self, response: ElectronicsResponse) -> None:
             self.response = response
@@ -87,13 +89,10 @@ def test_a_known_response_starts_with_the_main_decay_that_fits(
     recipe = load_recipe("fast")
     known = ElectronicsResponse(recipe.matching[0], 16.0)
     known.log_decay_us.data.fill_(math.log(300.0))
-    monkeypatch.setattr(
-        response_starts,
-        "levenberg_marquardt",
-        lambda problem, *_, **__: response_starts.Minimum(0.0, 1, np.eye(1)),
-    )
-    monkeypatch.setattr(response_starts, "is_poor", lambda *_: False)
-    found = response_starts.from_known(Problem(known), known, recipe.matching[1], remains, None)
+    fitter = Fitter(recipe.matching[1], remains)
+    monkeypatch.setattr(fitter, "fit", lambda of, **_: Fitted(of, 0.0, np.eye(1)))
+    found = response_starts.from_known(Problem(known), known, fitter)
     assert found is not None
-    assert math.exp(found[0].response.log_decay_us.item()) == pytest.approx(expected)
+    decay_us = math.exp(found.problem.response.log_decay_us.item())
+    assert decay_us == pytest.approx(expected)
     assert math.exp(known.log_decay_us.item()) == pytest.approx(300.0)  # it is left alone

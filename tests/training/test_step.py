@@ -225,7 +225,7 @@ def test_the_gradient_penalty_by_finite_differences(tiny, batches):
     judge = step.model.discriminator_data.double()
     judge.norm.eval()  # so that pulses do not influence each other
     judge.value_range = (-0.5, 1.5)
-    _, penalty = step._discriminator_loss(judge, data[:2], sim[:2])
+    _, penalty, _ = step._discriminator_loss(judge, data[:2], sim[:2])
     squares = 0.0
     for pulse in (*data[:2], *sim[:2]):
         for sample in range(pulse.shape[1]):

@@ -13,10 +13,11 @@ from dataclasses import replace
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import ResponseProblem
-from cpunet.training.response_starts import GOOD_FIT, ringing_if_better, with_free_decay
+from cpunet.training.response_starts import ringing_if_better, with_free_decay
 
 STEPS = 12
 # Chi-square beyond chance, in its standard deviations, for which another chain is tried.
@@ -34,10 +35,11 @@ def ringing_chain(
         return None
     plain = _at_these_physics(problem, chain, sets, training)
     found = levenberg_marquardt(plain, STEPS, None, coarse=False)
-    if found.cost < GOOD_FIT * plain.moments:
+    fitted = Fitted(plain, found.cost, found.covariance)
+    if not fitted.poor:
         return None
-    best, _ = ringing_if_better(plain, found, chain.config, training, None)
-    return best.response if len(best.response.ringing) else None
+    best = ringing_if_better(fitted, Fitter(training)).problem.response
+    return best if len(best.ringing) else None
 
 
 def decaying_chain(
@@ -53,12 +55,11 @@ def decaying_chain(
     chain = copy.deepcopy(problem.parameters.chain.response)
     plain = _at_these_physics(problem, chain, sets, training)
     remains = sets.remains
-    other = with_free_decay(
-        plain, training, None if remains is None else remains.known_decay, None
-    )
+    decay = None if remains is None else remains.known_decay
+    other = with_free_decay(plain, Fitter(training, decay))
     if other is None:
         return None
-    tried = problem.of_chain(other[0].response)
+    tried = problem.of_chain(other.problem.response)
     levenberg_marquardt(tried, STEPS, None, coarse=False)
     return None if _cost(tried) > _cost(problem) - NEEDED else tried.parameters.chain.response
 

@@ -90,7 +90,7 @@ def info(
         force=force,
     )
     if told["kind"] == "run" and (wrong := problem(told)):
-        warn(f"{source}: its run.json is damaged ({wrong}); train again")
+        warn(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
         print_table(_tables(told))
         out.print("one of them: --table NAME; each in full: --table all", highlight=False)

@@ -175,8 +175,7 @@ def read_records(
     tail = np.empty(w.fit_samples, np.float32)
     logs = np.empty(w.fit_samples, np.float32)
     current = np.empty(w.before + w.after - 1, np.float32)
-    reach = weights.shape[1] // 2 + w.edge // 3
-    half = weights.shape[1] // 2
+    near = w.edge // 3  # of the steepest sample, within which the maximum is
     for row in range(len(records)):
         record = records[row]
         _, sample = _crossing(record, w.level, w.last)
@@ -194,12 +193,11 @@ def read_records(
         slopes[row] = _tail_slope(record, w, tail, logs)
         for i in range(len(current)):
             current[i] = aligned[row, i + 1] - aligned[row, i]
-        steepest = w.before - w.edge
-        for i in range(w.before - w.edge, w.before + w.edge):
+        steepest = max(w.before - w.edge, 0)
+        for i in range(steepest, min(w.before + w.edge, len(current))):
             if current[i] > current[steepest]:
                 steepest = i
-        first = steepest - reach + half
-        amplitudes[row] = _amplitude(current, first, first + 2 * (reach - half) + 1, weights)
+        amplitudes[row] = _amplitude(current, steepest - near, steepest + near + 1, weights)
 
 
 @kernel(error_model="numpy")

@@ -92,12 +92,12 @@ class ChainStep:
         """Measured or translated windows, (batch, 1, samples), for the discriminator."""
         level = float(self.inverse.half_height)
         last, tail = self.preparation.samples_before + 1, self.preparation.tail_level
-        return at_half_maximum(windows[:, 0], level, last, self.matching, tail)[0][:, None]
+        return at_half_maximum(windows[:, 0], level, last, self.matching, tail)[:, None]
 
     def sim_view(self, near: Tensor) -> Tensor:
         """Charge around its half maximum, (batch, samples), for the discriminator."""
         last = self.matching.before + LATEST
-        return at_half_maximum(near, 0.5, last, self.matching, 1.0)[0][:, None]
+        return at_half_maximum(near, 0.5, last, self.matching, 1.0)[:, None]
 
     @torch.no_grad()
     def _by_chain(self, sim: Tensor) -> Tensor:

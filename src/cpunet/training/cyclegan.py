@@ -21,11 +21,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.compared import Compared, Judged
-from cpunet.training.fast_step import (
-    fast_translations,
-    logits,
-    plain_translations,
-)
+from cpunet.training.fast_step import fast_translations, logits, plain_translations
 from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
 from cpunet.training.outside import Outside, tolerance
@@ -126,7 +122,6 @@ class Step:
         self.outside, self.chain = outside, chain
         # of the discriminators, if this iteration updates them
         self.accuracy: dict[str, Tensor] = {}
-        self._right = torch.empty(0, dtype=torch.bool)
         self.config, self.warmup = config, warmup
         self.group = group
         device = next(model.parameters()).device
@@ -280,8 +275,8 @@ class Step:
 
     def _discriminator_loss(
         self, network: Discriminator, real: Tensor, fake: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the adversarial loss and the gradient penalty."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the adversarial loss, the gradient penalty, and the accuracy."""
         weight = self.config.losses.gradient_penalty
         # in one batch: the batch norm must see both kinds together
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
@@ -289,17 +284,18 @@ class Step:
         with torch.backends.cudnn.flags(enabled=weight == 0):
             found = network(pulses) if weight else logits(network, pulses)
         loss = real_loss(found[: len(real)]) + fake_loss(found[len(real) :])
-        self._right = torch.cat([found[: len(real)] > 0, found[len(real) :] < 0])
+        right = torch.cat([found[: len(real)] > 0, found[len(real) :] < 0])
+        accuracy = right.float().mean()
         if not weight:
-            return loss, torch.zeros_like(loss)
+            return loss, torch.zeros_like(loss), accuracy
         (slope,) = torch.autograd.grad(found.sum(), pulses, create_graph=True)
-        return loss, weight * slope.square().sum(dim=(1, 2)).mean()
+        return loss, weight * slope.square().sum(dim=(1, 2)).mean(), accuracy
 
     def _update_discriminators(self, judged: dict[str, Judged]) -> dict[str, Tensor]:
         losses = {}
         for (name, pulses), optimiser in zip(judged.items(), self.discriminators, strict=True):
             network = getattr(self.model, name)
-            loss, penalty = self._discriminator_loss(
+            loss, penalty, accuracy = self._discriminator_loss(
                 network, pulses.real.detach(), pulses.fake.detach()
             )
             optimiser.zero_grad(set_to_none=True)
@@ -308,6 +304,5 @@ class Step:
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss
-            side = name.removeprefix("discriminator_")
-            self.accuracy[side] = self._right.float().mean()
+            self.accuracy[name.removeprefix("discriminator_")] = accuracy
         return losses

@@ -107,7 +107,7 @@ class EdgeFunctions:
 
     def _aligned(self, records: Tensor, last: int) -> Tensor:
         level = self.preparation.tail_level
-        found = at_half_maximum(records, self.level, last, self.training, level)[0]
+        found = at_half_maximum(records, self.level, last, self.training, level)
         return found[torch.isfinite(found).all(dim=1)]
 
     def _read(self, aligned: Tensor) -> Readings:
@@ -140,14 +140,17 @@ class EdgeFunctions:
         )
 
     def _slopes(self, aligned: Tensor) -> Tensor:
-        before = self.training.before
-        return torch.diff(aligned[:, before - SLOPE_BEFORE : before + SLOPE_AFTER], dim=1)
+        return self._current(aligned, SLOPE_BEFORE, SLOPE_AFTER)
 
     def _log_amplitudes(self, aligned: Tensor) -> Tensor:
-        before = self.training.before
-        current = torch.diff(aligned[:, before - EDGE : before + EDGE], dim=1)
+        current = self._current(aligned, EDGE, EDGE)
         phases = nn.functional.conv1d(current[:, None], self.kernel[:, None])
         return phases.flatten(1).amax(dim=1).clamp_min(1e-4).log()
+
+    def _current(self, aligned: Tensor, before: int, after: int) -> Tensor:
+        """Current from so many samples before the half maximum to so many after it."""
+        middle = self.training.before
+        return torch.diff(aligned[:, max(middle - before, 0) : middle + after], dim=1)
 
 
 class EdgeMisfit:

@@ -12,14 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-
-Values = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
+from cpunet.training.moments import Rows, Values
 
 # Ratio of the limits of a band; the next is used only if no band of the one before is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
@@ -119,17 +116,19 @@ def _continuum(
         if min(counts) >= LEAST:
             low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
             weights = _weights(sim_kev[parts[0]], data_kev[parts[1]])
-            bands.append(EnergyBand(f"{low:.0f}-{top:.0f} keV", parts[0], parts[1], weights))
+            if weights.any():
+                weights /= weights.mean()
+                name = f"{low:.0f}-{top:.0f} keV"
+                bands.append(EnergyBand(name, parts[0], parts[1], weights))
         rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
     return bands
 
 
 def _weights(sim_kev: Values, data_kev: Values) -> Values:
-    """Weights of simulated pulses that give them the data's spectrum."""
+    """Weights of simulated pulses that give them the data's spectrum; all 0 without overlap."""
     slices = max(2, min(SLICES, min(len(sim_kev), len(data_kev)) // IN_SLICE))
     edges = np.quantile(data_kev, np.linspace(0, 1, slices + 1)[1:-1])
     of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
     counts = [np.bincount(of, minlength=slices) for of in (of_sim, of_data)]
     ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
-    weights = np.minimum(ratio, HEAVIEST)[of_sim]
-    return np.asarray(weights / weights.mean())
+    return np.asarray(np.minimum(ratio, HEAVIEST)[of_sim])

@@ -65,7 +65,9 @@ def finished_members(ensemble: Path) -> list[Path]:
     CpunetError
         If there is none.
     """
-    runs = [path.parent for path in Path(ensemble).glob(f"seed_*/{INFO}")]
+    found = [path.parent for path in Path(ensemble).glob(f"seed_*/{INFO}")]
+    # not what a process left that was stopped while it put a run in place
+    runs = [run for run in found if re.fullmatch(r"seed_\d+", run.name)]
     if not runs:
         raise CpunetError(
             f"{ensemble}: no folder of an ensemble with a finished seed; make one with "

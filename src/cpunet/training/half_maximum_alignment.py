@@ -41,7 +41,7 @@ def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tenso
 
 def at_half_maximum(
     records: Tensor, level: float, last: int, config: MatchingConfig, tail_level: float
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Align records, subtract the baseline and scale.
 
     Parameters
@@ -57,9 +57,9 @@ def at_half_maximum(
 
     Returns
     -------
-    tuple of Tensor
+    Tensor
         Windows of ``before + after`` samples around the crossing, shifted by fractions of a
-        sample, and the records with the same baseline and scale.
+        sample.
     """
     whole = torch.full((len(records),), last, device=records.device)
     _, sample = crossing(records, level, whole)
@@ -74,4 +74,4 @@ def at_half_maximum(
     start = time.floor()
     fraction = (time - start)[:, None]
     window = stretch(records, start.long(), -config.before, config.after + 1)
-    return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction, records
+    return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction

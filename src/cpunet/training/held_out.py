@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from cpunet.networks.hybrid import RecordCorrection
+from cpunet.pulses.container import FloatArray
+from cpunet.recipes.schema import Recipe
 from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 
 RESAMPLED = 60  # bootstrap samples, for the error of the decrease of chi-square
@@ -53,6 +55,17 @@ class Aim:
     functions: EdgeFunctions
     misfit: EdgeMisfit
     measured: Tensor
+
+    @classmethod
+    def at(cls, windows: FloatArray, recipe: Recipe) -> Aim:
+        """Functions, weights and means of the same measured windows, shape (n, samples)."""
+        functions = EdgeFunctions(windows, recipe)
+        measured = functions.of_windows(windows)
+        return cls(functions, EdgeMisfit(measured, recipe.matching.training.ridge), measured)
+
+    def at_others(self, windows: FloatArray) -> Aim:
+        """The same functions and weights, with the means of other measured windows."""
+        return replace(self, measured=self.functions.of_windows(windows))
 
     def chi_square(self, made: Tensor) -> Tensor:
         """Chi-square per function, for functions of translated pulses."""

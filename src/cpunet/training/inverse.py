@@ -24,9 +24,7 @@ from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
-from cpunet.training.moments import MIN_N
-
-Values = npt.NDArray[np.float64]
+from cpunet.training.moments import MIN_N, Values
 
 # RMS, in pulse heights, of white noise added to that of the baselines: rounding to float32,
 # and effects that the response does not describe.

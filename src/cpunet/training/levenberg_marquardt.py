@@ -58,14 +58,11 @@ class Minimum(NamedTuple):
     ----------
     cost
         Sum of the squared residuals.
-    steps
-        Number of steps taken.
     covariance
         Covariance of the parameters.
     """
 
     cost: float
-    steps: int
     covariance: Values
 
 
@@ -133,7 +130,7 @@ def levenberg_marquardt(
     jacobian = problem.jacobian(vector, residuals)
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
-    return Minimum(cost, taken, covariance)
+    return Minimum(cost, covariance)
 
 
 def _step(

@@ -9,6 +9,7 @@ the data.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,16 @@ from cpunet.training.response_problem import Band
 
 BINS = 32  # of the logarithm of the amplitude
 STEP = 0.002  # of the logarithm of the amplitude, for the derivative
+NEAR = 0.02  # maximum shift in which densities are linear without doubt
+
+
+class _Shift(NamedTuple):
+    """Shift by a linear fit, the chi-square where it starts, and the shift of the mean."""
+
+    chi_square: float
+    shift: float
+    error: float
+    of_mean: float
 
 
 def amplitude_shift(
@@ -27,7 +38,8 @@ def amplitude_shift(
     """Relative shift that the translated current amplitudes need, and its error.
 
     It is a least-squares fit to the densities of its logarithm, with their covariance from the
-    data's events.
+    data's events.  If the mean logarithms differ much, the fit starts from their difference,
+    unless the densities agree better without it.
 
     Parameters
     ----------
@@ -36,27 +48,41 @@ def amplitude_shift(
     bands
         Bands to compare.
     """
-    weight = weighted = 0.0
+    found = _linear_fit(response, bands, 0.0)
+    if abs(found.of_mean) > NEAR:
+        found = min(found, _linear_fit(response, bands, found.of_mean))
+    return found.shift, found.error
+
+
+def _linear_fit(response: ElectronicsResponse, bands: Sequence[Band], start: float) -> _Shift:
+    """Fit from amplitudes that are already shifted by `start`."""
+    chi_square = weight = weighted = weight_of_mean = weighted_mean = 0.0
     for band in bands:
         functions = ConditionalFunctions.of(band.moments, BINS)
-        density, slope = _density(band, functions, response)
-        values = functions.density(band.moments.data.log_amplitude)
+        density, slope, mean = _density(band, functions, response, start)
+        logs = band.moments.data.log_amplitude
+        values = functions.density(logs)
+        apart = values.mean(axis=0) - density
         inverse = np.linalg.inv(np.cov(values.T) / band.pairs + 1e-12 * np.eye(len(slope)))
+        chi_square += float(apart @ inverse @ apart)
         weight += float(slope @ inverse @ slope)
-        weighted += float(slope @ inverse @ (values.mean(axis=0) - density))
-    return weighted / weight, weight**-0.5
+        weighted += float(slope @ inverse @ apart)
+        weight_of_mean += band.pairs
+        weighted_mean += band.pairs * float(logs.mean() - mean)
+    weight = max(weight, 1.0)  # an error of more than 100 % is that of no overlap
+    shift = start + weighted / weight
+    return _Shift(chi_square, shift, weight**-0.5, weighted_mean / weight_of_mean)
 
 
 def _density(
-    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse
-) -> tuple[Values, Values]:
-    """Mean densities of translated amplitudes, and their derivatives in the shift."""
+    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse, start: float
+) -> tuple[Values, Values, Values]:
+    """Mean densities of translated amplitudes, derivatives in the shift, and mean logarithm."""
 
     def of(readings: Readings) -> tuple[Values, ...]:
-        logs = readings.log_amplitude
-        return tuple(
-            readings.weights @ functions.density(logs + shift) for shift in (0.0, STEP, -STEP)
-        )
+        logs, weights = readings.log_amplitude, readings.weights
+        shifts = (start, start + STEP, start - STEP)
+        return (*(weights @ functions.density(logs + s) for s in shifts), weights @ logs)
 
-    (here, up, down), n = band.sim.sums(response, of)
-    return here / n, (up - down) / (2 * STEP * n)
+    (here, up, down, total), n = band.sim.sums(response, of)
+    return here / n, (up - down) / (2 * STEP * n), total / n

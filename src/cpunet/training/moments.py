@@ -11,7 +11,7 @@ four times better than its mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -26,6 +26,7 @@ from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training._record_kernels import Window, project, read_records
 
 Values = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
 
 SIGMA_PER_MAD = 1.4826
 MIN_N = 200  # minimum number of pulses for a covariance of about a hundred moments
@@ -64,7 +65,7 @@ class Readings:
     def __len__(self) -> int:
         return len(self.linear)
 
-    def __getitem__(self, rows: npt.NDArray[np.bool_] | slice) -> Readings:
+    def __getitem__(self, rows: npt.NDArray[np.bool_] | Rows | slice) -> Readings:
         return Readings(self.linear[rows], self.log_amplitude[rows], self.weights[rows])
 
 
@@ -117,17 +118,19 @@ class Moments:
             If there are too few pulses.
         """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
-        some = whole[np.linspace(0, len(whole) - 1, min(len(whole), DRAWN)).astype(int)]
+        some = whole[spread(len(whole), DRAWN)]
         level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0
         window = _window(config, preparation, level, preparation.samples_before + 1)
         aligned, slopes, log_amplitude = _read_windows(windows[some], window, preparation)
-        usable = _usable(aligned, log_amplitude, config)
+        usable = _single(aligned, config)
+        if usable.any():
+            usable &= log_amplitude > _least(log_amplitude[usable])
         if usable.sum() < MIN_N:
             raise CpunetError(
                 f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
                 "needed: select more energies (--peak) or give more files"
             )
-        least = float(np.log(MIN_SHARE) + np.median(log_amplitude[usable]))
+        least = _least(log_amplitude[usable])
         aligned, slopes, log_amplitude = aligned[usable], slopes[usable], log_amplitude[usable]
         mean, components = _principal_components(aligned, config.components)
         linear = _linear(aligned, slopes, mean, components, config)
@@ -153,13 +156,13 @@ class Moments:
         data = drawn_up._of_windows(windows, whole, window, least)
         slopes = data.linear[:, -1] * drawn_up.spreads[-1] + drawn_up.centres[-1]
         rounding = 1e-4 * drawn_up.spreads[-1]
-        complete = vars(drawn_up) | {
-            "data": data,
-            "values": drawn_up.functions(data),
-            "left_out": len(windows) - len(data),
-            "slope_range": (slopes.min() - rounding, slopes.max() + rounding),
-        }
-        return cls(**complete)
+        return replace(
+            drawn_up,
+            data=data,
+            values=drawn_up.functions(data),
+            left_out=len(windows) - len(data),
+            slope_range=(slopes.min() - rounding, slopes.max() + rounding),
+        )
 
     def read(
         self,
@@ -239,19 +242,24 @@ class Moments:
         return float(self.centres[-1])
 
     def _of_windows(
-        self, windows: FloatArray, whole: npt.NDArray[np.intp], window: Window, least: float
+        self, windows: FloatArray, whole: Rows, window: Window, least: float
     ) -> Readings:
         """Readings of the prepared measured pulses that are used."""
         linear, log_amplitude = [], []
         for first in range(0, len(whole), BLOCK):
             block = windows[whole[first : first + BLOCK]]
             aligned, slopes, logs = _read_windows(block, window, self.preparation)
-            usable = _usable(aligned, logs, self.config) & (logs > least)
+            usable = _single(aligned, self.config) & (logs > least)
             of_block = _linear(aligned, slopes, self.mean, self.components, self.config)
             linear.append(((of_block - self.centres) / self.spreads)[usable])
             log_amplitude.append(logs[usable])
         logs = np.concatenate(log_amplitude)
         return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
+
+
+def spread(n: int, most: int) -> Rows:
+    """Rows of at most `most` of `n` pulses, spread over all: files can be in any order."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)
 
 
 def _window(
@@ -295,14 +303,15 @@ def _read_windows(
     return aligned, slopes, log_amplitude
 
 
-def _usable(
-    aligned: FloatArray, log_amplitude: Values, config: MatchingConfig
-) -> npt.NDArray[np.bool_]:
-    quiet = np.abs(aligned[:, : max(1, config.before // 4)].mean(axis=1)) < QUIET
-    usable = np.isfinite(aligned).all(axis=1) & quiet
-    if usable.any():
-        usable &= log_amplitude > np.log(MIN_SHARE) + np.median(log_amplitude[usable])
-    return np.asarray(usable)
+def _single(aligned: FloatArray, config: MatchingConfig) -> npt.NDArray[np.bool_]:
+    """Whether pulses are whole, with nothing before them."""
+    before = np.abs(aligned[:, : max(1, config.before // 4)].mean(axis=1))
+    return np.asarray(np.isfinite(aligned).all(axis=1) & (before < QUIET))
+
+
+def _least(log_amplitude: Values) -> float:
+    """Logarithm of the current amplitude below which there is no single pulse."""
+    return float(np.log(MIN_SHARE) + np.median(log_amplitude))
 
 
 def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,6 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.held_out import Aim, Kept, judge, split_rows
 from cpunet.training.outside import of_height
 from cpunet.training.surroundings import MatchedChain
@@ -51,10 +50,8 @@ class NetworkGate:
 
     def judge(self, model: CycleGan, chain: MatchedChain) -> Kept:
         """Make the correction of REN's network exactly zero unless it improves pulses."""
-        functions = EdgeFunctions(self.data, self.recipe.of_chain)
-        measured = functions.of_windows(self.data)
-        misfit = EdgeMisfit(measured, self.recipe.of_chain.matching.training.ridge)
-        held_out = Aim(functions, misfit, functions.of_windows(self.data[self._held_data]))
+        aim = Aim.at(self.data, self.recipe.of_chain)
+        held_out = aim.at_others(self.data[self._held_data])
         ren, level = model.cpu().ren, self.recipe.preparation.tail_level  # moves the chain, too
         correction = ChainStep(*chain, ren, model.iren, self.recipe).correction.eval()
         with torch.no_grad():

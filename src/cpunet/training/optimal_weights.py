@@ -27,7 +27,7 @@ import numpy as np
 import scipy.optimize
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.moments import BLOCK, Moments, Readings, Values
+from cpunet.training.moments import BLOCK, Moments, Readings, Values, spread
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.smooth_parameters import SmoothParameters
 from cpunet.training.translated import Translated
@@ -180,13 +180,16 @@ class _Weighted:
     ) -> None:
         self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
         data = band.moments.data
-        some = data[slice(0, FOR_WEIGHTS)]
-        measured = [
-            Sums.of(self.functions(some[slice(part, None, PARTS)])) for part in range(PARTS)
-        ]
-        sim = band.sim.first(FOR_WEIGHTS)
+        # all parts are spread over the files, where neighbours may be alike
+        of_sim, of_data = (
+            [spread(n, FOR_WEIGHTS)[part::PARTS] for part in range(PARTS)]
+            for n in (len(band.sim), len(data))
+        )
+        measured = [Sums.of(self.functions(data[rows])) for rows in of_data]
+        sim = band.sim.of(np.concatenate(of_sim))
         simulated = _simulated(sim, self.functions, smooth, response)
-        self.pairs = 1 / (1 / len(some) + 1 / sum(part.n for part in simulated))
+        counts = (sum(part.n for part in side) for side in (simulated, measured))
+        self.pairs = 1 / sum(1 / n for n in counts)
         self.parts = Parts(simulated, measured, band.pairs)
         self.weights, self.whiten = self.parts.whole.weights, self.parts.whole.whiten
         self.slopes = self.parts.whole.slopes

@@ -11,8 +11,8 @@ from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
-from cpunet.training.energy_bands import EnergyBand, Rows, energy_bands
-from cpunet.training.moments import Moments
+from cpunet.training.energy_bands import EnergyBand, energy_bands
+from cpunet.training.moments import Moments, Rows
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, Translated
 

@@ -16,16 +16,15 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.networks.hybrid import EdgeResidual
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.networks.response_layer import PADDING_AFTER
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.network_settings import ResidualConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.edge_functions import EdgeFunctions, EdgeMisfit
 from cpunet.training.held_out import Aim, Kept, judge, split_rows
-from cpunet.training.moments import BLOCK
+from cpunet.training.outside import of_height
 
 DRAWS = 4  # noise traces per pulse; in training, they are assigned to pulses at random
 PER_MILLE = 1e-3  # of a pulse's height: the unit of roughness
@@ -78,15 +77,12 @@ def fit_residual(
             ]
         )
     )
-    functions = EdgeFunctions(data[own_data], recipe)
-    measured = functions.of_windows(data[own_data])
-    misfit = EdgeMisfit(measured, recipe.matching.training.ridge)
+    aim = Aim.at(data[own_data], recipe)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = EdgeResidual(config)
-    aim = Aim(functions, misfit, measured)
     trained = _train(network, aim, records[own], noise, config, rng)
-    held_out = Aim(functions, misfit, functions.of_windows(data[held_data]))
+    held_out = aim.at_others(data[held_data])
     dealt = noise[torch.from_numpy(rng.permutation(len(noise))[: len(held)])]
     found = judge(trained, held_out, records[held], dealt, config.least_fall, rng)
     if found.kept:
@@ -99,15 +95,8 @@ def fit_residual(
 @torch.no_grad()
 def _records(generator: ResponseGenerator, sim: FloatArray, recipe: Recipe) -> Tensor:
     """Noise-free records of the chain alone, with the height of prepared windows."""
-    records = torch.cat(
-        [
-            generator.response(torch.from_numpy(sim[first : first + BLOCK]))
-            for first in range(0, len(sim), BLOCK)
-        ]
-    )
-    plateau = records[:, -PADDING_AFTER : -PADDING_AFTER + 100].mean(dim=1, keepdim=True)
-    scaled: Tensor = records * (recipe.preparation.tail_level / plateau)
-    return scaled
+    records = [generator.response(torch.from_numpy(sim[rows])) for rows in blocks(len(sim))]
+    return of_height(torch.cat(records), recipe.preparation.tail_level)
 
 
 def _train(

@@ -9,33 +9,30 @@ then determine the response within it.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains, KnownDecay
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
+from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
-    GOOD_FIT,
     HOPELESS_FIT,
     best_start,
     drift_if_better,
     drift_if_needed,
     free_decay_if_better,
     from_known,
-    is_poor,
     onset_is_off,
     ringing_if_better,
 )
@@ -61,7 +58,7 @@ class Fit:
         Chi-square and number of moments of the comparison, before any allowance for errors of
         the simulation.
     steps
-        Number of steps taken.
+        Number of steps taken, by all fits together.
     errors
         Standard deviations of the parameters by name, from the curvature of chi-square.
     pulls
@@ -168,96 +165,72 @@ def fit_response(
     sets = PulseSets(sim, data, noise, recipe, rng, remains)
     some = sets.bands(training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
-    if listener is not None:
-        listener = _counted(listener)
-    told = None if remains is None else remains.known_decay
-    near = None if known is None else from_known(first, known, training, told, listener)
-    problem, found = near or best_start(first, config, training, told, listener)
+    fitter = Fitter(training, None if remains is None else remains.known_decay, listener)
+    near = None if known is None else from_known(first, known, fitter)
+    found = near or best_start(first, config, fitter)
     everything = sets.bands()
-    if problem.response.drift is None and not is_poor(problem, found):
-        fit = _determined(problem, found, everything, training, listener)
+    response = found.problem.response
+    if response.drift is None and not found.poor:
+        fit = _determined(found, everything, fitter)
         if not fit.poor:
-            return problem.response, fit
-    elif found.cost > ANOTHER_DETECTOR * problem.moments and onset_is_off(problem, training):
-        return problem.response, _with_wrong_physics(problem, found, training, listener)
-    problem, found = _checked(problem, sets.bands(CHECKED), training, listener)
-    problem, found = _extended(problem, found, training, told, listener)
-    if is_poor(problem, found) and onset_is_off(problem, training):
-        return problem.response, _with_wrong_physics(problem, found, training, listener)
-    return problem.response, _determined(problem, found, everything, training, listener)
+            return response, fit
+    elif found.per_moment > ANOTHER_DETECTOR and onset_is_off(found.problem):
+        return response, _with_wrong_physics(found, fitter)
+    found = _extended(_with_more(found, sets.bands(CHECKED), fitter), fitter)
+    response = found.problem.response
+    if found.poor and onset_is_off(found.problem):
+        return response, _with_wrong_physics(found, fitter)
+    return response, _determined(found, everything, fitter)
 
 
-def _extended(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def _extended(found: Fitted, fitter: Fitter) -> Fitted:
     """Extend the response by what brings a poor or stretched fit closer."""
-    stretched = problem.response.drift is not None
-    if stretched and found.cost < HOPELESS_FIT * problem.moments:  # else a ringing is first
-        problem, found = drift_if_better(problem, found, training, listener)
+    stretched = found.problem.response.drift is not None
+    if stretched and found.per_moment < HOPELESS_FIT:  # else a ringing is first
+        found = drift_if_better(found, fitter)
     # a stretch hides some of what another decay does
-    if is_poor(problem, found) or (stretched and found.cost > HIDDEN * problem.moments):
-        problem, found = free_decay_if_better(problem, found, training, decay, listener)
-    if is_poor(problem, found):
-        own = problem.response.config
-        problem, found = ringing_if_better(problem, found, own, training, listener)
-    if stretched or (is_poor(problem, found) and onset_is_off(problem, training)):
-        problem, found = drift_if_better(problem, found, training, listener)
-        problem, found = drift_if_needed(problem, found, training, listener)
-    return problem, found
+    if found.poor or (stretched and found.per_moment > HIDDEN):
+        found = free_decay_if_better(found, fitter)
+    if found.poor:
+        found = ringing_if_better(found, fitter)
+    if stretched or (found.poor and onset_is_off(found.problem)):
+        found = drift_if_better(found, fitter)
+        found = drift_if_needed(found, fitter)
+    return found
 
 
-def _determined(
-    problem: ResponseProblem,
-    found: Minimum,
-    bands: Sequence[Band],
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> Fit:
+def _determined(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fit:
     """Determine the response within its valley from all pulses.
 
     Optimal weights trust the shapes of the pulses to a thousandth.  A simulation whose drift
     had to be stretched is not as good as that, so the moments alone are compared there.
     """
-    if problem.response.drift is not None:
-        whole, end = _checked(problem, bands, training, listener)
-        return _fit(whole, end.covariance, found.steps + end.steps)
-    compared, steps = ResponseProblem(problem.response, bands), found.steps
+    response = found.problem.response
+    if response.drift is not None:
+        whole = _with_more(found, bands, fitter)
+        return _fit(whole.problem, whole.covariance, fitter.steps)
+    compared = ResponseProblem(response, bands)
     for _ in range(ROUNDS):
-        covariance = refine(problem, bands, training.conditional_bins)
-        steps += 1
-        fit = _fit(compared, covariance, steps)
-        if listener is not None:
-            listener(steps, fit.chi_square)
-    return fit
+        covariance = refine(found.problem, bands, fitter.training.conditional_bins)
+        deviations = compared.deviations(compared.parameters.vector())
+        fitter.count(float(deviations @ deviations))
+    return _fit(compared, covariance, fitter.steps)
 
 
-def _checked(
-    problem: ResponseProblem,
-    bands: Sequence[Band],
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
-    """Continue the fit with more pulses."""
-    more = problem.of(problem.response, bands)
-    return more, levenberg_marquardt(more, training.steps, listener, coarse=False)
+def _with_more(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fitted:
+    """Continue a fit with more pulses."""
+    more = found.problem.of(found.problem.response, bands)
+    return fitter.fit(more, coarse=False)
 
 
-def _with_wrong_physics(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> Fit:
+def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:
     """Fit with model errors of the simulation, but report the chi-square without them."""
-    told = _fit(problem, found.covariance, found.steps)
+    problem = found.problem
+    deviations = problem.deviations(problem.parameters.vector())
     problem.allow_for_model_error()
-    again = levenberg_marquardt(problem, training.steps, listener, coarse=False)
-    fit = _fit(problem, again.covariance, found.steps + again.steps)
-    return replace(fit, chi_square=told.chi_square)
+    again = fitter.fit(problem, coarse=False)
+    fit = _fit(problem, again.covariance, fitter.steps)
+    return replace(fit, chi_square=float(deviations @ deviations))
 
 
 def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
@@ -279,9 +252,3 @@ def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
         amplitude_shift=shift,
         amplitude_shift_error=shift_error,
     )
-
-
-def _counted(listener: Listener) -> Listener:
-    """Make a listener that counts the steps of all fits."""
-    steps = itertools.count(1)
-    return lambda _, chi_square: listener(next(steps), chi_square)

@@ -18,15 +18,11 @@ import torch
 from cpunet.electronics.drawn_remains import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
-from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.levenberg_marquardt import Listener, Minimum, levenberg_marquardt
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.response_problem import STRETCH, ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
 
-# Chi-square per moment, with as many pulses as are used to search for the valley, below which a
-# fit has found the right one.  Outliers in the data and the ridge keep it above 1.
-GOOD_FIT = 1.6
-# In a wrong valley it is about three; this means another detector.
+# Chi-square per moment of another detector; in a wrong valley it is about three.
 HOPELESS_FIT = 20.0
 # A ringing or free decay must lower chi-square to this fraction.  A ringing is tried from a
 # higher expected one: derivatives far from the minimum underestimate the decrease.
@@ -48,150 +44,98 @@ MIN_DECAY_ERROR = 0.01
 ONSET, OFF = -15, 4.0
 
 
-def is_poor(problem: ResponseProblem, found: Minimum) -> bool:
-    """Whether a fit has not found its valley."""
-    return found.cost >= GOOD_FIT * problem.moments
-
-
 def from_known(
-    first: ResponseProblem,
-    known: ElectronicsResponse,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum] | None:
+    first: ResponseProblem, known: ElectronicsResponse, fitter: Fitter
+) -> Fitted | None:
     """Fit from a known response, first as if the data were near; None if the fit is poor.
 
     Its main decay is kept or replaced by that of the data, whichever fits them better: tails of
     a response with several decays do not follow the main one.
     """
     start = copy.deepcopy(known)
-    set_decay(start, first.slope, decay)
+    set_decay(start, first.slope, fitter.decay)
     starts = [first.of(start)]
-    if decay is None:
+    if fitter.decay is None:
         starts.append(first.of(copy.deepcopy(known)))
-    problem, steps = min(starts, key=_distance), 0
+    problem = min(starts, key=_cost)
     for coarse in (False, True):
-        found = levenberg_marquardt(problem, training.steps, listener, coarse=coarse)
-        steps += found.steps
-        if not is_poor(problem, found):
-            return problem, found._replace(steps=steps)
+        found = fitter.fit(problem, coarse=coarse)
+        if not found.poor:
+            return found
     return None
 
 
-def _distance(problem: ResponseProblem) -> float:
-    residuals = problem.residuals(problem.parameters.vector())
-    return float(residuals @ residuals)
-
-
-def best_start(
-    first: ResponseProblem,
-    config: ResponseConfig,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def best_start(first: ResponseProblem, config: ResponseConfig, fitter: Fitter) -> Fitted:
     """Fit from one start after another, until a fit is good or hopeless, or all are done.
 
     If the first fit is poor, a stretch of the drift and a fast decay with a free time are tried
     before other starts, the latter with the main decay constrained to its known value, if any.
     """
-    best: tuple[ResponseProblem, Minimum] | None = None
+    best: Fitted | None = None
     dt_ns = float(first.response.dt_ns)
-    for factor in training.start_factors:
+    for factor in fitter.training.start_factors:
         start = start_response(config, dt_ns, factor, first.slope)
-        problem = first.of(start)
-        found = levenberg_marquardt(problem, training.steps, listener)
-        if best is None and is_poor(problem, found) and onset_is_off(problem, training):
-            problem, found = drift_if_better(problem, found, training, listener)
-        if best is None and GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
-            problem, found = free_decay_if_better(problem, found, training, decay, listener)
-        if best is None or found.cost < best[1].cost:
-            best = problem, found
-        if not GOOD_FIT <= found.cost / problem.moments <= HOPELESS_FIT:
+        found = fitter.fit(first.of(start))
+        if best is None and found.poor and onset_is_off(found.problem):
+            found = drift_if_better(found, fitter)
+        if best is None and GOOD_FIT <= found.per_moment <= HOPELESS_FIT:
+            found = free_decay_if_better(found, fitter)
+        if best is None or found.cost < best.cost:
+            best = found
+        if not GOOD_FIT <= found.per_moment <= HOPELESS_FIT:
             break  # there is no other valley to search for
     assert best is not None  # the recipe has at least one start
     return best
 
 
-def onset_is_off(problem: ResponseProblem, training: MatchingConfig) -> bool:
+def onset_is_off(problem: ResponseProblem) -> bool:
     """Whether pulses begin differently than simulated, which physics can cause, but no readout.
 
     If only later parts are off, the data contain effects that no readout chain has, such as
     remains of earlier pulses in their tails, and the edge can still be trusted.
     """
-    onset = {f"samples {a} to {b}" for a, b in pairwise(training.segments) if b <= ONSET}
+    edges = problem.bands[0].moments.config.segments
+    onset = {f"samples {a} to {b}" for a, b in pairwise(edges) if b <= ONSET}
     pulls = problem.pulls(problem.parameters.vector())
     named = zip(problem.names, pulls, strict=True)
     return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
 
 
-def drift_if_better(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     """Stretch the simulated drift by one more parameter if that lowers chi-square clearly."""
-    terms = problem.response.config.drift_terms + 1
-    if terms > training.drift_terms:
-        return problem, found
-    tried = problem.of(with_drift_terms(problem.response, terms))
-    again = levenberg_marquardt(tried, training.steps, listener, coarse=terms == 1)
-    steps = found.steps + again.steps
-    drift = tried.response.drift
-    sane = drift is not None and float(drift.stretch.detach().abs().max()) < MAX_STRETCH
-    if sane and again.cost < found.cost - STRETCHES:
-        return tried, again._replace(steps=steps)
-    return problem, found._replace(steps=steps)
+    response = found.problem.response
+    terms = response.config.drift_terms + 1
+    if terms > fitter.training.drift_terms:
+        return found
+    tried = with_drift_terms(response, terms)
+    again = fitter.fit(found.problem.of(tried), coarse=terms == 1)
+    assert tried.drift is not None
+    sane = float(tried.drift.stretch.detach().abs().max()) < MAX_STRETCH
+    return again if sane and again.cost < found.cost - STRETCHES else found
 
 
-def drift_if_needed(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
     """Take the drift as simulated if what stretches it is 0 within its errors.
 
     It may have been added before a ringing was found.
     """
-    parameters = problem.parameters
+    problem, parameters = found.problem, found.problem.parameters
     stretch = [i for i, label in enumerate(parameters.labels) if label == STRETCH]
     errors = np.sqrt(np.diagonal(found.covariance)[stretch])
     if not stretch or (np.abs(parameters.vector()[stretch]) > SURE * errors).any():
-        return problem, found
+        return found
     simulated = problem.of(with_drift_terms(problem.response, 0))
-    again = levenberg_marquardt(simulated, training.steps, listener, coarse=False)
-    if again.cost < found.cost + STRETCHES:
-        return simulated, again._replace(steps=found.steps + again.steps)
-    return problem, found
+    again = fitter.fit(simulated, coarse=False)
+    return again if again.cost < found.cost + STRETCHES else found
 
 
-def free_decay_if_better(
-    problem: ResponseProblem,
-    found: Minimum,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def free_decay_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     """Free the time of a fast decay if that explains much of the remaining chi-square."""
-    other = with_free_decay(problem, training, decay, listener)
-    if other is None:
-        return problem, found
-    again, fitted = other
-    steps = found.steps + fitted.steps
-    if fitted.cost < RINGS * found.cost:
-        return again, fitted._replace(steps=steps)
-    return problem, found._replace(steps=steps)
+    again = with_free_decay(found.problem, fitter)
+    return found if again is None or again.cost >= RINGS * found.cost else again
 
 
-def with_free_decay(
-    problem: ResponseProblem,
-    training: MatchingConfig,
-    decay: KnownDecay | None,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum] | None:
+def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
     """Fit a response with one free fast decay; None if decays are free already or absent."""
     config = problem.response.config
     if config.free_decays or not config.fast_decays_us:
@@ -200,12 +144,12 @@ def with_free_decay(
     free = config.model_copy(
         update={"free_decays": True, "fast_decays_us": FAST_DECAYS_US[:1], "slow_ns": slow}
     )
+    decay = fitter.decay
     starts = [
         _free_decay_start(problem, free, us, share, decay)
         for us, share in _decays(problem, decay)
     ]
-    again = min(starts, key=_cost)
-    return again, levenberg_marquardt(again, training.steps, listener)
+    return fitter.fit(min(starts, key=_cost))
 
 
 def _free_decay_start(
@@ -262,30 +206,24 @@ def _cost(problem: ResponseProblem) -> float:
     return float(residuals @ residuals)
 
 
-def ringing_if_better(
-    problem: ResponseProblem,
-    found: Minimum,
-    config: ResponseConfig,
-    training: MatchingConfig,
-    listener: Listener | None,
-) -> tuple[ResponseProblem, Minimum]:
+def ringing_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     """Add a ringing to the response if that explains much of the remaining chi-square."""
-    if config.ringing_mhz is not None:
-        return problem, found
-    response, promised = most_promising_ringing(problem, config, training.ringing_mhz)
+    problem = found.problem
+    if problem.response.config.ringing_mhz is not None:
+        return found
+    response, promised = most_promising_ringing(problem, fitter.training.ringing_mhz)
     if response is None or promised > PROMISES * found.cost:
-        return problem, found
-    best, steps = (problem, found), found.steps
+        return found
+    best = found
     # from the end of the fit without ringing, first as if that were near, then as if far
     for coarse in (False, True):
         rings = problem.of(copy.deepcopy(response))
-        again = levenberg_marquardt(rings, training.steps, listener, coarse=coarse)
-        steps += again.steps
-        if again.cost < RINGS * best[1].cost:
-            best = rings, again
-        if not is_poor(*best):
+        again = fitter.fit(rings, coarse=coarse)
+        if again.cost < RINGS * best.cost:
+            best = again
+        if not best.poor:
             break
-    return best[0], best[1]._replace(steps=steps)
+    return best
 
 
 def with_drift_terms(response: ElectronicsResponse, terms: int) -> ElectronicsResponse:

@@ -13,12 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.response_problem import ResponseProblem
 
 
 def most_promising_ringing(
-    problem: ResponseProblem, config: ResponseConfig, frequencies_mhz: Sequence[float]
+    problem: ResponseProblem, frequencies_mhz: Sequence[float]
 ) -> tuple[ElectronicsResponse | None, float]:
     """Look for the ringing that would lower chi-square most.
 
@@ -26,8 +25,6 @@ def most_promising_ringing(
     ----------
     problem
         Problem of a fitted response without ringing.
-    config
-        Configuration of that response.
     frequencies_mhz
         Frequencies to try.
 
@@ -45,7 +42,7 @@ def most_promising_ringing(
     known = problem.derivatives(vector, deviations, range(len(vector)))
     best: tuple[ElectronicsResponse | None, float] = (None, float(deviations @ deviations))
     for frequency in frequencies_mhz:
-        response = _ringing_copy(problem.response, config, frequency)
+        response = _ringing_copy(problem.response, frequency)
         tried = problem.of(response)
         weights = [i for i, label in enumerate(tried.parameters.labels) if label == "ringing"]
         slopes = tried.derivatives(tried.parameters.vector(), deviations, weights)
@@ -58,13 +55,10 @@ def most_promising_ringing(
     return best
 
 
-def _ringing_copy(
-    response: ElectronicsResponse, config: ResponseConfig, frequency_mhz: float
-) -> ElectronicsResponse:
+def _ringing_copy(response: ElectronicsResponse, frequency_mhz: float) -> ElectronicsResponse:
     """A copy of a response with a ringing of a given frequency and zero weights."""
-    rings = ElectronicsResponse(
-        config.model_copy(update={"ringing_mhz": frequency_mhz}), float(response.dt_ns)
-    )
+    config = response.config.model_copy(update={"ringing_mhz": frequency_mhz})
+    rings = ElectronicsResponse(config, float(response.dt_ns))
     state = {n: v for n, v in response.state_dict().items() if "ringing" not in n}
     rings.load_state_dict(state, strict=False)
     rings.decay_known = response.decay_known

@@ -87,7 +87,7 @@ def read_info(run: Path) -> dict[str, Any]:
     absent = f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
     info = json_mapping(path, absent, "train again")
     if wrong := problem(info):
-        raise CpunetError(f"{path}: damaged ({wrong}); train again")
+        raise CpunetError(f"{path}: {wrong}")
     return info
 
 

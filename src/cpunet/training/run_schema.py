@@ -57,20 +57,21 @@ class RunFacts(_Part):
 
 
 def problem(info: Mapping[str, Any]) -> str:
-    """First error in the content of a ``run.json``, in words; empty if there is none.
+    """What is wrong with the content of a ``run.json``, and what to do; empty if nothing is.
 
     Examples
     --------
     >>> facts = {"recipe": "fast", "peak": "FEP", "seed": 0, "device": "cpu", "seconds": 9.5}
     >>> problem(facts | {"dt_ns": 16}), problem(facts | {"dt_ns": "16"})
-    ('', 'dt_ns: Input should be a valid number')
+    ('', 'damaged (dt_ns: Input should be a valid number); train again')
     """
     try:
         found = RunFacts.model_validate(info)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         key = ".".join(map(str, first["loc"]))
-        return f"no {key}" if first["type"] == "missing" else f"{key}: {first['msg']}"
+        wrong = f"no {key}" if first["type"] == "missing" else f"{key}: {first['msg']}"
+        return f"damaged ({wrong}); train again"
     if found.format > FORMAT:
-        return f"format {found.format} of a newer version; read it with that one"
+        return f"of a newer version of cpunet (format {found.format}); read it with that one"
     return ""

@@ -27,7 +27,7 @@ from cpunet.networks.response_layer import (
 )
 from cpunet.pulses.container import FloatArray
 from cpunet.training._record_kernels import add_noise
-from cpunet.training.moments import BLOCK, Moments, Readings, Values
+from cpunet.training.moments import BLOCK, Moments, Readings, Rows, Values
 
 # Maximum delay of the half maximum by the response, in samples after the alignment sample.
 DELAY = 100
@@ -102,14 +102,14 @@ class Noise:
         left = np.stack([remains.factors(energy_kev, rng)[0] for _ in range(draws)])
         return replace(drawn, left=left, decay=np.asarray(remains.decay(length), np.float32))
 
-    def first(self, n: int) -> Noise:
-        """Noise of the first `n` pulses."""
+    def of(self, rows: Rows | slice) -> Noise:
+        """Noise of some of the pulses."""
         return replace(
             self,
-            trace=self.trace[:, :n],
-            start=self.start[:, :n],
-            factor=self.factor[:, :n],
-            left=None if self.left is None else self.left[:, :n],
+            trace=np.ascontiguousarray(self.trace[:, rows]),
+            start=np.ascontiguousarray(self.start[:, rows]),
+            factor=np.ascontiguousarray(self.factor[:, rows]),
+            left=None if self.left is None else self.left[:, rows],
         )
 
     def add(self, records: FloatArray, draw: int, first: int) -> FloatArray:
@@ -161,7 +161,12 @@ class Translated:
 
     def first(self, n: int) -> Translated:
         """The first `n` pulses, with their noise."""
-        return Translated(self.sim[:n], self.noise.first(n), self.moments, self.weights[:n])
+        return self.of(slice(n))
+
+    def of(self, rows: Rows | slice) -> Translated:
+        """Some of the pulses, with their noise."""
+        noise = self.noise.of(rows)
+        return Translated(self.sim[rows], noise, self.moments, self.weights[rows])
 
     def sums(
         self,

@@ -216,7 +216,7 @@ class UnfinishedRun:
             write_checkpoint(self.folder, Checkpoint(state, facts))
         except OSError as error:
             self._note(
-                f"warning: {self.folder}: no checkpoint after {state['iteration']} iterations "
+                f"warning: {self.folder}: no checkpoint after {_progress(state)} "
                 f"({error.strerror or error}); the one before is kept"
             )
 
@@ -239,7 +239,7 @@ class UnfinishedRun:
             if damaged:
                 self._note(
                     f"warning: {self.folder / CHECKPOINT}: damaged; going on from the previous "
-                    f"one, after {checkpoint.state['iteration']} iterations"
+                    f"one, after {_progress(checkpoint.state)}"
                 )
             return checkpoint
         if damaged:
@@ -249,14 +249,20 @@ class UnfinishedRun:
         return None
 
     def _take_up(self, checkpoint: Checkpoint) -> None:
-        facts, iteration = checkpoint.facts, checkpoint.state["iteration"]
+        facts, state = checkpoint.facts, checkpoint.state
         require_same(facts["fingerprint"], self._fingerprint)
         for difference in differences(facts["environment"], self._environment):
             self._note(f"warning: resumed elsewhere: {difference}; the last bits may differ")
         self.started, self._seconds_before = facts["started"], facts["seconds"]
-        self.resumed_at = [*facts["resumed_at"], iteration]
+        self.resumed_at = [*facts["resumed_at"], state["iteration"]]
         self._log.cut(facts["log_bytes"])
-        self._note(f"going on after {iteration} iterations")
+        self._note(f"going on after {_progress(state)}")
+
+
+def _progress(state: State) -> str:
+    if "pairs" in state:
+        return f"{state['pairs']['iteration']} iterations on pairs"
+    return f"{state['iteration']} iterations"
 
 
 def _fits(checkpoint: Checkpoint, log_bytes: int) -> bool:

@@ -1,0 +1,81 @@
+"""One fit of a response after another: common settings, and a common count of steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.levenberg_marquardt import Listener, levenberg_marquardt
+from cpunet.training.moments import Values
+from cpunet.training.response_problem import ResponseProblem
+
+# Chi-square per moment, with as many pulses as are used to search for the valley, below which a
+# fit has found the right one.  Outliers in the data and the ridge keep it above 1.
+GOOD_FIT = 1.6
+
+
+class Fitted(NamedTuple):
+    """A comparison at the minimum of a fit.
+
+    Parameters
+    ----------
+    problem
+        Comparison whose response was fitted.
+    cost
+        Sum of its squared residuals.
+    covariance
+        Covariance of its parameters.
+    """
+
+    problem: ResponseProblem
+    cost: float
+    covariance: Values
+
+    @property
+    def per_moment(self) -> float:
+        """Sum of the squared residuals per moment."""
+        return self.cost / self.problem.moments
+
+    @property
+    def poor(self) -> bool:
+        """Whether the fit has not found its valley."""
+        return self.per_moment >= GOOD_FIT
+
+
+@dataclass(eq=False)
+class Fitter:
+    """Fit responses with the same settings, and count the steps of all fits.
+
+    Parameters
+    ----------
+    training
+        Settings of the fits.
+    decay
+        Main decay as known from remains of earlier pulses, if it is.
+    listener
+        Called with the number of steps so far, and chi-square.
+    steps
+        Number of steps so far.
+    """
+
+    training: MatchingConfig
+    decay: KnownDecay | None = None
+    listener: Listener | None = None
+    steps: int = 0
+
+    def fit(self, problem: ResponseProblem, *, coarse: bool = True) -> Fitted:
+        """Fit from the current response; `coarse` if it is far from the data."""
+
+        def told(_step: int, chi_square: float) -> None:
+            self.count(chi_square)
+
+        found = levenberg_marquardt(problem, self.training.steps, told, coarse=coarse)
+        return Fitted(problem, found.cost, found.covariance)
+
+    def count(self, chi_square: float) -> None:
+        """Count a step, and report it."""
+        self.steps += 1
+        if self.listener is not None:
+            self.listener(self.steps, chi_square)
