@@ -59,6 +59,23 @@ def test_every_ending_is_one_line(command, monkeypatch, ending):
         assert "report it" in line
 
 
+@pytest.mark.parametrize(
+    "line", ["run[bold]", "run[/x]: 3 pulses", "hit.lh5:key: no such column", r"a\[bold]b[1]\ "]
+)
+def test_names_are_printed_as_they_are(capsys, line):
+    """Brackets, backslashes and colons belong to a name: they are neither markup nor emoji."""
+    for say in (messages.show, messages.tell):
+        say(line)
+        assert capsys.readouterr().out == f"{line}\n"
+    for say, head in (
+        (messages.fail, "error: "),
+        (messages.warn, "warning: "),
+        (messages.note, ""),
+    ):
+        say(line)
+        assert capsys.readouterr().err == f"{head}{line.strip()}\n"
+
+
 def test_debug_shows_where_wherever_it_stands(command, monkeypatch):
     def fail(*_words: object, **_options: object) -> None:
         raise KeyError("translated")

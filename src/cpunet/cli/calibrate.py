@@ -177,7 +177,7 @@ def calibrate(
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())
     for line in result_lines(content):
-        tell(f"{out_folder}: {line}", plain=True)
+        tell(f"{out_folder}: {line}")
 
 
 def _start(

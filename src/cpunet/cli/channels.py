@@ -26,5 +26,5 @@ def tell_channels(outcome: Outcome[R], out: Path, in_words: Callable[[R], str]) 
     lines |= {name: f"failed: {reason}" for name, reason in outcome.failed.items()}
     width = max(map(len, lines), default=0)
     for name, line in lines.items():
-        tell(f"{name:<{width}}  {line}", plain=True)
+        tell(f"{name:<{width}}  {line}")
     outcome.require_all(out)

@@ -68,5 +68,4 @@ def explore(
         + (f" (none: {left_out})" if left_out else "")
         + (f", {told['drawn']} measured ones beside them" if "drawn" in told else "")
         + f"; {told['bytes'] / 1e6:.1f} MB",
-        plain=True,
     )

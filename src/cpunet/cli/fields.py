@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -54,6 +53,6 @@ def fields(
         monitor=monitor(),
     )
     width = max(map(len, told))
-    say = show if out_file is None else partial(tell, plain=True)
+    say = show if out_file is None else tell
     for name, value in told.items():
         say(f"{name:<{width}}  {value}")

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table, show, tell, warn
+from cpunet.cli.messages import show, tell, warn
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
@@ -92,11 +92,11 @@ def info(
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is damaged ({wrong}); train again")
     if told["kind"] == "tables":
-        print_table(_tables(told))
-        out.print("one of them: --table NAME; each in full: --table all", highlight=False)
+        show(_tables(told))
+        show("one of them: --table NAME; each in full: --table all")
     elif told["kind"] == "channels":
         for name, one in told["channels"].items():
-            out.print(f"{name}:", markup=False, highlight=False)
+            show(f"{name}:")
             _print([("", one)] if isinstance(one, str) else in_words(one))
     else:
         _print(in_words(told))

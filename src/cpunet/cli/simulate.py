@@ -281,7 +281,7 @@ def simulate(
         monitor=monitor(),
     )
     for line in summary_lines(summary):
-        tell(f"{out_file}: {line}", plain=True)
+        tell(f"{out_file}: {line}")
 
 
 def summary_lines(summary: Summary) -> list[str]:

@@ -140,7 +140,7 @@ def stand(
         monitor=monitor(),
     )
     for line in _lines(summary):
-        tell(f"{out_folder}: {line}", plain=True)
+        tell(f"{out_folder}: {line}")
 
 
 def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
