@@ -13,7 +13,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -140,10 +139,9 @@ def _ours(error: BaseException) -> Iterator[FrameType]:
 
 def _damaged_code(error: BaseException) -> str | None:
     """The file of compiled code that numba could not read, of this package or another."""
-    if not isinstance(error, pickle.UnpicklingError | EOFError | ValueError | TypeError):
-        with suppress(AttributeError):
-            if "unpickl" not in str(error).lower():
-                return None
+    kinds = pickle.UnpicklingError | EOFError | ValueError | TypeError
+    if not (isinstance(error, kinds) or "unpickl" in str(error).lower()):
+        return None
     for frame, _ in traceback.walk_tb(error.__traceback__):
         if frame.f_code.co_name in ("_load_index", "_load_data"):
             holder = frame.f_locals.get("self")

@@ -20,8 +20,10 @@ from rich.console import Console
 from cpunet.errors import CpunetError
 
 _REPLACING = "cpunet.plain"  # name of the handler of signs that an encoding lacks
-_PLAIN_SIGNS = {"–": "-", "—": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u"} | {
-    "σ": "sigma", "χ": "chi", "²": "2", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*"
+_PLAIN_SIGNS = {
+    "–": "-", "—": "-", "−": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u",
+    "σ": "sigma", "χ": "chi", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*",
+    "²": "2", "⁰": "0", "¹": "^1", "⁴": "^4",
 }  # fmt: skip
 
 
