@@ -50,10 +50,10 @@ def check(
     from cpunet.jobs.common.channels import ALL, paired
     from cpunet.jobs.training.check import Checked, Level, check
 
-    if out_file is not None:
-        refuse_inputs(out_file, sim, data, on.recipe)
-    chosen = on.load()
     sides = read_as.sim(sim), read_as.data(data)
+    if out_file is not None:
+        refuse_inputs(out_file, *sides[0].files, *sides[1].files, on.recipe)
+    chosen = on.load()
     stopped = False
     for name, pair in (paired(*sides) if read_as.data_table == ALL else {"": sides}).items():
         if isinstance(pair, CpunetError):

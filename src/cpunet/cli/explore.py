@@ -47,7 +47,7 @@ def explore(
     from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
-    refuse_inputs(out_file, detector, settings_file)
+    refuse_inputs(out_file, detector, crystal, settings_file)
     measured = None
     if data is not None:
         measured = read_as.data(data)

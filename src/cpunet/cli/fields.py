@@ -43,7 +43,7 @@ def fields(
     from cpunet.simulation.geometry_readers import read_detector
 
     if out_file is not None:
-        refuse_inputs(out_file, detector)
+        refuse_inputs(out_file, detector, crystal)
     told = describe_fields(
         read_detector(detector, set_values or (), crystal),
         out_file,

@@ -16,6 +16,7 @@ from cpunet.cli.messages import show, tell, warn
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
+from cpunet.outputs import refuse_inputs
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[
@@ -76,6 +77,9 @@ def info(
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.training.run_schema import problem
 
+    for target in (page, without_remains):
+        if target is not None:
+            refuse_inputs(target, detector)
     told = describe(
         source,
         table=table,

@@ -141,7 +141,7 @@ def make(
     from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
-    refuse_inputs(out_file, detector, settings)
+    refuse_inputs(out_file, detector, crystal, settings)
     degrees = parse_numbers(angles, angles.count(",") + 1, "--angles")
     if any(angle != int(angle) for angle in degrees):
         raise CpunetError(f"--angles {angles}: give whole degrees")

@@ -120,7 +120,7 @@ def stand(
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.shifted import Shift
 
-    refuse_inputs(out_folder, preset, detector)
+    refuse_inputs(out_folder, preset, detector, crystal, settings_file, *(shift or ()))
     names, numbers = wanted_events(events)
     overrides, values = split_overrides(set_values or ())
     electronics = read_electronics(preset).disturbed(
