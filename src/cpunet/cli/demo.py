@@ -10,7 +10,8 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
-from cpunet.cli.stand import Events, Kind, KindOption, wanted_events
+from cpunet.cli.stand import Events, Kind, KindOption
+from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]

@@ -146,7 +146,8 @@ def make(
     if any(angle != int(angle) for angle in degrees):
         raise CpunetError(f"--angles {angles}: give whole degrees")
     if settings is None:
-        dt, length_ns = dt or DT_NS, length_ns or LENGTH_NS
+        dt = DT_NS if dt is None else dt
+        length_ns = LENGTH_NS if length_ns is None else length_ns
     counts = write_library(
         read_detector(detector, set_values or (), crystal),
         out_file,

@@ -11,7 +11,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
-from cpunet.cli.values import event_count
+from cpunet.cli.values import wanted_events
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -141,18 +141,6 @@ def stand(
     )
     for line in _lines(summary):
         tell(f"{out_folder}: {line}")
-
-
-def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
-    """Names and numbers of ``"FEP=4000,DEP=1500"``."""
-    pairs = [part.partition("=") for part in events.split(",")]
-    for name, _, number in pairs:
-        if not (name.strip() and number.strip().isdecimal()):
-            raise CpunetError(f"--events {events}: expected FEP=N,DEP=M and the like")
-    names = [name.strip() for name, _, _ in pairs]
-    if len(set(names)) < len(names):
-        raise CpunetError(f"--events {events}: names a peak twice; give each once")
-    return names, tuple(event_count(number) for _, _, number in pairs)
 
 
 def wanted_hum(hum: str | None) -> Hum | None:
