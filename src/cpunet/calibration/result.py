@@ -14,9 +14,8 @@ from cpunet.calibration.search import Calibrated
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
-# Number of prior errors beyond which a parameter is reported as unexpected, and fraction of an
-# error within which it is at a bound.
-FAR, AT_BOUND = 3.0, 1e-6
+# Number of prior errors beyond which a parameter is reported as unexpected.
+FAR = 3.0
 # Chi-square per moment beyond which the physics does not describe the data at all.
 HOPELESS = 50.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -51,14 +50,15 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         nuisance = physics.nuisances[i]
         nominal, value = physics.nominal(nuisance), values[nuisance.name]
         slope, prior = nuisance.slope(nominal, value), known[nuisance.name]
+        centre = nuisance.value(nominal, prior.centre)
         free[nuisance.name] = {
             "value": value,
             "error": float(slope * error),
             "error_all": slope * calibrated.errors_all[nuisance.name],
             "simulated": nominal,
             "prior": {
-                "value": nuisance.value(nominal, prior.centre),
-                "error": nuisance.slope(nominal, value) * prior.width,
+                "value": centre,
+                "error": nuisance.slope(nominal, centre) * prior.width,
                 "source": "given" if nuisance.name in parameters.given else nuisance.source,
             },
         }
@@ -106,7 +106,7 @@ def notes(calibrated: Calibrated) -> list[str]:
     for k, i in enumerate(parameters.free):
         nuisance = physics.nuisances[i]
         value, name = values[nuisance.name], nuisance.name
-        if value in (nuisance.lowest, nuisance.highest):
+        if vector[n + k] in (parameters.low[n + k], parameters.high[n + k]):
             found.append(f"{name} is at its bound, {value:g}: --fix it, or free another")
         width = parameters.widths[n + k]
         off = (vector[n + k] - parameters.centre[n + k]) / width
