@@ -18,10 +18,6 @@ DetectorFile = Annotated[
         metavar="DETECTOR",
     ),
 ]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
-]
 Out = Annotated[Path | None, typer.Option("--out", help="Picture to make: .png, .pdf or .svg.")]
 Paths = Annotated[bool, typer.Option("--paths/--no-paths", help="Draw drift paths.")]
 
@@ -29,7 +25,7 @@ Paths = Annotated[bool, typer.Option("--paths/--no-paths", help="Draw drift path
 def fields(
     detector: DetectorFile,
     out_file: Out = None,
-    set_values: Set = None,
+    set_values: options.Set = None,
     crystal: options.Crystal = None,
     impurity_from: options.ImpurityFrom = options.Impurities.file,
     paths: Paths = True,

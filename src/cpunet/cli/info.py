@@ -22,8 +22,6 @@ Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", m
 TableName = Annotated[
     str | None, typer.Option("--table", help="Table, if there are several; or all.")
 ]
-Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
-
 WithoutRemains = Annotated[
     Path | None,
     typer.Option(
@@ -32,8 +30,6 @@ WithoutRemains = Annotated[
         "with the columns remains_kev and remains_error_kev.",
     ),
 ]
-
-
 Page = Annotated[
     Path | None,
     typer.Option("--out", help="HTML page to write: the same with the spectrum and its lines."),
@@ -50,7 +46,7 @@ Crystal = Annotated[
 def info(
     source: Source,
     table: TableName = None,
-    energy: Energy = None,
+    energy: options.Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
     detector: Crystal = None,

@@ -115,9 +115,6 @@ Diffusion = Annotated[
         callback=options.within(1, 1e5),
     ),
 ]
-SettingsFile = Annotated[
-    Path | None, typer.Option("--settings", help="Settings of the simulation, a YAML file.")
-]
 
 
 @library.command()
@@ -128,7 +125,7 @@ def make(
     angles: Angles = "0,45",
     dt: Dt = None,
     length_ns: Length = None,
-    settings: SettingsFile = None,
+    settings: options.SettingsFile = None,
     set_values: options.Set = None,
     crystal: options.Crystal = None,
     force: options.Force = False,

@@ -54,9 +54,6 @@ SetValues = Annotated[
         "--set", help="Override a value of the detector or of the settings (repeatable)."
     ),
 ]
-SettingsFile = Annotated[
-    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
-]
 RateKhz = Annotated[
     float | None,
     typer.Option(
@@ -94,7 +91,7 @@ def stand(
     kind: KindOption = Kind.matched,
     shift: ShiftParts = None,
     set_values: SetValues = None,
-    settings_file: SettingsFile = None,
+    settings_file: options.SettingsFile = None,
     crystal: options.Crystal = None,
     rate_khz: RateKhz = None,
     pile_up_khz: PileUpKhz = None,
