@@ -1,4 +1,4 @@
-"""What became of the channels of a file, a line each."""
+"""The outcome of each channel of a file in a line."""
 
 from __future__ import annotations
 

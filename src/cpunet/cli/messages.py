@@ -20,7 +20,7 @@ from rich.text import Text
 from cpunet.cli.streams import Notes, OutputError, Results
 from cpunet.jobs.common.monitor import Advance, Monitor
 
-# no emoji: columns such as FILE:key: are not to become pictures
+# no emoji: in FILE:key:, rich would replace the column by a picture
 out = Results(emoji=False)
 err = Notes(stderr=True, emoji=False)
 

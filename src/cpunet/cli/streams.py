@@ -1,8 +1,8 @@
 """Standard output and standard error, whatever they are.
 
-Nothing fails for a sign that the encoding of a screen lacks: common ones are written otherwise,
-others by their number.  A log that cannot be written stops no job; a result that cannot be
-printed is an error of its own.
+Characters that the encoding of a terminal lacks cause no failure: common ones are replaced,
+others are written by their number.  A log that cannot be written stops no job; a result that
+cannot be printed is an error of its own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rich.console import Console
 
 from cpunet.errors import CpunetError
 
-_REPLACING = "cpunet.plain"  # name of the handler of signs that an encoding lacks
+_REPLACING = "cpunet.plain"  # handler of characters that an encoding lacks
 _PLAIN_SIGNS = {
     "–": "-", "—": "-", "−": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u",
     "σ": "sigma", "χ": "chi", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*",
@@ -32,7 +32,7 @@ class OutputError(CpunetError):
 
 
 class GoneError(OutputError):
-    """Who read standard output has stopped reading."""
+    """The reader of standard output has stopped reading."""
 
 
 class Results(Console):
@@ -49,34 +49,34 @@ class Results(Console):
             raise OutputError(f"standard output: cannot be written ({reason})") from error
 
     def on_broken_pipe(self) -> None:
-        """Pass the error on, which rich would end the program by."""
+        """Pass the error on; rich would end the program."""
         raise
 
 
 class Notes(Console):
-    """Standard error: what cannot be told is lost, and nothing else."""
+    """Standard error: a message that cannot be printed is lost, but stops nothing."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print if that can be done."""
+        """Print if possible."""
         with suppress(OSError):
             super().print(*objects, **options)
 
     def on_broken_pipe(self) -> None:
-        """Pass the error on, which rich would end the program by."""
+        """Pass the error on; rich would end the program."""
         raise
 
 
 class _Closed(io.TextIOBase):
-    """What stands for a standard output that was closed before the program began."""
+    """Stands in for a standard output that was closed before the program began."""
 
     def write(self, _text: str, /) -> int:
         raise OSError(errno.EBADF, "it is closed")
 
 
 def prepare_streams() -> None:
-    """Make standard streams take every sign, and be there even if they were closed.
+    """Make the standard streams accept every character, and open those that were closed.
 
-    A closed one would have its number taken by the next file, into which others then print.
+    The next file would take the number of a closed one, and what is printed would go into it.
     """
     for number in range(3):
         with suppress(OSError):  # open: as it should be
@@ -92,7 +92,7 @@ def prepare_streams() -> None:
 
 
 def finish_streams() -> None:
-    """Write what is left, so that nothing fails when the interpreter does that at its end."""
+    """Flush the streams now, so that nothing fails when the interpreter does so at its end."""
     for stream in (sys.stdout, sys.stderr):
         try:
             if stream is not None:
