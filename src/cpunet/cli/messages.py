@@ -20,9 +20,8 @@ from rich.text import Text
 from cpunet.cli.streams import Notes, OutputError, Results
 from cpunet.jobs.common.monitor import Advance, Monitor
 
-# no emoji: in FILE:key:, rich would replace the column by a picture
-out = Results(emoji=False)
-err = Notes(stderr=True, emoji=False)
+out = Results()
+err = Notes(stderr=True)
 
 LOG_EVERY_S = 30.0  # between lines of progress in a log file
 
@@ -82,7 +81,7 @@ def _print_table(table: Table) -> None:
         column.width, column.no_wrap, column.overflow = low + more, False, "fold"
         spare -= 0 if spare < 0 else more
     whole = out.width - room + sum(column.width or 0 for column in table.columns)
-    Results(file=out.file, width=max(out.width, whole), emoji=False).print(table)
+    Results(file=out.file, width=max(out.width, whole)).print(table)
 
 
 def monitor() -> Monitor:

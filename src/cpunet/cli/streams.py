@@ -35,7 +35,18 @@ class GoneError(OutputError):
     """The reader of standard output has stopped reading."""
 
 
-class Results(Console):
+class _Stream(Console):
+    """A console that prints names as they are, and leaves errors to this package."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(emoji=False, **options)  # in FILE:key:, a picture would replace key
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on; rich would end the program."""
+        raise
+
+
+class Results(_Stream):
     """Standard output, which a result must reach."""
 
     def print(self, *objects: Any, **options: Any) -> None:
@@ -48,22 +59,14 @@ class Results(Console):
             reason = error.strerror or error
             raise OutputError(f"standard output: cannot be written ({reason})") from error
 
-    def on_broken_pipe(self) -> None:
-        """Pass the error on; rich would end the program."""
-        raise
 
-
-class Notes(Console):
+class Notes(_Stream):
     """Standard error: a message that cannot be printed is lost, but stops nothing."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print if possible."""
         with suppress(OSError):
             super().print(*objects, **options)
-
-    def on_broken_pipe(self) -> None:
-        """Pass the error on; rich would end the program."""
-        raise
 
 
 class _Closed(io.TextIOBase):
