@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
 from cpunet.calibration.nearby import Derivative, Nearby
 from cpunet.calibration.nuisances import Physics, named
@@ -183,6 +184,21 @@ def test_priors_and_further_knowledge_follow_the_deviations(sides):
     assert not prior[: parameters.n_chain].any()
     assert found[-1] == pytest.approx(10.5)
     assert parameters.coordinates.tolist() == [1.5, 0.02]
+
+
+def test_what_else_is_known_makes_errors_smaller(sides):
+    plain = problem(*sides)
+    known = problem(*sides, known=lambda coordinates: 500 * coordinates[1:])
+    before, after = (
+        Information.of(one, one.jacobian(one.parameters.vector(), np.empty(0)))
+        for one in (plain, known)
+    )
+    own = before.errors([1])[0]
+    assert after.errors([1])[0] == pytest.approx((own**-2 + 500**2) ** -0.5, rel=1e-6)
+    assert after.errors()[0] < 0.95 * before.errors()[0]  # what was alike is told apart
+    few = after.for_pulses(1e-9)
+    assert few.errors() == pytest.approx([3.0, (0.1**-2 + 500**2) ** -0.5], rel=1e-4)
+    np.testing.assert_allclose(after.matrix, before.matrix, rtol=1e-4)
 
 
 def test_steps_from_far_away_are_held_within_reach(sides):

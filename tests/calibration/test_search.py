@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cpunet.calibration import search
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.search import _relaxed
+from cpunet.calibration.search import ROUNDS, Search, _relaxed
+from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibration_inputs import Freedom, known_depletion
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -41,6 +45,39 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
     assert known(np.array([np.log(1.1), 0.01]))[0] == pytest.approx(0, abs=1.5)
     assert known(np.zeros(2))[0] < -5
     assert not len(known_depletion(physics, None)(np.zeros(2)))
+
+
+@pytest.mark.parametrize("prior", ["impurity=0±0.1", "impurity=-1±0.1", "temperature=200±1"])
+def test_a_prior_beyond_what_can_be_is_refused(prior):
+    with pytest.raises(CpunetError, match=rf"^--prior {prior}: give a value from "):
+        Freedom.of("auto", "", [prior])
+    assert Freedom.of("auto", "", ["self_repulsion=0±0.5"]).priors
+
+
+def test_after_the_last_round_nothing_is_simulated(monkeypatch):
+    """A search that never settles moves between its rounds only."""
+    ended, moved = [], []
+    parameters = SimpleNamespace(
+        chain=SimpleNamespace(response="chain"), coordinates=np.ones(1), free=[0], n_chain=0
+    )
+    nearby = SimpleNamespace(centre=np.zeros(1))
+    monkeypatch.setattr(search.Nearby, "about", lambda *_: nearby)
+    found = SimpleNamespace(covariance=np.eye(1))
+    monkeypatch.setattr(search, "levenberg_marquardt", lambda *_, **__: found)
+    physics = SimpleNamespace(nuisances=(named("temperature"),))
+    endless = Search.__new__(Search)
+    endless.simulator = SimpleNamespace(physics=physics)
+    endless._first = [0]
+    endless._chain = lambda: "chain"
+    endless._tell = lambda *_: None
+    endless._problem = lambda *_, **__: SimpleNamespace(parameters=parameters)
+    endless._first_free = lambda *_: [0]
+    endless._other_chain = lambda *_, **__: None
+    endless._moved = lambda *words: (moved.append(words), nearby)[1]
+    endless._ended = lambda *words, **more: ended.append((words[-1], more))
+    endless.run()
+    assert ended == [(ROUNDS, {"settled": False})]
+    assert len(moved) == ROUNDS - 1
 
 
 def test_what_is_free_and_what_is_not():

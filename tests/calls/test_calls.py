@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -224,6 +225,17 @@ def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):
     assert made.sim == tmp_path / "cal" / "sim.lh5"
 
 
+def damaged(home, run=None) -> Path:
+    """A folder whose files of results hold something else."""
+    folder = home / "damaged"
+    folder.mkdir(exist_ok=True)
+    if run is not None:
+        shutil.copy(run.folder / "run.json", folder)
+    (folder / "calibration.json").write_text("[1]")
+    (folder / "metrics.json").write_text('{"peaks": []}')
+    return folder
+
+
 WRONG = {
     "an array": (
         lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
@@ -275,6 +287,20 @@ WRONG = {
         lambda home, _: cpunet.CalibratedRun.load(home / "run"),
         "no calibrated run",
     ),
+    "damaged calibration": (
+        lambda home, run: cpunet.CalibratedRun.load(damaged(home, run)),
+        r"calibration.json: damaged \(no mapping\); calibrate again",
+    ),
+    "damaged report": (
+        lambda home, _: cpunet.Report.load(damaged(home)),
+        "metrics.json: holds no scores; make the report again",
+    ),
+    "strange setting": (
+        lambda home, _: cpunet.train(
+            home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.steps": {1}}
+        ),
+        r"settings: \{1\} is of type set; give numbers",
+    ),
     "no hits": (
         lambda home, _: cpunet.calibrate(home / "sim.lh5", home / "raw.lh5", home / "new"),
         "sim.lh5: ",
@@ -295,6 +321,13 @@ def test_what_is_wrong_is_one_line(home, run, case):
         call(home, run)
     assert "\n" not in str(error.value)
     assert not (home / "new").exists()
+
+
+def test_settings_may_be_numbers_of_numpy():
+    settings = {"generator.width": np.int64(16), "training.rate_generators": np.float32(0.5)}
+    recipe = as_recipe("paper", settings | {"training.betas": np.array([0.25, 0.5])})
+    assert (recipe.generator.width, recipe.training.rate_generators) == (16, 0.5)
+    assert tuple(recipe.training.betas) == (0.25, 0.5)
 
 
 def test_a_recipe_and_settings_are_not_both_given():

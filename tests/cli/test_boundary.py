@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from cpunet.calibration.identifiability import Direction
+from cpunet.calibration.titles import TITLES
 from cpunet.cli import messages
 from cpunet.cli.environment import drop_nonsense
-from cpunet.cli.streams import Notes, Results
+from cpunet.cli.streams import Notes, Results, prepare_streams
 
 PROGRAM = "from cpunet.cli.main import main; main()"
 
@@ -59,6 +61,23 @@ def test_every_ending_is_one_line(command, monkeypatch, ending):
         assert "report it" in line
 
 
+@pytest.mark.parametrize(
+    "line", ["run[bold]", "run[/x]: 3 pulses", "hit.lh5:key: no such column", r"a\[bold]b[1]\ "]
+)
+def test_names_are_printed_as_they_are(capsys, line):
+    """Brackets, backslashes and colons belong to a name: they are neither markup nor emoji."""
+    for say in (messages.show, messages.tell):
+        say(line)
+        assert capsys.readouterr().out == f"{line}\n"
+    for say, head in (
+        (messages.fail, "error: "),
+        (messages.warn, "warning: "),
+        (messages.note, ""),
+    ):
+        say(line)
+        assert capsys.readouterr().err == f"{head}{line.strip()}\n"
+
+
 def test_debug_shows_where_wherever_it_stands(command, monkeypatch):
     def fail(*_words: object, **_options: object) -> None:
         raise KeyError("translated")
@@ -69,6 +88,23 @@ def test_debug_shows_where_wherever_it_stands(command, monkeypatch):
         assert outcome.code == 70
         assert "Traceback" in outcome.err
         assert outcome.err.splitlines()[-1].startswith("error: ")
+
+
+def test_after_two_dashes_debug_is_a_name(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = command("info", "--", "--debug")
+    assert outcome.code == 2
+    assert outcome.err.startswith("error: --debug: ")
+
+
+def test_the_words_of_a_calibration_without_our_signs():
+    prepare_streams()
+    titles = "\n".join(f"{words} {unit}" for words, unit in TITLES.values())
+    told = titles.encode("ascii", errors="cpunet.plain").decode()
+    assert "impurity tilt [10^10/cm^4]" in told
+    assert "\\" not in told
+    words = Direction({"bias_V": 0.8, "temperature_K": -0.6}, 0.1).words
+    assert words.encode("ascii", errors="cpunet.plain") == b"0.80 bias_V - 0.60 temperature_K"
 
 
 def test_the_file_that_was_being_read_is_named(command, monkeypatch, stand):

@@ -122,6 +122,9 @@ def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data,
         (["--events", "5", "--hits", "x.npz"], "give either --hits FILE or --events N"),
         (["--events", "5", "--peak", "DPE"], "'DPE' is no known peak (FEP, SEP, DEP)"),
         (["--events", "FEP=5", "--peak", "SEP"], "leave out --peak"),
+        (["--events", "FEP=5,FEP=7"], "names a peak twice; give each once"),
+        (["--events", "5", "--peak", "FEP, FEP"], "names a peak twice; give each once"),
+        (["--events", "FEP=5e3"], "expected FEP=N,DEP=M"),
         (["--events", "many"], "'many' is no number of events"),
         (["--events", "0"], "no event is wanted"),
         (["--events", "5", "--window-kev", "0"], "give a half-width above 0"),
@@ -144,6 +147,16 @@ def test_wrong_words_are_one_line(command, tmp_path: Path, words: list[str], sai
     assert outcome.out == ""
     assert said in outcome.err.splitlines()[-1]
     assert "Traceback" not in outcome.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("option", "key"), [("--dt-ns", "dt_ns"), ("--length-ns", "length_ns")]
+)
+def test_zero_is_not_the_default_of_a_library(command, tmp_path: Path, option: str, key: str):
+    outcome = command("library", "make", *PPC, option, "0", "--out", tmp_path / "psl.lh5")
+    assert outcome.code == 2
+    assert f"settings: {key}: " in outcome.err
     assert list(tmp_path.iterdir()) == []
 
 

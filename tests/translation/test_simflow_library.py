@@ -31,7 +31,12 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import write_run
 from cpunet.translation.library_mode import TemplateTranslator
-from cpunet.translation.peak_currents import PEAK, currents_about_peak, heights
+from cpunet.translation.peak_currents import (
+    PEAK,
+    currents_about_peak,
+    heights,
+    most_frequent,
+)
 from cpunet.translation.ring_padding import continued, with_rings
 from cpunet.translation.translator import REN
 
@@ -105,6 +110,15 @@ def test_currents_about_their_maximum() -> None:
     nothing, when = currents_about_peak(np.full((2, 300), [[0], [np.nan]], np.float32))
     assert np.isnan(nothing).all()
     assert np.isnan(when).all()
+    templates[1, -50] = np.nan  # long after the maximum
+    found, times = currents_about_peak(templates)
+    assert np.isnan(found).all(axis=1).tolist() == [False, True, False]
+    assert np.isnan(times).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_mode_of_equal_amplitudes_is_their_value(n: int) -> None:
+    assert most_frequent(np.full(n, 0.0081)) == 0.0081
 
 
 def test_rings_go_on_from_the_crystal() -> None:

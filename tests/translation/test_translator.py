@@ -48,6 +48,14 @@ def test_any_precision_gives_float32(ren, sim, dtype):
     assert np.array_equal(out, ren.translate(sim, noise=False))
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64, torch.int32])
+def test_tensors_of_any_precision_give_float32(ren, sim, dtype):
+    given = torch.from_numpy(200 * sim).round().to(dtype)  # whole numbers, exact in all of them
+    out = ren.translate(given, noise=False)
+    assert out.dtype == torch.float32
+    assert np.array_equal(out.numpy(), ren.translate(given.float().numpy(), noise=False))
+
+
 def test_tensors_with_a_gradient_are_taken(ren, sim):
     out = ren.translate(torch.from_numpy(sim).requires_grad_(), noise=False)
     assert np.array_equal(out.numpy(), ren.translate(sim, noise=False))

@@ -10,7 +10,7 @@ direction, never as two values with small errors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,6 +70,9 @@ class Information:
         Standard deviations of their priors.
     pairs
         Number of pulses it refers to (the harmonic sum of both datasets).
+    known
+        Derivatives :math:`K` of further knowledge, such as a depletion voltage, in units of its
+        errors, shape (numbers known, parameters).
 
     Examples
     --------
@@ -84,6 +87,7 @@ class Information:
     matrix: Values
     widths: Values
     pairs: float
+    known: Values | None = None
 
     @classmethod
     def of(cls, problem: JointProblem, jacobian: Values) -> Information:
@@ -98,18 +102,17 @@ class Information:
         physics = problem.nearby.simulator.physics
         nuisances = tuple(physics.nuisances[i] for i in parameters.free)
         pairs = sum(band.pairs for band in problem.bands)
-        return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs)
+        known = jacobian[problem.moments + len(widths) :, n:]
+        return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs, known)
 
     def for_pulses(self, pairs: float) -> Information:
         """Information of `pairs` pulses; it scales linearly with their number."""
-        return Information(
-            self.nuisances, self.matrix * (pairs / self.pairs), self.widths, pairs
-        )
+        return replace(self, matrix=self.matrix * (pairs / self.pairs), pairs=pairs)
 
     def errors(self, chosen: Sequence[int] | None = None) -> Values:
-        r"""Standard errors of the coordinates given their priors.
+        r"""Standard errors of the coordinates given their priors and what else is known.
 
-        .. math:: \sigma_i^2 = \left[(F + P^{-1})^{-1}\right]_{ii}
+        .. math:: \sigma_i^2 = \left[(F + P^{-1} + K^T K)^{-1}\right]_{ii}
 
         Parameters
         ----------
@@ -118,6 +121,8 @@ class Information:
         """
         rows = list(range(len(self.widths))) if chosen is None else list(chosen)
         matrix = self.matrix[np.ix_(rows, rows)] + np.diag(self.widths[rows] ** -2.0)
+        if self.known is not None:
+            matrix += self.known[:, rows].T @ self.known[:, rows]
         return np.asarray(np.sqrt(np.linalg.inv(matrix).diagonal()))
 
     def directions(self) -> list[Direction]:

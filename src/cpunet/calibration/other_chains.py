@@ -1,8 +1,8 @@
 """Other chains, for data that a chain of fixed times does not explain.
 
-Such a chain does not only leave a larger chi-square. The parameters of the physics absorb part
-of the deviation: a readout with an early decay between the fixed ones looks like more
-self-repulsion.
+A chain that does not fit leaves more than a larger chi-square. The parameters of the physics
+absorb part of the deviation: a readout with an early decay between the fixed ones looks like
+more self-repulsion.
 """
 
 from __future__ import annotations

@@ -14,9 +14,8 @@ from cpunet.calibration.search import Calibrated
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
-# Number of prior errors beyond which a parameter is reported as unexpected, and fraction of an
-# error within which it is at a bound.
-FAR, AT_BOUND = 3.0, 1e-6
+# Number of prior errors beyond which a parameter is reported as unexpected.
+FAR = 3.0
 # Chi-square per moment beyond which the physics does not describe the data at all.
 HOPELESS = 50.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -41,31 +40,12 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
     """
     problem = calibrated.problem
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    values = physics.values(parameters.coordinates)
-    known = dict(
-        zip((n.name for n in physics.nuisances), priors(physics, parameters.given), strict=True)
-    )
-    free = {}
-    for i, error in zip(parameters.free, calibrated.errors, strict=True):
-        nuisance = physics.nuisances[i]
-        nominal, value = physics.nominal(nuisance), values[nuisance.name]
-        slope, prior = nuisance.slope(nominal, value), known[nuisance.name]
-        free[nuisance.name] = {
-            "value": value,
-            "error": float(slope * error),
-            "error_all": slope * calibrated.errors_all[nuisance.name],
-            "simulated": nominal,
-            "prior": {
-                "value": nuisance.value(nominal, prior.centre),
-                "error": nuisance.slope(nominal, value) * prior.width,
-                "source": "given" if nuisance.name in parameters.given else nuisance.source,
-            },
-        }
-    vector = parameters.vector()
+    vector = problem.parameters.vector()
+    physics = problem.nearby.simulator.physics
+    values = physics.values(problem.parameters.coordinates)
     mean, spread = problem.by_chance
     return {
-        "parameters": free,
+        "parameters": _parameters(calibrated),
         "fixed": {
             name: {"value": values[name], "chi_square_would_fall_by": fall}
             for name, fall in calibrated.promised.items()
@@ -80,7 +60,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         },
         "directions": [_direction(direction) for direction in calibrated.directions],
         "covariance": {
-            "names": list(parameters.names),
+            "names": list(problem.parameters.names),
             "values": vector.tolist(),
             "matrix": calibrated.covariance.tolist(),
         },
@@ -106,7 +86,7 @@ def notes(calibrated: Calibrated) -> list[str]:
     for k, i in enumerate(parameters.free):
         nuisance = physics.nuisances[i]
         value, name = values[nuisance.name], nuisance.name
-        if value in (nuisance.lowest, nuisance.highest):
+        if vector[n + k] in (parameters.low[n + k], parameters.high[n + k]):
             found.append(f"{name} is at its bound, {value:g}: --fix it, or free another")
         width = parameters.widths[n + k]
         off = (vector[n + k] - parameters.centre[n + k]) / width
@@ -141,6 +121,34 @@ def notes(calibrated: Calibrated) -> list[str]:
 def hopeless(calibrated: Calibrated) -> bool:
     """Whether the data clearly belong to another detector."""
     return calibrated.chi_square > HOPELESS * calibrated.problem.moments
+
+
+def _parameters(calibrated: Calibrated) -> dict[str, Any]:
+    """Value, errors, simulated value and prior of each free parameter, by name."""
+    problem = calibrated.problem
+    parameters, physics = problem.parameters, problem.nearby.simulator.physics
+    values = physics.values(parameters.coordinates)
+    known = dict(
+        zip((n.name for n in physics.nuisances), priors(physics, parameters.given), strict=True)
+    )
+    free = {}
+    for i, error in zip(parameters.free, calibrated.errors, strict=True):
+        nuisance = physics.nuisances[i]
+        nominal, value = physics.nominal(nuisance), values[nuisance.name]
+        slope, prior = nuisance.slope(nominal, value), known[nuisance.name]
+        centre = nuisance.value(nominal, prior.centre)
+        free[nuisance.name] = {
+            "value": value,
+            "error": float(slope * error),
+            "error_all": slope * calibrated.errors_all[nuisance.name],
+            "simulated": nominal,
+            "prior": {
+                "value": centre,
+                "error": nuisance.slope(nominal, centre) * prior.width,
+                "source": "given" if nuisance.name in parameters.given else nuisance.source,
+            },
+        }
+    return free
 
 
 def _direction(direction: Direction) -> dict[str, Any]:

@@ -171,7 +171,7 @@ class Search:
             other = self._other_chain(problem, kinds, number, settled=settled)
             response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
-            if settled and added is None:
+            if number == ROUNDS or (settled and added is None):
                 break
             if added is not None:
                 free, more = sorted([*free, added]), more + 1

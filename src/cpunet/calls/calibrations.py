@@ -20,19 +20,17 @@ from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
-from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulation_settings import load_settings
 from cpunet.recipes.schema import Recipe
-from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import read_info
-from cpunet.yaml_files import MAX_BYTES, plain_json
+from cpunet.yaml_files import json_mapping
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,13 +56,12 @@ class CalibratedRun(Run):
         """
         folder = Path(folder)
         info = read_info(folder)
-        try:
-            content = plain_json(read_text(folder / CALIBRATION, MAX_BYTES))
-        except (OSError, ValueError) as error:
-            raise CpunetError(
-                f"{folder}: no calibrated run ({CALIBRATION} cannot be read); open it with "
-                "cpunet.Run.load, or calibrate"
-            ) from error
+        content = json_mapping(
+            folder / CALIBRATION,
+            absent=f"{folder}: no calibrated run ({CALIBRATION} cannot be read); open it with "
+            "cpunet.Run.load, or calibrate",
+            remedy="calibrate again",
+        )
         return cls(folder, info, tuple(content.get("notes", ())), content)
 
     @property

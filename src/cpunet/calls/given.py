@@ -8,10 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from cpunet.yaml_files import shown
 
 File: TypeAlias = str | Path | InputFile
 
@@ -49,7 +52,10 @@ def as_recipe(recipe: str | Path | Recipe, settings: Mapping[str, Any] | None) -
     """
     if not isinstance(recipe, Recipe):
         # JSON is YAML
-        words = [f"{key}={json.dumps(value)}" for key, value in (settings or {}).items()]
+        words = [
+            f"{key}={json.dumps(value, default=_plain)}"
+            for key, value in (settings or {}).items()
+        ]
         return load_recipe(str(recipe), words)
     if settings:
         raise CpunetError(
@@ -57,3 +63,13 @@ def as_recipe(recipe: str | Path | Recipe, settings: Mapping[str, Any] | None) -
             "already, so change it and leave settings out"
         )
     return recipe
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers and arrays as those of JSON."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise CpunetError(
+        f"settings: {shown(value)} is of type {type(value).__name__}; give numbers, text, "
+        "lists or mappings"
+    )

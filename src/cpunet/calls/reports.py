@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
-_SHOWN = ("data", "raw", "ren", "truth")  # methods in a notebook's table
+_SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
 _HISTOGRAMS = "histograms"
 
 
@@ -76,7 +75,7 @@ class Report:
                 f"{file}: cannot be read ({error}); give the folder of a report, or make one "
                 "with cpunet.validate"
             ) from error
-        if not isinstance(metrics, dict) or "peaks" not in metrics:
+        if not (isinstance(metrics, dict) and isinstance(metrics.get("peaks"), dict)):
             raise CpunetError(f"{file}: holds no scores; make the report again")
         drawn, _ = read_drawings(Path(folder) / STORE)
         values: dict[str, ByMethod] = {}
@@ -114,7 +113,7 @@ class Report:
     @property
     def figures(self) -> Mapping[str, Figure]:
         """Figures by name, drawn on every access."""
-        return WhenAsked({name: partial(_draw, one) for name, one in self.drawn.items()})
+        return WhenAsked({name: one.draw for name, one in self.drawn.items()})
 
     def hist(
         self,
@@ -163,7 +162,7 @@ class Report:
         return f"<Report{where}: {peaks}>"
 
     def _repr_html_(self) -> str:
-        methods = [m for m in _SHOWN[1:] if any(row["method"] == m for row in self.scores)]
+        methods = [m for m in _SHOWN if any(row["method"] == m for row in self.scores)]
         by_place: dict[tuple[str, str], dict[str, Any]] = {}
         for row in self.scores:
             place = by_place.setdefault((row["peak"], row["parameter"]), {})
@@ -241,10 +240,6 @@ def validate(
     values = {peak: of_peak for peak, of_peak in found.values.items() if of_peak}
     where = None if out is None else Path(out)
     return Report(found.metrics, values, where, tuple(monitor.notes), drawn)
-
-
-def _draw(drawing: Drawing) -> Figure:
-    return drawing.draw()
 
 
 def _number(value: float | None) -> str:

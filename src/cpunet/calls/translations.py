@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.style import COLOURS, styled
 from cpunet.calls.given import File, as_input
-from cpunet.calls.progress import shown
+from cpunet.calls.progress import NotesKept, shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
@@ -247,11 +247,11 @@ def translate(
     if out is None:
         return _in_memory(job, made, source, monitor)
     counts = job(source, Path(out), resume=resume, force=force, monitor=monitor)
-    return _filled(made, counts, path=Path(out), notes=tuple(monitor.notes))
+    return replace(made, counts=counts, path=Path(out), notes=tuple(monitor.notes))
 
 
 def _in_memory(
-    job: FileTranslation, made: Translation, given: Pulses | InputFile, monitor: Monitor
+    job: FileTranslation, made: Translation, given: Pulses | InputFile, monitor: NotesKept
 ) -> Translation:
     pulses = given if isinstance(given, Pulses) else job.opened(given).read()
     if not len(pulses):
@@ -278,12 +278,7 @@ def _in_memory(
     if made.adc:
         counts["saturated"] = int(sum(block.saturated.sum() for block in formed))
     whole = Pulses.concatenate([block.pulses for block in formed])
-    notes = tuple(getattr(monitor, "notes", ()))
-    return _filled(made, counts, kept=(whole, codes), notes=notes)
-
-
-def _filled(made: Translation, counts: Mapping[str, Any], **more: Any) -> Translation:
-    return Translation(made.run, counts, made.recipe, adc=made.adc, **more)
+    return replace(made, counts=counts, kept=(whole, codes), notes=tuple(monitor.notes))
 
 
 def named_axis(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:

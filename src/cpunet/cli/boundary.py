@@ -1,7 +1,7 @@
-"""What a command ended with, whatever it was, as one line and a status.
+"""Turn whatever ended a command into one line and an exit status.
 
-Status 2 is for what whoever called can mend: bad input, a full disk, too little memory.  70 is
-for what nobody thought of, a bug; 128 and more for a signal.
+Status 2 is for what the user can mend: bad input, a full disk, too little memory.  70 is for
+what nobody thought of, a bug; 128 and more for a signal.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -89,7 +88,7 @@ def _wrong_usage(error: BaseException) -> int:
 
 
 def _known(error: BaseException) -> str | None:
-    """What the system refused, or input was wrong with; None for anything else."""
+    """What the system refused, or what was wrong with the input; None for anything else."""
     if isinstance(error, CpunetError):
         return str(error)
     text = " ".join(str(error).split())
@@ -122,7 +121,7 @@ def _unknown(error: BaseException) -> str:
 
 
 def _prefix(error: BaseException) -> str:
-    """The file that was being read or written, as the innermost function of ours calls it."""
+    """The file that was being read or written, from the innermost of our functions."""
     for frame in _ours(error):
         for holder in (frame.f_locals, getattr(frame.f_locals.get("self"), "__dict__", {})):
             for name in ("path", "_path", "file", "source", "run", "target", "out", "folder"):
@@ -140,10 +139,9 @@ def _ours(error: BaseException) -> Iterator[FrameType]:
 
 def _damaged_code(error: BaseException) -> str | None:
     """The file of compiled code that numba could not read, of this package or another."""
-    if not isinstance(error, pickle.UnpicklingError | EOFError | ValueError | TypeError):
-        with suppress(AttributeError):
-            if "unpickl" not in str(error).lower():
-                return None
+    kinds = pickle.UnpicklingError | EOFError | ValueError | TypeError
+    if not (isinstance(error, kinds) or "unpickl" in str(error).lower()):
+        return None
     for frame, _ in traceback.walk_tb(error.__traceback__):
         if frame.f_code.co_name in ("_load_index", "_load_data"):
             holder = frame.f_locals.get("self")

@@ -155,7 +155,7 @@ def calibrate(
     if out_folder is None and not plan:
         raise CpunetError("give --out, the run folder to make, or --plan")
     if out_folder is not None:
-        refuse_inputs(out_folder, recipe, detector, settings_file)
+        refuse_inputs(out_folder, recipe, detector, crystal, settings_file)
     start = _start(
         sim, detector, hits, settings_file, set_values or [], crystal, frame,
         cluster_mm, read_as.insist,
@@ -177,7 +177,7 @@ def calibrate(
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())
     for line in result_lines(content):
-        tell(f"{out_folder}: {line}", plain=True)
+        tell(f"{out_folder}: {line}")
 
 
 def _start(

@@ -1,4 +1,4 @@
-"""What became of the channels of a file, a line each."""
+"""The outcome of each channel of a file in a line."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ def tell_channels(outcome: Outcome[R], out: Path, in_words: Callable[[R], str]) 
     lines |= {name: f"failed: {reason}" for name, reason in outcome.failed.items()}
     width = max(map(len, lines), default=0)
     for name, line in lines.items():
-        tell(f"{name:<{width}}  {line}", plain=True)
+        tell(f"{name:<{width}}  {line}")
     outcome.require_all(out)

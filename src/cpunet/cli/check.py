@@ -50,10 +50,10 @@ def check(
     from cpunet.jobs.common.channels import ALL, paired
     from cpunet.jobs.training.check import Checked, Level, check
 
-    if out_file is not None:
-        refuse_inputs(out_file, sim, data, on.recipe)
-    chosen = on.load()
     sides = read_as.sim(sim), read_as.data(data)
+    if out_file is not None:
+        refuse_inputs(out_file, *sides[0].files, *sides[1].files, on.recipe)
+    chosen = on.load()
     stopped = False
     for name, pair in (paired(*sides) if read_as.data_table == ALL else {"": sides}).items():
         if isinstance(pair, CpunetError):
@@ -62,7 +62,7 @@ def check(
             checked = check(*pair, chosen, on.peak, monitor())
         picture = out_file
         if name:
-            out.print(f"{name}:", markup=False, highlight=False)
+            show(f"{name}:")
             picture = out_file and out_file.with_stem(f"{out_file.stem}-{name}")
         _show(checked, picture, force=force)
         stopped |= checked.level == Level.ERROR
@@ -78,4 +78,4 @@ def _show(checked: Checked, picture: Path | None, *, force: bool) -> None:
         show(str(finding))
     if picture is not None and checked.sides:
         draw(checked, picture, force=force)
-        out.print(f"{picture}: pulses of both sides", markup=False, highlight=False)
+        show(f"{picture}: pulses of both sides")

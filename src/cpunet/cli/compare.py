@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import print_table, show, tell, tell_table
+from cpunet.cli.messages import show, tell
 
 if TYPE_CHECKING:
     from cpunet.analysis.side_by_side import SideBySide
@@ -39,13 +38,12 @@ def compare(
     from cpunet.jobs.validation.compare import compare_reports
 
     compared = compare_reports(reports, method=method, out=out_file, force=force)
-    table = comparison_table(compared)
-    print_table(table) if out_file is None else tell_table(table)
-    say = show if out_file is None else partial(tell, plain=True)
+    say = show if out_file is None else tell
+    say(comparison_table(compared))
     for note in compared.notes:
         say(f"note: {note}")
     if out_file is not None:
-        tell(str(out_file), plain=True)
+        tell(str(out_file))
 
 
 def comparison_table(compared: SideBySide) -> Table:

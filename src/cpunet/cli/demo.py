@@ -10,13 +10,11 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
 from cpunet.cli.scores import print_scores
-from cpunet.cli.stand import Events, Kind, KindOption, wanted_events
+from cpunet.cli.stand import Events, Kind, KindOption, Preset
+from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
-Preset = Annotated[
-    str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
-]
 RecipeName = Annotated[
     str, typer.Option("--recipe", help="fast, best, small, paper, or a YAML file of your own.")
 ]

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.environment import MAX_THREADS
-from cpunet.cli.messages import err, monitor, tell, tell_table
+from cpunet.cli.messages import monitor, note, tell
 from cpunet.cli.scores import PARAMETERS
 from cpunet.outputs import refuse_inputs
 
@@ -79,12 +79,12 @@ def ensemble(
             monitor=monitor(),
         )
     except SystemExit:
-        err.print("finished seeds are kept; continue with --resume", markup=False)
+        note("finished seeds are kept; continue with --resume")
         raise
     if told["table"]:
-        tell_table(_table(told))
+        tell(_table(told))
     for line in _summary(told):
-        tell(line, plain=True)
+        tell(line)
     if told["table"]:
         tell(str(out_folder / FIGURE))
 

@@ -1,4 +1,4 @@
-"""Variables of the environment that other packages choke on, before these are imported."""
+"""Environment variables that break other packages, checked before these are imported."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _COUNTS = (
 
 
 def drop_nonsense() -> list[str]:
-    """Take numbers of threads that are none out of the environment; say which.
+    """Remove invalid numbers of threads from the environment, and return a line about each.
 
-    numba cannot be imported with them, OpenMP complains in words of its own, and children
-    would inherit them.  A folder of compiled code that others can write to is nonsense, too:
-    what lies there is run.
+    numba cannot be imported with them, OpenMP prints warnings of its own, and child processes
+    would inherit them.  A folder of compiled code that others can write to is removed as well,
+    since that code is run.
 
     Examples
     --------
@@ -72,13 +72,13 @@ def _is_count(text: str) -> bool:
 
 
 def share_the_machine() -> None:
-    """Keep OpenMP's threads from spinning for long, before torch loads it.
+    """Keep OpenMP's threads from spinning for long, before torch loads OpenMP.
 
-    By default they wait for each other in busy loops. Where something else runs too, the
-    thread that is waited for often has no core, and the loop takes the one it could have:
+    By default threads wait for each other in busy loops. If other programs run as well, the
+    thread that the others wait for often has no core, because a waiting one occupies it:
     trainings then take several times as much of the machine. Short loops bridge the gaps
-    between two operations; whoever waits longer sleeps. Whoever sets OpenMP's own variables
-    is obeyed.
+    between two operations; a thread that waits longer sleeps. If the user has set OpenMP's own
+    variables, nothing is changed.
     """
     if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
         os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT

@@ -11,30 +11,24 @@ from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
 from cpunet.outputs import refuse_inputs
 
-Runs = Annotated[
-    list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
-]
 Out = Annotated[Path, typer.Option("--out", help="HTML file to write.")]
 Data = Annotated[
     Path | None, typer.Option("--data", help="File of measured pulses to find the nearest in.")
 ]
 Points = Annotated[int, typer.Option(help="Places in the crystal, about; 20 to 600.")]
-SettingsFile = Annotated[
-    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
-]
 
 
 @options.grouped
 def explore(
     *,
-    runs: Runs,
+    runs: options.Runs,
     detector: options.DetectorFile,
     out_file: Out,
     data: Data = None,
     points: Points = 400,
     set_values: options.Set = None,
     crystal: options.Crystal = None,
-    settings_file: SettingsFile = None,
+    settings_file: options.SettingsFile = None,
     read_as: options.DataAs,
     device: options.Device = "auto",
     force: options.Force = False,
@@ -47,15 +41,12 @@ def explore(
     from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
-    refuse_inputs(out_file, detector, settings_file)
-    measured = None
-    if data is not None:
-        measured = read_as.data(data)
+    refuse_inputs(out_file, detector, crystal, settings_file)
     told = explore_runs(
         runs,
         read_detector(detector, set_values or (), crystal),
         out_file,
-        data=measured,
+        data=None if data is None else read_as.data(data),
         points=points,
         settings=None if settings_file is None else load_settings(settings_file),
         device=device,
@@ -68,5 +59,4 @@ def explore(
         + (f" (none: {left_out})" if left_out else "")
         + (f", {told['drawn']} measured ones beside them" if "drawn" in told else "")
         + f"; {told['bytes'] / 1e6:.1f} MB",
-        plain=True,
     )

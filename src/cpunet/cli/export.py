@@ -46,7 +46,6 @@ Library = Annotated[
         "--library", help="With --to: ideal pulses on which two parameters are tried."
     ),
 ]
-Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulation-like.")]
 Report = Annotated[
     Path | None,
     typer.Option(
@@ -60,7 +59,7 @@ def export(
     out_file: Out,
     form: FormName = Form.ONNX,
     to: To = None,
-    inverse: Inverse = False,
+    inverse: options.Inverse = False,
     report: Report = None,
     detector: Detector = None,
     library: Library = None,

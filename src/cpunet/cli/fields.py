@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,10 +18,6 @@ DetectorFile = Annotated[
         metavar="DETECTOR",
     ),
 ]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
-]
 Out = Annotated[Path | None, typer.Option("--out", help="Picture to make: .png, .pdf or .svg.")]
 Paths = Annotated[bool, typer.Option("--paths/--no-paths", help="Draw drift paths.")]
 
@@ -30,7 +25,7 @@ Paths = Annotated[bool, typer.Option("--paths/--no-paths", help="Draw drift path
 def fields(
     detector: DetectorFile,
     out_file: Out = None,
-    set_values: Set = None,
+    set_values: options.Set = None,
     crystal: options.Crystal = None,
     impurity_from: options.ImpurityFrom = options.Impurities.file,
     paths: Paths = True,
@@ -44,7 +39,7 @@ def fields(
     from cpunet.simulation.geometry_readers import read_detector
 
     if out_file is not None:
-        refuse_inputs(out_file, detector)
+        refuse_inputs(out_file, detector, crystal)
     told = describe_fields(
         read_detector(detector, set_values or (), crystal),
         out_file,
@@ -54,6 +49,6 @@ def fields(
         monitor=monitor(),
     )
     width = max(map(len, told))
-    say = show if out_file is None else partial(tell, plain=True)
+    say = show if out_file is None else tell
     for name, value in told.items():
         say(f"{name:<{width}}  {value}")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import err, monitor, tell
+from cpunet.cli.messages import monitor, note, tell
 
 import_ = typer.Typer(
     help="Published weights become a run, pickled pulses an LH5 file; nothing is executed.",
@@ -84,9 +84,6 @@ def pulses(
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
     tell(f"{out_file}: {told['written']} of {told['read']} pulses{rejected}")
     if told["truncated"]:
-        err.print(
-            f"{source}: ends within a pulse or is damaged there; what was before it is written",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
+        note(
+            f"{source}: ends within a pulse or is damaged there; what was before it is written"
         )

@@ -12,17 +12,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import out, print_table, show, tell, warn
+from cpunet.cli.messages import show, tell, warn
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
+from cpunet.outputs import refuse_inputs
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[
     str | None, typer.Option("--table", help="Table, if there are several; or all.")
 ]
-Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
-
 WithoutRemains = Annotated[
     Path | None,
     typer.Option(
@@ -31,8 +30,6 @@ WithoutRemains = Annotated[
         "with the columns remains_kev and remains_error_kev.",
     ),
 ]
-
-
 Page = Annotated[
     Path | None,
     typer.Option("--out", help="HTML page to write: the same with the spectrum and its lines."),
@@ -49,7 +46,7 @@ Crystal = Annotated[
 def info(
     source: Source,
     table: TableName = None,
-    energy: Energy = None,
+    energy: options.Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
     detector: Crystal = None,
@@ -76,6 +73,9 @@ def info(
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.training.run_schema import problem
 
+    for target in (page, without_remains):
+        if target is not None:
+            refuse_inputs(target, detector)
     told = describe(
         source,
         table=table,
@@ -92,11 +92,11 @@ def info(
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
-        print_table(_tables(told))
-        out.print("one of them: --table NAME; each in full: --table all", highlight=False)
+        show(_tables(told))
+        show("one of them: --table NAME; each in full: --table all")
     elif told["kind"] == "channels":
         for name, one in told["channels"].items():
-            out.print(f"{name}:", markup=False, highlight=False)
+            show(f"{name}:")
             _print([("", one)] if isinstance(one, str) else in_words(one))
     else:
         _print(in_words(told))

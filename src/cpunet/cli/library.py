@@ -115,9 +115,6 @@ Diffusion = Annotated[
         callback=options.within(1, 1e5),
     ),
 ]
-SettingsFile = Annotated[
-    Path | None, typer.Option("--settings", help="Settings of the simulation, a YAML file.")
-]
 
 
 @library.command()
@@ -128,7 +125,7 @@ def make(
     angles: Angles = "0,45",
     dt: Dt = None,
     length_ns: Length = None,
-    settings: SettingsFile = None,
+    settings: options.SettingsFile = None,
     set_values: options.Set = None,
     crystal: options.Crystal = None,
     force: options.Force = False,
@@ -141,12 +138,13 @@ def make(
     from cpunet.jobs.simulation.simulation_settings import load_settings
     from cpunet.simulation.geometry_readers import read_detector
 
-    refuse_inputs(out_file, detector, settings)
+    refuse_inputs(out_file, detector, crystal, settings)
     degrees = parse_numbers(angles, angles.count(",") + 1, "--angles")
     if any(angle != int(angle) for angle in degrees):
         raise CpunetError(f"--angles {angles}: give whole degrees")
     if settings is None:
-        dt, length_ns = dt or DT_NS, length_ns or LENGTH_NS
+        dt = DT_NS if dt is None else dt
+        length_ns = LENGTH_NS if length_ns is None else length_ns
     counts = write_library(
         read_detector(detector, set_values or (), crystal),
         out_file,

@@ -94,8 +94,9 @@ app.add_typer(import_, name="import")
 def main() -> None:
     """Run the command line: it ends in one line on stderr, if anything goes wrong."""
     words = sys.argv[1:]
-    options = words[: words.index("--")] if "--" in words else words
-    debug = DEBUG in options  # known wherever it stands, also before anything is imported
+    end = words.index("--") if "--" in words else len(words)  # then names only
+    debug = DEBUG in words[:end]  # known wherever it stands, also before anything is imported
+    words = [word for word in words[:end] if word != DEBUG] + words[end:]
     try:
         prepare_streams()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -105,7 +106,7 @@ def main() -> None:
         share_the_machine()
         if clash := other_package():
             warn(clash)
-        status = app([word for word in words if word != DEBUG], standalone_mode=False)
+        status = app(words, standalone_mode=False)
     except BaseException as error:
         status = ended_with(error, debug=debug)
     finish_streams()

@@ -26,18 +26,18 @@ err = Notes(stderr=True)
 LOG_EVERY_S = 30.0  # between lines of progress in a log file
 
 
-def show(text: str) -> None:
-    """Print a line as it is: brackets in it are no markup, and numbers have no colour."""
-    out.print(text, markup=False, highlight=False, soft_wrap=True)
+def show(result: str | Table) -> None:
+    """Print a line as it is (brackets are no markup), or a table with every number whole."""
+    if isinstance(result, Table):
+        _print_table(result)
+    else:
+        out.print(result, markup=False, highlight=False, soft_wrap=True)
 
 
-def tell(text: str, *, plain: bool = False) -> None:
-    """Print a line about an output that is in place: if it cannot be, that is a warning.
-
-    With `plain`, brackets in it are no markup and numbers have no colour.
-    """
+def tell(result: str | Table) -> None:
+    """Show what is in an output that is in place: if it cannot be printed, only warn."""
     try:
-        out.print(text, soft_wrap=True, markup=not plain, highlight=not plain)
+        show(result)
     except OutputError as error:
         warn(f"{error}; the output is whole")
         out.quiet = True  # once is enough
@@ -45,24 +45,20 @@ def tell(text: str, *, plain: bool = False) -> None:
 
 def fail(message: str) -> None:
     """Print an error as one line."""
-    err.print(f"[bold red]error:[/] {_plain(message)}", soft_wrap=True, highlight=False)
+    err.print(Text.assemble(("error:", "bold red"), " ", _one_line(message)), soft_wrap=True)
 
 
 def warn(message: str) -> None:
     """Print a warning as one line."""
-    err.print(f"[bold]warning:[/] {_plain(message)}", soft_wrap=True, highlight=False)
+    err.print(Text.assemble(("warning:", "bold"), " ", _one_line(message)), soft_wrap=True)
 
 
-def tell_table(table: Table) -> None:
-    """Print a table of what is in an output that is in place, as `tell` does."""
-    try:
-        print_table(table)
-    except OutputError as error:
-        warn(f"{error}; the output is whole")
-        out.quiet = True
+def note(message: str) -> None:
+    """Print one line on stderr."""
+    err.print(_one_line(message), markup=False, highlight=False, soft_wrap=True)
 
 
-def print_table(table: Table) -> None:
+def _print_table(table: Table) -> None:
     """Print a table with every number whole, on a narrow screen or in a log, too.
 
     Words and headings are broken if that makes the table fit; else it is wider than the screen.
@@ -73,8 +69,8 @@ def print_table(table: Table) -> None:
     room = out.width - 1 - len(table.columns) * (left + right + 1)
     least, most = [], []
     for column in table.columns:
-        head = Text.from_markup(str(column.header)).plain
-        cells = [Text.from_markup(str(cell)).plain for cell in column.cells]
+        head = Text.from_markup(str(column.header), emoji=False).plain
+        cells = [Text.from_markup(str(cell), emoji=False).plain for cell in column.cells]
         most.append(max([1, *map(len, (head, *cells))]))
         if column.justify != "right":  # words
             cells = [word for cell in cells for word in cell.split()]
@@ -103,17 +99,17 @@ class BarMonitor(Monitor):
     def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
         """Show a bar while the stage lasts."""
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
-            TextColumn("{task.fields[state]}"),
+            TextColumn("{task.fields[state]}", markup=False),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
         with Progress(*columns, console=err) as progress:
-            task = progress.add_task(_plain(title), total=total, rate="", state="")
-            self._show = lambda text: progress.update(task, state=_plain(text))
+            task = progress.add_task(title, total=total, rate="", state="")
+            self._show = lambda text: progress.update(task, state=text)
             start, done = time.monotonic(), 0
 
             def advance(steps: int) -> None:
@@ -133,7 +129,7 @@ class BarMonitor(Monitor):
 
     def note(self, message: str) -> None:
         """Print a line."""
-        _print(message)
+        note(message)
 
 
 class LogMonitor(Monitor):
@@ -161,11 +157,11 @@ class LogMonitor(Monitor):
                     else ""
                 )
                 state = f", {self._state}" if self._state else ""
-                _print(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}{state}")
+                note(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}{state}")
 
         self._state = ""
         yield advance
-        _print(f"{title}: done in {time.monotonic() - start:.1f} s")
+        note(f"{title}: done in {time.monotonic() - start:.1f} s")
 
     def state(self, text: str) -> None:
         """Keep a text for the next line."""
@@ -173,13 +169,8 @@ class LogMonitor(Monitor):
 
     def note(self, message: str) -> None:
         """Print a line."""
-        _print(message)
+        note(message)
 
 
-def _print(message: str) -> None:
-    err.print(_plain(message), soft_wrap=True, highlight=False)
-
-
-def _plain(text: str) -> str:
-    # file names may hold brackets, which rich would read as markup
-    return " ".join(text.split()).replace("[", r"\[")
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -89,6 +89,9 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 Sim = Annotated[Path, typer.Option("--sim", help="File of simulated pulses.")]
 Data = Annotated[Path, typer.Option("--data", help="File of measured pulses.")]
 Run = Annotated[Path, typer.Argument(help="Folder of a training run.", metavar="RUN")]
+Runs = Annotated[
+    list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
+]
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of all random numbers.")]
 Threads = Annotated[
     int | None,
@@ -115,6 +118,7 @@ DataEnergy = Annotated[
     str | None,
     typer.Option(help="Energy column of the data, or FILE:path/to/column, as of a hit tier."),
 ]
+Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
 KevPerAdc = Annotated[
     float | None,
     typer.Option(
@@ -138,6 +142,7 @@ Insist = Annotated[
         help="Pulses are simulated or measured as given, whatever they look like.",
     ),
 ]
+Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulation-like.")]
 Truth = Annotated[
     Path | None, typer.Option(help="Noise-free responses of the simulated pulses (.npz).")
 ]
@@ -165,6 +170,9 @@ ImpurityFrom = Annotated[
 Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a detector's value: --set bias_V=3500 (repeatable)."),
+]
+SettingsFile = Annotated[
+    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
 ]
 DetectorFile = Annotated[
     str,

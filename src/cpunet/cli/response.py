@@ -12,13 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, print_table, tell, tell_table, warn
+from cpunet.cli.messages import monitor, show, tell, warn
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
-Runs = Annotated[
-    list[Path], typer.Argument(help="Folders of training runs, as of several seeds.")
-]
 Stand = Annotated[
     Path | None, typer.Option("--stand", help="Test stand of the data: compare with its truth.")
 ]
@@ -55,7 +52,7 @@ ROWS = {
 
 
 def response(
-    runs: Runs,
+    runs: options.Runs,
     stand: Stand = None,
     electronics: Truth = None,
     out_folder: Out = None,
@@ -79,9 +76,9 @@ def response(
         truth = read_electronics(electronics)
     told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
     if out_folder is None:
-        print_table(response_table(told))
+        show(response_table(told))
     else:
-        tell_table(response_table(told))
+        tell(response_table(told))
         tell(f"{out_folder / 'response.png'}")
     for run in told["runs"]:
         for doubt in run["doubts"]:
@@ -139,7 +136,9 @@ def _cells(told: dict[str, Any], name: str, unit: str) -> list[str]:
     """A row of the table."""
     runs, truth = told["runs"], told.get("truth")
     scale = 100.0 if unit == "%" else 1.0
-    cells = [_number(run["values"].get(name), scale, _error(run, name, runs)) for run in runs]
+    # beside several runs there is no room for errors, and the spread says more
+    errors = runs[0]["errors"] if len(runs) == 1 else {}
+    cells = [_number(run["values"].get(name), scale, errors.get(name)) for run in runs]
     if "mean" in told:
         cells.append(_number(told["mean"].get(name), scale, told["spread"].get(name)))
     if truth is not None:
@@ -148,12 +147,6 @@ def _cells(told: dict[str, Any], name: str, unit: str) -> list[str]:
         sigma = truth["sigma"].get(name)
         cells.append("" if sigma is None else f"{sigma:+.1f}")
     return cells
-
-
-def _error(run: dict[str, Any], name: str, runs: list[Any]) -> float | None:
-    # beside several runs there is no room for it, and the spread says more
-    error: float | None = run["errors"].get(name) if len(runs) == 1 else None
-    return error
 
 
 def _number(value: float | None, scale: float, error: float | None = None) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from cpunet.cli.messages import tell, tell_table
+from cpunet.cli.messages import tell
 
 # Methods in the order of a report; those without noise are in metrics.json.
 METHODS = {
@@ -29,11 +29,10 @@ PARAMETERS = {
 
 def print_scores(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> None:
     """Print the table of scores, and below it why peaks have none."""
-    tell_table(score_table(metrics, leave_out))
+    tell(score_table(metrics, leave_out))
     for peak, scores in metrics["peaks"].items():
         if "missing" in scores and peak not in leave_out:
-            line = f"{peak}: not scored, {scores['missing']}"
-            tell(line, plain=True)
+            tell(f"{peak}: not scored, {scores['missing']}")
 
 
 def score_table(metrics: dict[str, Any], leave_out: Sequence[str] = ()) -> Table:

@@ -245,7 +245,7 @@ def simulate(
             "give either --hits FILE or --events N (for the gamma Monte Carlo); pulse-shape "
             "libraries are made by cpunet library make"
         )
-    refuse_inputs(out_file, detector, settings_file)
+    refuse_inputs(out_file, detector, crystal, settings_file)
     peaks = load_recipe("small").peaks
     source: HitSource
     if hits is not None:
@@ -281,7 +281,7 @@ def simulate(
         monitor=monitor(),
     )
     for line in summary_lines(summary):
-        tell(f"{out_file}: {line}", plain=True)
+        tell(f"{out_file}: {line}")
 
 
 def summary_lines(summary: Summary) -> list[str]:

@@ -11,7 +11,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import monitor, tell
-from cpunet.cli.values import event_count
+from cpunet.cli.values import wanted_events
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -54,9 +54,6 @@ SetValues = Annotated[
         "--set", help="Override a value of the detector or of the settings (repeatable)."
     ),
 ]
-SettingsFile = Annotated[
-    Path | None, typer.Option("--settings", help="YAML file of settings of the simulation.")
-]
 RateKhz = Annotated[
     float | None,
     typer.Option(
@@ -94,7 +91,7 @@ def stand(
     kind: KindOption = Kind.matched,
     shift: ShiftParts = None,
     set_values: SetValues = None,
-    settings_file: SettingsFile = None,
+    settings_file: options.SettingsFile = None,
     crystal: options.Crystal = None,
     rate_khz: RateKhz = None,
     pile_up_khz: PileUpKhz = None,
@@ -120,7 +117,7 @@ def stand(
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.shifted import Shift
 
-    refuse_inputs(out_folder, preset, detector)
+    refuse_inputs(out_folder, preset, detector, crystal, settings_file, *(shift or ()))
     names, numbers = wanted_events(events)
     overrides, values = split_overrides(set_values or ())
     electronics = read_electronics(preset).disturbed(
@@ -140,19 +137,7 @@ def stand(
         monitor=monitor(),
     )
     for line in _lines(summary):
-        tell(f"{out_folder}: {line}", plain=True)
-
-
-def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
-    """Names and numbers of ``"FEP=4000,DEP=1500"``."""
-    pairs = [part.partition("=") for part in events.split(",")]
-    for name, _, number in pairs:
-        if not (name.strip() and number.strip().isdecimal()):
-            raise CpunetError(f"--events {events}: expected FEP=N,DEP=M and the like")
-    names = [name.strip() for name, _, _ in pairs]
-    if len(set(names)) < len(names):
-        raise CpunetError(f"--events {events}: names a peak twice; give each once")
-    return names, tuple(event_count(number) for _, _, number in pairs)
+        tell(f"{out_folder}: {line}")
 
 
 def wanted_hum(hum: str | None) -> Hum | None:

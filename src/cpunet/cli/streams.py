@@ -1,8 +1,8 @@
 """Standard output and standard error, whatever they are.
 
-Nothing fails for a sign that the encoding of a screen lacks: common ones are written otherwise,
-others by their number.  A log that cannot be written stops no job; a result that cannot be
-printed is an error of its own.
+Characters that the encoding of a terminal lacks cause no failure: common ones are replaced,
+others are written by their number.  A log that cannot be written stops no job; a result that
+cannot be printed is an error of its own.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from rich.console import Console
 
 from cpunet.errors import CpunetError
 
-_REPLACING = "cpunet.plain"  # name of the handler of signs that an encoding lacks
-_PLAIN_SIGNS = {"–": "-", "—": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u"} | {
-    "σ": "sigma", "χ": "chi", "²": "2", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*"
+_REPLACING = "cpunet.plain"  # handler of characters that an encoding lacks
+_PLAIN_SIGNS = {
+    "–": "-", "—": "-", "−": "-", "…": "...", "±": "+-", "×": "x", "µ": "u", "μ": "u",
+    "σ": "sigma", "χ": "chi", "→": "->", "≥": ">=", "≤": "<=", "°": "deg", "•": "*",
+    "²": "2", "⁰": "0", "¹": "^1", "⁴": "^4",
 }  # fmt: skip
 
 
@@ -30,10 +32,21 @@ class OutputError(CpunetError):
 
 
 class GoneError(OutputError):
-    """Who read standard output has stopped reading."""
+    """The reader of standard output has stopped reading."""
 
 
-class Results(Console):
+class _Stream(Console):
+    """A console that prints names as they are, and leaves errors to this package."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(emoji=False, **options)  # in FILE:key:, a picture would replace key
+
+    def on_broken_pipe(self) -> None:
+        """Pass the error on; rich would end the program."""
+        raise
+
+
+class Results(_Stream):
     """Standard output, which a result must reach."""
 
     def print(self, *objects: Any, **options: Any) -> None:
@@ -46,35 +59,27 @@ class Results(Console):
             reason = error.strerror or error
             raise OutputError(f"standard output: cannot be written ({reason})") from error
 
-    def on_broken_pipe(self) -> None:
-        """Pass the error on, which rich would end the program by."""
-        raise
 
-
-class Notes(Console):
-    """Standard error: what cannot be told is lost, and nothing else."""
+class Notes(_Stream):
+    """Standard error: a message that cannot be printed is lost, but stops nothing."""
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print if that can be done."""
+        """Print if possible."""
         with suppress(OSError):
             super().print(*objects, **options)
 
-    def on_broken_pipe(self) -> None:
-        """Pass the error on, which rich would end the program by."""
-        raise
-
 
 class _Closed(io.TextIOBase):
-    """What stands for a standard output that was closed before the program began."""
+    """Stands in for a standard output that was closed before the program began."""
 
     def write(self, _text: str, /) -> int:
         raise OSError(errno.EBADF, "it is closed")
 
 
 def prepare_streams() -> None:
-    """Make standard streams take every sign, and be there even if they were closed.
+    """Make the standard streams accept every character, and open those that were closed.
 
-    A closed one would have its number taken by the next file, into which others then print.
+    The next file would take the number of a closed one, and what is printed would go into it.
     """
     for number in range(3):
         with suppress(OSError):  # open: as it should be
@@ -90,7 +95,7 @@ def prepare_streams() -> None:
 
 
 def finish_streams() -> None:
-    """Write what is left, so that nothing fails when the interpreter does that at its end."""
+    """Flush the streams now, so that nothing fails when the interpreter does so at its end."""
     for stream in (sys.stdout, sys.stderr):
         try:
             if stream is not None:

@@ -37,5 +37,5 @@ def summary(
     entries = summarise_reports(reports, out_file, missing_ok=missing_ok, force=force)
     missing = [entry.name for entry in entries if entry.metrics is None]
     for name in missing:
-        tell(f"no report: {name}", plain=True)
-    tell(f"{out_file}: {len(entries) - len(missing)} of {len(entries)} reports", plain=True)
+        tell(f"no report: {name}")
+    tell(f"{out_file}: {len(entries) - len(missing)} of {len(entries)} reports")

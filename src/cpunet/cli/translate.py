@@ -38,7 +38,6 @@ Out = Annotated[
     str,
     typer.Option("--out", help="LH5 file to write; for several files, or with /, a folder."),
 ]
-Inverse = Annotated[bool, typer.Option("--inverse", help="IREN: data → simulation-like.")]
 Noise = Annotated[
     bool, typer.Option("--noise/--no-noise", help="Add noise as the data have it, or none.")
 ]
@@ -68,7 +67,6 @@ AppendColumn = Annotated[
     str | None,
     typer.Option(help="Copy the file, and add the pulses to its table as a column so named."),
 ]
-Energy = Annotated[str | None, typer.Option(help="Energy column, or FILE:path/to/column.")]
 Jobs = Annotated[
     int,
     typer.Option(
@@ -150,7 +148,7 @@ def translate(
     run: options.Run,
     sources: Sources,
     out_name: Out,
-    inverse: Inverse = False,
+    inverse: options.Inverse = False,
     noise: Noise = True,
     remains: Remains = "none",
     pile_up_khz: PileUpKhz = 0.0,
@@ -159,7 +157,7 @@ def translate(
     table: Table = None,
     out_table: OutTable = None,
     append_column: AppendColumn = None,
-    energy: Energy = None,
+    energy: options.Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
     insist: options.Insist = False,

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cpunet.cli import options
 from cpunet.cli.ensemble import Jobs, Resume, Threads
-from cpunet.cli.messages import err, monitor, tell, tell_table
+from cpunet.cli.messages import monitor, note, tell
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the search to make.")]
@@ -62,15 +62,15 @@ def tune(
             monitor=monitor(),
         )
     except SystemExit:
-        err.print("finished trials are kept; continue with --resume", markup=False)
+        note("finished trials are kept; continue with --resume")
         raise
-    tell_table(_table(told))
+    tell(_table(told))
     best, first = told["best"], told["first"]
     line = f"best: trial {best['number']} with {best['score']:.3f}"
     tell(line + ("" if first is None else f"; the recipe as it is has {first:.3f}"))
     if told["importances"]:
         shares = (f"{key} {share:.2f}" for key, share in told["importances"].items())
-        tell(f"importance: {', '.join(shares)}", plain=True)
+        tell(f"importance: {', '.join(shares)}")
     tell(str(out_folder / BEST))
 
 

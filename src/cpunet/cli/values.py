@@ -37,18 +37,38 @@ def parse_events(
     Raises
     ------
     CpunetError
-        If a number or a line cannot be understood, or the lines are named twice.
+        If a number or a line cannot be understood, a line is named twice, or the lines are
+        named in both.
     """
     from cpunet.jobs.simulation.hit_sources import energy_windows
 
     if "=" not in events:
         windows = energy_windows(peak or ",".join(peaks), peaks, window_kev)
+        if len(set(windows)) < len(windows):
+            raise CpunetError(f"--peak {peak}: names a peak twice; give each once")
         return windows, (event_count(events),) * len(windows)
     if peak is not None:
         raise CpunetError(f"--events {events} names its peaks; leave out --peak")
+    names, numbers = wanted_events(events)
+    return energy_windows(",".join(names), peaks, window_kev), numbers
+
+
+def wanted_events(events: str) -> tuple[list[str], tuple[int, ...]]:
+    """Names and numbers of ``"FEP=4000,DEP=1500"``.
+
+    Raises
+    ------
+    CpunetError
+        If it has another form, or a name occurs twice.
+    """
     pairs = [part.partition("=") for part in events.split(",")]
-    windows = energy_windows(",".join(name for name, _, _ in pairs), peaks, window_kev)
-    return windows, tuple(event_count(number) for _, _, number in pairs)
+    for name, _, number in pairs:
+        if not (name.strip() and number.strip().isdecimal()):
+            raise CpunetError(f"--events {events}: expected FEP=N,DEP=M and the like")
+    names = [name.strip() for name, _, _ in pairs]
+    if len(set(names)) < len(names):
+        raise CpunetError(f"--events {events}: names a peak twice; give each once")
+    return names, tuple(event_count(number) for _, _, number in pairs)
 
 
 def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:

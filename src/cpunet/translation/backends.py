@@ -27,7 +27,6 @@ from cpunet.recipes.schema import PreparationConfig
 
 Energies = npt.NDArray[np.float64]
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-
 NO_OTHERS = (
     "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
 )
@@ -258,8 +257,18 @@ class InverseBackend(Backend):
         self.dt_ns = dt_ns
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Invert the response and suppress the noise; deterministic."""
-        del drawn
+        """Invert the response and suppress the noise; deterministic.
+
+        Raises
+        ------
+        CpunetError
+            If other pulses are to be added.
+        """
+        if drawn.others:
+            raise CpunetError(
+                "the inverse gives charge, without other pulses; leave out remains_kev and "
+                "second"
+            )
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")

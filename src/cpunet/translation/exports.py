@@ -109,8 +109,8 @@ def graph_of(translator: Translator) -> Graph:
     -------
     Graph
         Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either
-        zeros for the latent mean or drawn from N(0, 1).  Output: ``windows`` for a network,
-        unprepared ``records`` for a readout chain, ``pulses`` for its inverse.
+        zeros for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a
+        network, unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
     """
     length = translator.recipe.preparation.length
     windows = _windows(length)

@@ -22,7 +22,8 @@ Floats = npt.NDArray[np.float32]
 def components(templates: Floats, rank: int) -> Floats:
     """Leading principal components, without centring: orthonormal, shape ``(rank, samples)``.
 
-    They minimise the squared error of templates of shape ``(n, samples)``.
+    They minimise the squared error of templates of shape ``(n, samples)``.  Templates that span
+    fewer dimensions have fewer components.
 
     Raises
     ------

@@ -53,6 +53,8 @@ def heights(currents: FloatArray) -> Values:
 def most_frequent(amplitudes: Values) -> float:
     """Mode of A/E as in production: centre of the fullest of 1,000 bins of the whole range.
 
+    If all values are the same, it is their value.
+
     Parameters
     ----------
     amplitudes
@@ -63,6 +65,8 @@ def most_frequent(amplitudes: Values) -> float:
     >>> round(most_frequent(np.array([1.0, 2.0, 2.0, 3.0])), 2)
     2.0
     """
+    if np.ptp(amplitudes) == 0:  # the bins would be 0.001/ns wide, a tenth of A/E
+        return float(amplitudes[0])
     counts, edges = np.histogram(amplitudes, MODE_BINS)
     highest = int(counts.argmax())
     return float(0.5 * (edges[highest] + edges[highest + 1]))
@@ -80,7 +84,8 @@ def _about_peak(
             if current[k] > current[peak]:
                 peak = k
         bend = current[peak - 1] - 2 * current[peak] + current[peak + 1]
-        if not (current[peak] > 0 and bend < 0):
+        # the running sums remain NaN after a NaN
+        if np.isnan(current[-1]) or not (current[peak] > 0 and bend < 0):
             currents[i] = np.nan
             times[i] = np.nan
             continue
@@ -108,7 +113,7 @@ def _about_peak(
 
 @kernel
 def _averaged(charge: npt.NDArray[np.float32]) -> Values:
-    """Differences between samples after the backward averages; NaN if the charge has NaN."""
+    """Differences between samples after the backward averages; NaN from a NaN on."""
     n_samples = len(charge)
     current = np.empty(n_samples)
     before = 0.0

@@ -199,7 +199,7 @@ class Translator:
             `translate_pulses` returns a code for each instead.
         """
         if isinstance(waveforms, torch.Tensor):
-            array = waveforms.detach().cpu().numpy()
+            array = waveforms.detach().cpu().float().numpy()  # NumPy has no bfloat16
             result = self._translate_array(array, energy_kev, noise, seed, remains_kev)
             return torch.from_numpy(result).to(waveforms.device)
         return self._translate_array(
@@ -328,8 +328,11 @@ class Translator:
             raise CpunetError(NO_ENERGY)
         pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
         if energy_kev is not None:
-            pulses = replace(pulses, energy_kev=_one_each(energy_kev, len(pulses)))
-        left = None if remains_kev is None else _one_each(remains_kev, len(pulses))
+            energies = _one_each("energy_kev", energy_kev, len(pulses))
+            pulses = replace(pulses, energy_kev=energies)
+        left = None
+        if remains_kev is not None:
+            left = _one_each("remains_kev", remains_kev, len(pulses))
         done = self.translate_pulses(
             pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
         )
@@ -345,13 +348,13 @@ class Translator:
         return done.pulses.waveforms[0] if single else done.pulses.waveforms
 
 
-def _one_each(energy_kev: npt.ArrayLike, n: int) -> Energies:
+def _one_each(name: str, energy_kev: npt.ArrayLike, n: int) -> Energies:
     """Energies of `n` pulses, from `n` values or one common value."""
     energies = np.asarray(energy_kev, float)
     if energies.shape not in ((), (n,)):
         raise CpunetError(
-            f"energy_kev has shape {energies.shape} beside {n} pulses; give one for each, or "
-            "one for all"
+            f"{name} has shape {energies.shape} beside {n} pulses; give one for each, or one "
+            "for all"
         )
     return np.broadcast_to(energies, (n,))
 

@@ -262,4 +262,11 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
             f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
         ) from None
     name = found[1] if found else ""
-    return (name if name == DEPLETION else named(name).name), (value, error)
+    if name == DEPLETION:
+        return name, (value, error)
+    nuisance = named(name)
+    if not nuisance.lowest <= value <= nuisance.highest:
+        raise CpunetError(
+            f"--prior {text}: give a value from {nuisance.lowest:g} to {nuisance.highest:g}"
+        )
+    return nuisance.name, (value, error)
