@@ -43,6 +43,22 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
     assert not len(known_depletion(physics, None)(np.zeros(2)))
 
 
+@pytest.mark.parametrize(
+    "other_charge", ["impurity_tilt_1e10_per_cm4=0.1", "surface_charge_1e10_per_cm2=0.1"]
+)
+def test_scaled_impurities_keep_their_tilt_and_the_surface_charge(
+    tmp_path, monkeypatch, other_charge
+):
+    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path))
+    detector = read_detector("ppc", ["grid_mm=0.25", other_charge])
+    physics = Physics(detector, SimulationSettings(), (named("impurity"),))
+    tilt = detector.impurity_tilt_1e10_per_cm4
+    for factor in (0.9, 1.05):
+        voltage = solve(detector).depletion_V(factor * detector.impurity_scale, tilt)
+        found = known_depletion(physics, (voltage, 1.0))(np.array([np.log(factor)]))
+        assert found[0] == pytest.approx(0, abs=3)  # V
+
+
 def test_what_is_free_and_what_is_not():
     freedom = Freedom.of("auto", "cloud,tilt", ["impurity = 1.0 ± 0.05"])
     names = [nuisance.name for nuisance in freedom.looked_at]

@@ -31,8 +31,8 @@ from cpunet.simulation.superposition import solve
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
-# Step of the tilt (1e10/cm4) for the derivative of the depletion voltage.
-_TILT = 0.01
+# Steps of impurity factor and tilt (1e10/cm4) for the derivatives of the depletion voltage.
+_FACTOR, _TILT = 0.1, 0.01
 
 
 @dataclass(frozen=True)
@@ -233,12 +233,16 @@ def known_depletion(
     superposition, detector = solve(physics.detector), physics.detector
     scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
     at_first = superposition.depletion_V(scale, tilt)
-    with_tilt = (superposition.depletion_V(scale, tilt + _TILT) - at_first) / _TILT
+    # the factor scales neither a tilt nor a surface charge, so the voltage is not proportional
+    scaled = superposition.depletion_V((1 + _FACTOR) * scale, tilt)
+    tilted = superposition.depletion_V(scale, tilt + _TILT)
+    with_factor, with_tilt = (scaled - at_first) / _FACTOR, (tilted - at_first) / _TILT
 
     def known(coordinates: Values) -> Values:
         values = physics.values(coordinates)
+        factor = values.get("impurity_factor", 1.0)
         more = values.get("impurity_tilt_1e10_per_cm4", tilt) - tilt
-        voltage = values.get("impurity_factor", 1.0) * at_first + with_tilt * more
+        voltage = at_first + with_factor * (factor - 1) + with_tilt * more
         return np.array([(voltage - wanted) / error])
 
     return known
