@@ -157,9 +157,11 @@ def test_a_training_tells_what_it_does(files, tmp_path):
 
 
 def test_a_range_of_energies(files, tmp_path):
-    info = train_run(
-        *files, tmp_path / "run", RECIPE, TrainOptions(peak="1500-2200", device="cpu")
-    )
+    monitor = Listening()
+    how = TrainOptions(peak="1500-2200", device="cpu")
+    info = train_run(*files, tmp_path / "run", RECIPE, how, monitor=monitor)
+    told = "warning: SEP, DEP are in the range trained on, and no test of it any more"
+    assert [note for note in monitor.notes if "trained on" in note] == [told]
     assert info["peak"] == "1500-2200"
     assert info["sim"]["used"] == 20
 

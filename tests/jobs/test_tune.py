@@ -18,6 +18,7 @@ from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
 from cpunet.jobs.studies.tuning_study import _is_gone, open_study, this_worker
@@ -102,6 +103,12 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
     lost[:3] = np.nan
     with pytest.raises(CpunetError, match="% of the held-out pulses have no translation"):
         parts.score(Giving(lost, recipe))
+
+
+def test_energies_that_one_side_lacks_end_a_study_before_its_trials(files, tmp_path):
+    measured = write_files(tmp_path, np.repeat(KEV[:1], 90)).data
+    with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of SEP can be used"):
+        fingerprints(files.sim, measured, tiny(), "FEP,SEP", Monitor())
 
 
 @pytest.mark.slow

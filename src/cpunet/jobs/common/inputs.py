@@ -120,6 +120,11 @@ class InputSet:
             "sha256": hashlib.sha256(waveforms.data).hexdigest(),
         }
 
+    def fingerprint(self) -> dict[str, Any]:
+        """Entries of the provenance that identify the pulses used, wherever their file is."""
+        told = self.provenance()
+        return {key: told[key] for key in ("dt_ns", "used", "sha256")}
+
 
 def load_simulated(
     file: InputFile,

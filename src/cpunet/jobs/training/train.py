@@ -87,8 +87,7 @@ def train_run(
             sim_set = load_simulated(sim, recipe, selection, told)
             data_set = load_measured(data, recipe, selection, told)
             require_same_sampling(sim_set, data_set)
-            for note in require_both_sides(sim_set, data_set, selection):
-                told.note(note)
+            require_both_sides(sim_set, data_set, selection)
             for finding in compare_sides(sim_set, data_set, selection):
                 if finding.level != Level.FINE:
                     told.note(f"warning: {finding}")
