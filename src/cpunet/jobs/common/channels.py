@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
+from urllib.parse import quote
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
@@ -38,7 +39,7 @@ def channel_names(tables: list[str]) -> dict[str, str]:
             for part in parts:
                 part.pop(end)
     short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) for part in parts]
-    names = short if len(set(short)) == len(short) else [t.replace("/", "_") for t in tables]
+    names = short if len(set(short)) == len(short) else [quote(t, safe="") for t in tables]
     return dict(zip(names, tables, strict=True))
 
 
