@@ -42,10 +42,11 @@ def test_channels_have_short_names_and_their_own_energies(tmp_path):
 
 
 def test_no_channel_is_lost_whose_name_looks_like_another():
-    tables = ["a b/raw", "a_b/raw", "a/b/raw", "ch1/raw"]
+    tables = ["a b/raw", "a_b/raw", "a/b/raw", "ch1/raw", ""]
     names = channel_names(tables)
     assert list(names.values()) == tables
-    assert not any(set(name) & set("/ ") for name in names)
+    assert all(name and not set(name) & set("/ ") for name in names)
+    assert channel_names([""]) == {"root": ""}
 
 
 def test_a_simulation_serves_all_channels_or_its_own(tmp_path):

@@ -24,6 +24,8 @@ Pair = tuple[InputFile, InputFile]
 def channel_names(tables: list[str]) -> dict[str, str]:
     """Short name of each table: its path without the parts that all paths share at either end.
 
+    A table at the top of its file is called ``root``.
+
     Examples
     --------
     >>> channel_names(["ch1/raw", "ch2/raw"])
@@ -38,8 +40,9 @@ def channel_names(tables: list[str]) -> dict[str, str]:
         while all(len(part) > 1 for part in parts) and len({part[end] for part in parts}) == 1:
             for part in parts:
                 part.pop(end)
-    short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) for part in parts]
-    names = short if len(set(short)) == len(short) else [quote(t, safe="") for t in tables]
+    short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) or "root" for part in parts]
+    unique = len(set(short)) == len(short)
+    names = short if unique else [quote(table or "/", safe="") for table in tables]
     return dict(zip(names, tables, strict=True))
 
 
