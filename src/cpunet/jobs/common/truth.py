@@ -82,7 +82,7 @@ class Responses:
                 chosen = traces[self._index[begin:end] - first].astype(np.float32)
                 finite = finite or bool(np.isfinite(chosen).all(axis=1).any())
                 waiting = np.concatenate([waiting, chosen])
-                if len(waiting) >= size:
+                if len(waiting) > size:  # the last block waits for the check below
                     yield waiting[:size]
                     waiting = waiting[size:]
         if not finite:

@@ -18,6 +18,7 @@ from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.pickles import PickledPulse, as_pulse, entries
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
@@ -71,8 +72,9 @@ def import_weights(
     Raises
     ------
     CpunetError
-        If no generator is given, a file is not a plain state dict or has another
-        architecture, the two generators differ in width, or `out` cannot be written.
+        If no generator is given, `peak` cannot be understood, a file is not a plain state
+        dict or has another architecture, the two generators differ in width, or `out` cannot
+        be written.
     """
     given = {
         "ren": ren,
@@ -87,6 +89,7 @@ def import_weights(
     if not (np.isfinite(dt_ns) and dt_ns > 0):
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
     recipe = load_recipe("paper")
+    parse_selection(peak, recipe.peaks)
     networks: dict[str, nn.Module] = {}
     widths, overrides = set(), []
     for part, path in files.items():
