@@ -62,7 +62,7 @@ class Drawing:
     Parameters
     ----------
     kind
-        Kind of figure, a key of `_DRAW`.
+        Kind of figure, one of `KINDS`.
     values
         Arguments of its function: numbers, text, arrays, and lists and mappings of them.
     """
@@ -285,3 +285,4 @@ _DRAW: Mapping[str, Callable[..., Figure]] = {
     "noise": _draw_noise,
     "losses": loss_curves,
 }
+KINDS = frozenset(_DRAW)

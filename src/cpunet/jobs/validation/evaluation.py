@@ -256,6 +256,12 @@ def _compared(
 ) -> dict[str, Any]:
     """Description of the compared inputs, shown before the scores."""
     fit = info.get("fit") or {}
+    training = (
+        f"recipe {info['recipe']} on {info['peak']}",
+        "" if info["seed"] is None else f"seed {info['seed']}",
+        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses",
+        str(info.get("started", ""))[:10],
+    )
     known = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
@@ -266,9 +272,7 @@ def _compared(
         "simulation": _short(sim.path),
         "data": _short(data.path),
         "run": run.absolute().name,
-        "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
-        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
-        f"{str(info.get('started', ''))[:10]}",
+        "trained": ", ".join(filter(None, training)),
     }
     if fit.get("verdict"):
         compared["fit"] = str(fit["verdict"])

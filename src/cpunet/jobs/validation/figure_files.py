@@ -158,9 +158,7 @@ def _stored(
         return None
     if (folder / STORE).is_file() and sim is None and data is None:
         return read_drawings(folder / STORE)[0]
-    chosen_names(
-        names, figure_names([*read_recipe(folder).peaks, str(read_info(folder)["peak"])])
-    )
+    chosen_names(names, _possible(folder))
     raise CpunetError(
         "simulated and measured pulses are needed; give --sim and --data, or a report"
     )
