@@ -16,7 +16,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
+from cpunet.jobs.common.pool import Link, Outcome, shared_cores, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
@@ -111,8 +111,7 @@ def train_ensemble(
         member = _Member(sim, data, folder, recipe, peak, validate, truth, device)
         left = [seed for seed in range(seeds) if not member.is_done(seed)]
         ensemble.complete({*range(seeds)} - {*left})
-        jobs = max(1, min(jobs or default_jobs(device), len(left)))
-        threads = threads or max(1, cores() // jobs)
+        jobs, threads = shared_cores(jobs, threads, len(left), device)
         _remove_leavings(folder)
         outcomes = work_off(member, left, jobs=jobs, threads=threads, monitor=monitor)
         title = f"Training {len(left)} seeds in {jobs} processes"
