@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import _relaxed
+from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibration_inputs import Freedom, known_depletion
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -65,5 +66,10 @@ def test_what_is_free_and_what_is_not():
     assert names[:2] == ["temperature_K", "impurity_factor"]
     assert not {"cloud_fwhm_mm", "impurity_tilt_1e10_per_cm4", "li_thickness_mm"} & set(names)
     assert freedom.priors == {"impurity_factor": (1.0, 0.05)}
+    with pytest.raises(CpunetError, match=r"impurity_factor can be 0\.001 to 1000"):
+        Freedom.of("auto", "", ["impurity=-1±0.1"])
+    for free, fixed in (("auto", ""), ("auto", "li_thickness"), ("bias", "")):
+        with pytest.raises(CpunetError, match="li_thickness_mm: it stays as simulated"):
+            Freedom.of(free, fixed, ["li_thickness=1±0.1"])
     some = Freedom.of("li_thickness,bias", "bias", [])
     assert [nuisance.name for nuisance in some.looked_at] == ["li_thickness_mm"]

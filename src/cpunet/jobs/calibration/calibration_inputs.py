@@ -60,7 +60,8 @@ class Freedom:
         Raises
         ------
         CpunetError
-            If a parameter is unknown, or a prior is not of the form ``NAME=VALUE±ERROR``.
+            If a parameter is unknown, a prior is not of the form ``NAME=VALUE±ERROR``, its
+            value is not allowed, or it is of a parameter that stays as simulated.
 
         Examples
         --------
@@ -73,7 +74,14 @@ class Freedom:
             chosen = tuple(n for n in chosen if n.name not in stay)
             if not chosen:
                 raise CpunetError(f"--free {free}: all of it is fixed; leave something free")
-        return cls(chosen, stay, dict(_prior(text) for text in given))
+        freedom = cls(chosen, stay, dict(_prior(text) for text in given))
+        without_use = freedom.priors.keys() - {DEPLETION, *(n.name for n in freedom.looked_at)}
+        if without_use:
+            raise CpunetError(
+                f"--prior {min(without_use)}: it stays as simulated; name it in --free, or "
+                "leave out its prior"
+            )
+        return freedom
 
     @property
     def looked_at(self) -> tuple[Nuisance, ...]:
@@ -255,15 +263,21 @@ def _parameters(text: str) -> tuple[Nuisance, ...]:
 
 def _prior(text: str) -> tuple[str, tuple[float, float]]:
     found = _PRIOR.fullmatch(text)
+    expected = f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
+    if found is None:
+        raise CpunetError(expected)
     try:
-        if found is None:
-            raise ValueError
         value, error = float(found[2]), float(found[3])
-        if not (error > 0 and np.isfinite([value, error]).all()):
-            raise ValueError
     except ValueError:
+        raise CpunetError(expected) from None
+    if not (error > 0 and np.isfinite([value, error]).all()):
+        raise CpunetError(expected)
+    if found[1] == DEPLETION:
+        return DEPLETION, (value, error)
+    nuisance = named(found[1])
+    if not nuisance.lowest <= value <= nuisance.highest:
         raise CpunetError(
-            f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
-        ) from None
-    name = found[1] if found else ""
-    return (name if name == DEPLETION else named(name).name), (value, error)
+            f"--prior {text}: {nuisance.name} can be {nuisance.lowest:g} to "
+            f"{nuisance.highest:g}; give a value between"
+        )
+    return nuisance.name, (value, error)

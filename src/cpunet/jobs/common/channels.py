@@ -60,7 +60,7 @@ def channels_of(file: InputFile) -> dict[str, InputFile]:
     if not tables:
         raise CpunetError(
             f"{file.path}: holds no tables of waveforms of which to take all; leave out "
-            f"--table {ALL}"
+            f"--data-table {ALL} or --table {ALL}"
         )
     energy = file.energy or ""
     if ":" in energy and CHANNEL not in energy and len(tables) > 1:
