@@ -40,7 +40,7 @@ class Responses:
         self._index = sim.prepared.index
         with self._readable():
             if path.is_file() and not zipfile.is_zipfile(path):
-                raise ValueError("no archive of arrays")
+                raise ValueError("not an archive of arrays")
             headers = npz_files.headers(path)
         if _NAME not in headers:
             names = ", ".join(headers) or "none"

@@ -177,7 +177,7 @@ def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> di
     ]
     scored = [row for row in rows if row["state"] == "complete"]  # pruned ones also have scores
     if not scored:
-        reason = next((row["reason"] for row in rows if row["reason"]), "none was ended")
+        reason = next((row["reason"] for row in rows if row["reason"]), "none was completed")
         raise CpunetError(f"none of {len(rows)} trials has a score; the first: {reason}")
     own = {key: value_of(recipe, key) for key in space}
     optuna = require_optuna()

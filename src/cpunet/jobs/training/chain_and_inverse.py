@@ -34,7 +34,7 @@ from cpunet.training.run_folder import load_network, read_recipe
 class Sides:
     """Prepared pulses of both sides, the file of the measured ones, and its prepared set.
 
-    Without the latter, `data_set`, remains of earlier pulses are not looked for.
+    Without `data_set`, remains of earlier pulses are not looked for.
     """
 
     sim: Pulses

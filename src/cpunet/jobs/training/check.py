@@ -224,7 +224,7 @@ def _count(one: InputSet, side: str) -> Finding:
 
 
 REMEDIES = {
-    Rejection.SATURATED: "saturated traces tell nothing of the top; choose lower energies",
+    Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
     Rejection.WINDOW_OUTSIDE_RECORD: (
         "the traces end too soon before or after the pulse; write longer ones, or allow more "
         "padding (--set preparation.max_padding_before=…, max_padding_after)"

@@ -143,8 +143,8 @@ def _stored(
     if made_here(folder, REPORT):
         if sim is not None or data is not None:
             raise CpunetError(
-                f"{folder}: is a report, drawn of what it stores; leave out --sim and --data, "
-                "or give the run"
+                f"{folder}: is a report, whose stored results are drawn; leave out --sim and "
+                "--data, or give the run"
             )
         if not (folder / STORE).is_file():
             raise CpunetError(

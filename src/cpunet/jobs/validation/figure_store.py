@@ -69,7 +69,7 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
         if unknown := {one.kind for one in drawings.values()} - KINDS:
             raise ValueError(f"no figures of kind {min(unknown)}")
         if not isinstance(made, dict):
-            raise ValueError("not said of what the figures were made")
+            raise ValueError("the inputs of the figures are missing")
     except (*npz_files.DAMAGED, AttributeError) as error:
         raise CpunetError(
             f"{file}: cannot be read ({npz_files.said(error)}); remove it, and score the run "
