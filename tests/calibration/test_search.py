@@ -49,7 +49,7 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("prior", ["impurity=0±0.1", "impurity=-1±0.1", "temperature=200±1"])
 def test_a_prior_beyond_what_can_be_is_refused(prior):
-    with pytest.raises(CpunetError, match=rf"^--prior {prior}: give a value from "):
+    with pytest.raises(CpunetError, match=rf"^--prior {prior}: .* give a value between"):
         Freedom.of("auto", "", [prior])
     assert Freedom.of("auto", "", ["self_repulsion=0±0.5"]).priors
 
@@ -80,11 +80,32 @@ def test_after_the_last_round_nothing_is_simulated(monkeypatch):
     assert len(moved) == ROUNDS - 1
 
 
+@pytest.mark.parametrize(
+    "other_charge", ["impurity_tilt_1e10_per_cm4=0.1", "surface_charge_1e10_per_cm2=0.1"]
+)
+def test_scaled_impurities_keep_their_tilt_and_the_surface_charge(
+    tmp_path, monkeypatch, other_charge
+):
+    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path))
+    detector = read_detector("ppc", ["grid_mm=0.25", other_charge])
+    physics = Physics(detector, SimulationSettings(), (named("impurity"),))
+    tilt = detector.impurity_tilt_1e10_per_cm4
+    for factor in (0.9, 1.05):
+        voltage = solve(detector).depletion_V(factor * detector.impurity_scale, tilt)
+        found = known_depletion(physics, (voltage, 1.0))(np.array([np.log(factor)]))
+        assert found[0] == pytest.approx(0, abs=3)  # V
+
+
 def test_what_is_free_and_what_is_not():
     freedom = Freedom.of("auto", "cloud,tilt", ["impurity = 1.0 ± 0.05"])
     names = [nuisance.name for nuisance in freedom.looked_at]
     assert names[:2] == ["temperature_K", "impurity_factor"]
     assert not {"cloud_fwhm_mm", "impurity_tilt_1e10_per_cm4", "li_thickness_mm"} & set(names)
     assert freedom.priors == {"impurity_factor": (1.0, 0.05)}
+    with pytest.raises(CpunetError, match=r"impurity_factor can be 0\.001 to 1000"):
+        Freedom.of("auto", "", ["impurity=-1±0.1"])
+    for free, fixed in (("auto", ""), ("auto", "li_thickness"), ("bias", "")):
+        with pytest.raises(CpunetError, match="li_thickness_mm: it stays as simulated"):
+            Freedom.of(free, fixed, ["li_thickness=1±0.1"])
     some = Freedom.of("li_thickness,bias", "bias", [])
     assert [nuisance.name for nuisance in some.looked_at] == ["li_thickness_mm"]

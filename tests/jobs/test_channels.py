@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.channels import channels_of, one_by_one, own_folder, paired
+from cpunet.jobs.common.channels import (
+    channel_names,
+    channels_of,
+    one_by_one,
+    own_folder,
+    paired,
+)
 from cpunet.jobs.common.inputs import InputFile
 
 
@@ -33,6 +39,14 @@ def test_channels_have_short_names_and_their_own_energies(tmp_path):
     np.save(tmp_path / "raw.npy", np.zeros((3, 50)))
     with pytest.raises(CpunetError, match="no tables of waveforms"):
         channels_of(InputFile(tmp_path / "raw.npy", "all"))
+
+
+def test_no_channel_is_lost_whose_name_looks_like_another():
+    tables = ["a b/raw", "a_b/raw", "a/b/raw", "ch1/raw", ""]
+    names = channel_names(tables)
+    assert list(names.values()) == tables
+    assert all(name and not set(name) & set("/ ") for name in names)
+    assert channel_names([""]) == {"root": ""}
 
 
 def test_a_simulation_serves_all_channels_or_its_own(tmp_path):

@@ -134,6 +134,26 @@ def test_going_on_keeps_what_is_finished_and_records_what_fails(files, made, tmp
         train_ensemble(*files, folder, other, device="cpu", resume=True)
 
 
+@pytest.mark.parametrize("record", [None, {"state": "failed", "reason": "no truth"}])
+def test_a_finished_seed_is_counted_whatever_was_recorded(
+    files, made, tmp_path, no_pool, record
+):
+    """The program was stopped after the seed and before its record, or its score had failed."""
+    folder = Path(shutil.copytree(made.folder, tmp_path / "ens"))
+    told = json.loads((folder / "ensemble.json").read_text())
+    told["seeds"] = {} if record is None else {"0": record, "1": record}
+    (folder / "ensemble.json").write_text(json.dumps(told))
+    if record is not None:
+        (folder / "seed_001" / "metrics.json").unlink()
+    again = train_ensemble(
+        *files, folder, RECIPE, seeds=2, device="cpu", resume=True, validate=record is None
+    )
+    assert [entry["state"] for entry in again["seeds"].values()] == ["trained", "trained"]
+    assert again["seeds"]["0"]["iou"] == made.told["seeds"]["0"]["iou"]
+    assert again["seeds"]["1"]["seconds"] == made.told["seeds"]["1"]["seconds"]
+    assert again["failure_rate"] == len(again["poor"]) / 2
+
+
 def test_no_folder_is_overwritten_by_mistake(files, made, tmp_path):
     with pytest.raises(CpunetError, match="exists already; continue with --resume"):
         train_ensemble(*files, made.folder, RECIPE, device="cpu")

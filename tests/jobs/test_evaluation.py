@@ -13,11 +13,12 @@ from cpunet.analysis.paired import paired_scores
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.validation.drawings import drawings, figure_names
+from cpunet.jobs.validation.drawings import Drawing, drawings, figure_names
 from cpunet.jobs.validation.energy_ranges import validation_selection
-from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
+from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, _compared, evaluate
 from cpunet.jobs.validation.figure_store import made_of, read_drawings, write_drawings
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
@@ -191,6 +192,20 @@ def test_a_damaged_store_is_one_line(tmp_path, content) -> None:
     (tmp_path / "figures.npz").write_bytes(content)
     with pytest.raises(CpunetError, match=r"cannot be read .* score the run again"):
         read_drawings(tmp_path / "figures.npz")
+
+
+def test_a_store_with_figures_of_an_unknown_kind_is_one_line(tmp_path) -> None:
+    write_drawings(tmp_path / "figures.npz", {"SEP halo": Drawing("halo", {})}, {"seed": 1})
+    with pytest.raises(CpunetError, match=r"no figures of kind halo.* score the run again"):
+        read_drawings(tmp_path / "figures.npz")
+
+
+def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole) -> None:
+    info = {"recipe": "paper", "peak": "FEP", "seed": None, "sim": UNKNOWN, "data": UNKNOWN}
+    assert _compared(Path("run"), info, whole.sim, whole.data)["trained"] == (
+        "recipe paper on FEP, an unknown number of simulated and an unknown number of measured "
+        "pulses"
+    )
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:

@@ -110,7 +110,7 @@ def test_sets_of_different_sampling(sim_set, files):
 def test_devices():
     assert resolve_device("cpu") == "cpu"
     assert resolve_device("auto") in ("cpu", "cuda")
-    for name in ("gpu", "", "CPU", "mps"):
+    for name in ("gpu", "", "CPU", "mps", "cudas", "cuda:-1", "cuda:"):
         with pytest.raises(CpunetError, match="is not known; use cpu, cuda or auto"):
             resolve_device(name)
 
@@ -120,6 +120,14 @@ def test_devices():
 def test_a_gpu_that_is_not_there(name):
     with pytest.raises(CpunetError, match="no GPU was found; use --device cpu"):
         resolve_device(name)
+
+
+def test_a_gpu_beyond_the_last(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert resolve_device("cuda:1") == "cuda:1"
+    with pytest.raises(CpunetError, match="'cuda:2': the last of 2 GPUs is cuda:1"):
+        resolve_device("cuda:2")
 
 
 def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
@@ -157,9 +165,11 @@ def test_a_training_tells_what_it_does(files, tmp_path):
 
 
 def test_a_range_of_energies(files, tmp_path):
-    info = train_run(
-        *files, tmp_path / "run", RECIPE, TrainOptions(peak="1500-2200", device="cpu")
-    )
+    monitor = Listening()
+    how = TrainOptions(peak="1500-2200", device="cpu")
+    info = train_run(*files, tmp_path / "run", RECIPE, how, monitor=monitor)
+    told = "warning: SEP, DEP are in the range trained on, and no test of it any more"
+    assert [note for note in monitor.notes if "trained on" in note] == [told]
     assert info["peak"] == "1500-2200"
     assert info["sim"]["used"] == 20
 

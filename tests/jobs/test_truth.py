@@ -29,6 +29,15 @@ def test_responses_are_those_of_the_pulses_in_use_whatever_the_block(tmp_path, s
     np.testing.assert_array_equal(np.concatenate(blocks), response[used])
 
 
+@pytest.mark.parametrize("n", [3, 4])
+def test_a_truth_without_any_response_is_refused_with_its_last_block(tmp_path, n):
+    np.savez(tmp_path / "truth.npz", response=np.full((n, 5), np.nan))
+    blocks = Responses(tmp_path / "truth.npz", prepared(np.arange(n), n)).blocks(2)
+    next(blocks)
+    with pytest.raises(CpunetError, match="no response is finite"):
+        next(blocks)
+
+
 def test_responses_that_cannot_be_read(tmp_path):
     path = tmp_path / "truth.npz"
     np.savez(path, response=np.asfortranarray(np.ones((20, 3))))

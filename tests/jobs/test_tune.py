@@ -18,9 +18,17 @@ from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
-from cpunet.jobs.studies.tuning_study import _is_gone, open_study, this_worker
+from cpunet.jobs.studies.tuning_study import (
+    _is_gone,
+    found,
+    open_study,
+    queue_first,
+    suggested,
+    this_worker,
+)
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -104,6 +112,12 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         parts.score(Giving(lost, recipe))
 
 
+def test_energies_that_one_side_lacks_end_a_study_before_its_trials(files, tmp_path):
+    measured = write_files(tmp_path, np.repeat(KEV[:1], 90)).data
+    with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of SEP can be used"):
+        fingerprints(files.sim, measured, tiny(), "FEP,SEP", Monitor())
+
+
 @pytest.mark.slow
 def test_scores_on_the_way_do_not_change_the_training(files):
     recipe = tiny("training.iterations=6")
@@ -144,6 +158,20 @@ def test_what_cannot_be_searched_is_told_by_its_key(space, words):
         search_space(load_recipe("fast", [f"search={space}"]))
     assert words in str(told.value)
     assert "\n" not in str(told.value)
+
+
+def test_whole_numbers_can_be_choices_of_a_real_setting(tmp_path):
+    space = "search={training.clip: {choices: [7, 4]}, training.ridge: {low: 0.01, high: 0.2}}"
+    recipe = load_recipe("fast", [space, "training.clip=4"])
+    study = open_study(tmp_path, recipe)
+    queue_first(study, recipe, search_space(recipe))
+    trial = study.ask()
+    for key, config in search_space(recipe).items():
+        assert suggested(trial, key, recipe, config) == value_of(recipe, key)
+    study.tell(trial, 1.5)
+    told = found(study, recipe, search_space(recipe))
+    assert told["first"] == 1.5
+    assert told["importances"] == {}  # one trial says nothing of them
 
 
 @pytest.mark.parametrize("name", ["fast", "small", "paper"])

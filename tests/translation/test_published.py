@@ -157,6 +157,12 @@ def test_one_generator_is_enough(files, tmp_path):
         IREN.load(tmp_path / "run")
 
 
+def test_energies_that_no_validation_would_understand_are_refused(files, tmp_path):
+    with pytest.raises(CpunetError, match="'FPE' is no known peak"):
+        import_weights(tmp_path / "run", ren=files[0], peak="FPE")
+    assert not (tmp_path / "run").exists()
+
+
 def discriminator(hidden: int = 64) -> dict[str, Tensor]:
     both = 2 * hidden
     state = {"embedding.weight": torch.rand(1000, 64)}

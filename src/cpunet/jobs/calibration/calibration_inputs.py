@@ -31,8 +31,8 @@ from cpunet.simulation.superposition import solve
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
-# Step of the tilt (1e10/cm4) for the derivative of the depletion voltage.
-_TILT = 0.01
+# Steps of impurity factor and tilt (1e10/cm4) for the derivatives of the depletion voltage.
+_FACTOR, _TILT = 0.1, 0.01
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ class Freedom:
         Raises
         ------
         CpunetError
-            If a parameter is unknown, or a prior is not of the form ``NAME=VALUE±ERROR``.
+            If a parameter is unknown, a prior is not of the form ``NAME=VALUE±ERROR``, its
+            value is not allowed, or it is of a parameter that stays as simulated.
 
         Examples
         --------
@@ -73,7 +74,14 @@ class Freedom:
             chosen = tuple(n for n in chosen if n.name not in stay)
             if not chosen:
                 raise CpunetError(f"--free {free}: all of it is fixed; leave something free")
-        return cls(chosen, stay, dict(_prior(text) for text in given))
+        freedom = cls(chosen, stay, dict(_prior(text) for text in given))
+        without_use = freedom.priors.keys() - {DEPLETION, *(n.name for n in freedom.looked_at)}
+        if without_use:
+            raise CpunetError(
+                f"--prior {min(without_use)}: it stays as simulated; name it in --free, or "
+                "leave out its prior"
+            )
+        return freedom
 
     @property
     def looked_at(self) -> tuple[Nuisance, ...]:
@@ -233,12 +241,16 @@ def known_depletion(
     superposition, detector = solve(physics.detector), physics.detector
     scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
     at_first = superposition.depletion_V(scale, tilt)
-    with_tilt = (superposition.depletion_V(scale, tilt + _TILT) - at_first) / _TILT
+    # the factor scales neither a tilt nor a surface charge, so the voltage is not proportional
+    scaled = superposition.depletion_V((1 + _FACTOR) * scale, tilt)
+    tilted = superposition.depletion_V(scale, tilt + _TILT)
+    with_factor, with_tilt = (scaled - at_first) / _FACTOR, (tilted - at_first) / _TILT
 
     def known(coordinates: Values) -> Values:
         values = physics.values(coordinates)
+        factor = values.get("impurity_factor", 1.0)
         more = values.get("impurity_tilt_1e10_per_cm4", tilt) - tilt
-        voltage = values.get("impurity_factor", 1.0) * at_first + with_tilt * more
+        voltage = at_first + with_factor * (factor - 1) + with_tilt * more
         return np.array([(voltage - wanted) / error])
 
     return known
@@ -251,22 +263,21 @@ def _parameters(text: str) -> tuple[Nuisance, ...]:
 
 def _prior(text: str) -> tuple[str, tuple[float, float]]:
     found = _PRIOR.fullmatch(text)
+    expected = f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
+    if found is None:
+        raise CpunetError(expected)
     try:
-        if found is None:
-            raise ValueError
         value, error = float(found[2]), float(found[3])
-        if not (error > 0 and np.isfinite([value, error]).all()):
-            raise ValueError
     except ValueError:
-        raise CpunetError(
-            f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
-        ) from None
-    name = found[1] if found else ""
-    if name == DEPLETION:
-        return name, (value, error)
-    nuisance = named(name)
+        raise CpunetError(expected) from None
+    if not (error > 0 and np.isfinite([value, error]).all()):
+        raise CpunetError(expected)
+    if found[1] == DEPLETION:
+        return DEPLETION, (value, error)
+    nuisance = named(found[1])
     if not nuisance.lowest <= value <= nuisance.highest:
         raise CpunetError(
-            f"--prior {text}: give a value from {nuisance.lowest:g} to {nuisance.highest:g}"
+            f"--prior {text}: {nuisance.name} can be {nuisance.lowest:g} to "
+            f"{nuisance.highest:g}; give a value between"
         )
     return nuisance.name, (value, error)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
+from urllib.parse import quote
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
@@ -23,6 +24,8 @@ Pair = tuple[InputFile, InputFile]
 def channel_names(tables: list[str]) -> dict[str, str]:
     """Short name of each table: its path without the parts that all paths share at either end.
 
+    A table at the top of its file is called ``root``.
+
     Examples
     --------
     >>> channel_names(["ch1/raw", "ch2/raw"])
@@ -37,8 +40,9 @@ def channel_names(tables: list[str]) -> dict[str, str]:
         while all(len(part) > 1 for part in parts) and len({part[end] for part in parts}) == 1:
             for part in parts:
                 part.pop(end)
-    short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) for part in parts]
-    names = short if len(set(short)) == len(short) else [t.replace("/", "_") for t in tables]
+    short = [re.sub(r"[^\w.-]+", "_", "/".join(part)) or "root" for part in parts]
+    unique = len(set(short)) == len(short)
+    names = short if unique else [quote(table or "/", safe="") for table in tables]
     return dict(zip(names, tables, strict=True))
 
 
@@ -56,7 +60,7 @@ def channels_of(file: InputFile) -> dict[str, InputFile]:
     if not tables:
         raise CpunetError(
             f"{file.path}: holds no tables of waveforms of which to take all; leave out "
-            f"--table {ALL}"
+            f"--data-table {ALL} or --table {ALL}"
         )
     energy = file.energy or ""
     if ":" in energy and CHANNEL not in energy and len(tables) > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 from collections.abc import Iterator
@@ -16,10 +17,14 @@ def resolve_device(device: str) -> str:
     """Resolve ``"auto"`` to a device; raise a `CpunetError` if a device is missing."""
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise CpunetError("no GPU was found; use --device cpu or install a CUDA build of torch")
-    if device != "cpu" and not device.startswith("cuda"):
+    known = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
+    if known is None:
         raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise CpunetError("no GPU was found; use --device cpu or install a CUDA build of torch")
+    if known[1] and int(known[1]) >= torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        raise CpunetError(f"device {device!r}: the last of {count} GPUs is cuda:{count - 1}")
     return device
 
 

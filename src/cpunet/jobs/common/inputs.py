@@ -80,13 +80,7 @@ class InputFile:
 
     def open(self) -> PulseSource:
         """Open the file."""
-        return open_pulses(
-            self.path,
-            table=self.table,
-            energy=self.energy,
-            kev_per_adc=self.kev_per_adc,
-            dt_ns=self.dt_ns,
-        )
+        return open_pulses(self.path, **self.options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +114,11 @@ class InputSet:
             "sha256": hashlib.sha256(waveforms.data).hexdigest(),
         }
 
+    def fingerprint(self) -> dict[str, Any]:
+        """Entries of the provenance that identify the pulses used, wherever their file is."""
+        told = self.provenance()
+        return {key: told[key] for key in ("dt_ns", "used", "sha256")}
+
 
 def load_simulated(
     file: InputFile,
@@ -130,7 +129,7 @@ def load_simulated(
     most: int | None = None,
 ) -> InputSet:
     """Read and prepare the selected simulated pulses of a file, or a sample of `most`."""
-    return _load(file, recipe, selection, monitor, measured=False, most=most)
+    return _load(file, "simulated", recipe, selection, monitor, most)
 
 
 def load_measured(
@@ -142,7 +141,7 @@ def load_measured(
     most: int | None = None,
 ) -> InputSet:
     """Read, prepare and cut the selected measured pulses of a file, or a sample of `most`."""
-    return _load(file, recipe, selection, monitor, measured=True, most=most)
+    return _load(file, "measured", recipe, selection, monitor, most)
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
@@ -193,15 +192,13 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
 
 def _load(
     file: InputFile,
+    side: Kind,
     recipe: Recipe,
     selection: EnergySelection,
     monitor: Monitor,
-    *,
-    measured: bool,
     most: int | None,
 ) -> InputSet:
     source = file.open()
-    side: Kind = "measured" if measured else "simulated"
     require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
     seen: list[Energies] = []
 
@@ -224,14 +221,14 @@ def _load(
             hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
             raise CpunetError(f"{error}{hint}") from error
     cuts = None
-    if measured:
+    if side == "measured":
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
             )
-    if not measured and _decays(prepared, recipe):
+    elif _decays(prepared, recipe):
         monitor.note(
             f"warning: {file.path.name}: these pulses decay; "
             "are they simulated ones, without electronics?"

@@ -65,9 +65,7 @@ def noise_of_traces(
     CpunetError
         If the baselines are too few or too short.
     """
-    block = next(iter(data_file.open().blocks(NOISE_TRACES)), None)
-    if block is None:
-        raise CpunetError(f"{data_file.path}: holds no traces to measure the noise from")
+    block = next(data_file.open().blocks(NOISE_TRACES))
     known = np.isfinite(block.energy_kev) & (block.energy_kev > 0)
     if remains is not None and remains.law is not None:
         empty = known & remains.empty(block)

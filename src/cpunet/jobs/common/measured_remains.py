@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,8 @@ class FoundRemains(NamedTuple):
     drawn
         Distribution to draw from; None if the existence of remains is not certain.
     told
-        Entry of ``run.json``; None if they were not looked for.
+        Entry of ``run.json``: what was measured, even if the existence of remains is not
+        certain; None if they were not looked for.
     """
 
     measured: Remains | None
@@ -56,9 +58,9 @@ def find_remains(
     found, reason = measured_remains(data_file, config)
     if found is None:
         monitor.note(f"remains of earlier pulses are not looked for: {reason}")
-        return FoundRemains(None, None, told_of(None, None, reason))
+        return FoundRemains(None, None, {"missing": reason})
     drawn = drawn_like(found, data_file, data, config)
-    told = told_of(found, drawn, None)
+    told = found.describe() | {"sizes": _sizes(found), "drawn": drawn.describe()}
     if found.law is None:
         return FoundRemains(found, None, told)
     tenth = told["percent_above"]["10_kev"]["law"]
@@ -120,22 +122,10 @@ def drawn_like(
 
 def _rows(data_file: InputFile, data: InputSet) -> Iterator[Pulses]:
     """Raw traces of the pulses in use, block by block."""
-    first = 0
-    for number, block in enumerate(data_file.open().blocks(BLOCK)):
-        index = data.prepared.index
+    first, index = 0, data.prepared.index
+    for block in islice(data_file.open().blocks(BLOCK), MAX_BLOCKS):
         yield block[index[(index >= first) & (index < first + len(block))] - first]
         first += len(block)
-        if number + 1 >= MAX_BLOCKS:
-            return
-
-
-def told_of(
-    remains: Remains | None, drawn: DrawnRemains | None, reason: str | None
-) -> dict[str, Any]:
-    """Entry of ``run.json`` on remains; `drawn` can exist even if no remains are certain."""
-    if remains is None or drawn is None:
-        return {"missing": reason}
-    return remains.describe() | {"sizes": _sizes(remains), "drawn": drawn.describe()}
 
 
 def _sizes(remains: Remains) -> dict[str, list[float]]:

@@ -103,9 +103,16 @@ Work = Callable[[Any], Any]
 Begin = Callable[[Link], Work]
 
 
-def default_jobs(device: str) -> int:
-    """Default number of processes: one per core, or one on a GPU."""
-    return 1 if device.startswith("cuda") else cores()
+def shared_cores(
+    jobs: int | None, threads: int | None, items: int, device: str
+) -> tuple[int, int]:
+    """Numbers of processes for some items, and of CPU threads of each.
+
+    By default there is one process per core, or one on a GPU, and they share the cores.
+    """
+    jobs = jobs or (1 if device.startswith("cuda") else cores())
+    jobs = max(1, min(jobs, items))
+    return jobs, threads or max(1, cores() // jobs)
 
 
 def cores() -> int:

@@ -40,7 +40,7 @@ class Responses:
         self._index = sim.prepared.index
         with self._readable():
             if path.is_file() and not zipfile.is_zipfile(path):
-                raise ValueError("no archive of arrays")
+                raise ValueError("not an archive of arrays")
             headers = npz_files.headers(path)
         if _NAME not in headers:
             names = ", ".join(headers) or "none"
@@ -82,7 +82,7 @@ class Responses:
                 chosen = traces[self._index[begin:end] - first].astype(np.float32)
                 finite = finite or bool(np.isfinite(chosen).all(axis=1).any())
                 waiting = np.concatenate([waiting, chosen])
-                if len(waiting) >= size:
+                if len(waiting) > size:  # the last block waits for the check below
                     yield waiting[:size]
                     waiting = waiting[size:]
         if not finite:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
+from cpunet.jobs.common.pool import Link, Outcome, shared_cores, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
@@ -33,6 +33,7 @@ from cpunet.training.ensemble_folder import (
     write_json,
 )
 from cpunet.training.run_folder import INFO, read_info
+from cpunet.training.unfinished import unfinished_name
 
 QUIET = Monitor()
 SEEDS = 20
@@ -109,8 +110,8 @@ def train_ensemble(
         ensemble = _Ensemble(folder, begun_with)
         member = _Member(sim, data, folder, recipe, peak, validate, truth, device)
         left = [seed for seed in range(seeds) if not member.is_done(seed)]
-        jobs = max(1, min(jobs or default_jobs(device), len(left)))
-        threads = threads or max(1, cores() // jobs)
+        ensemble.complete({*range(seeds)} - {*left})
+        jobs, threads = shared_cores(jobs, threads, len(left), device)
         _remove_leavings(folder)
         outcomes = work_off(member, left, jobs=jobs, threads=threads, monitor=monitor)
         title = f"Training {len(left)} seeds in {jobs} processes"
@@ -144,6 +145,12 @@ class _Ensemble:
             entry = {"state": TRAINED} | outcome.result
         self.content["seeds"][str(outcome.item)] = entry
         self._write()
+
+    def complete(self, finished: Iterable[int]) -> None:
+        """Record finished seeds that are not recorded, since the program was stopped before."""
+        for seed in finished:
+            if str(seed) not in self.content["seeds"]:
+                self.add(Outcome(seed, _results(member_folder(self.folder, seed))))
 
     def finish(self) -> dict[str, Any]:
         """Combine the scores; return the content of ``ensemble.json``."""
@@ -201,13 +208,15 @@ class _Member:
         run = member_folder(self.folder, seed)
         if not (run / INFO).is_file():
             self._train(run, seed, link)
-        told = {"seconds": read_info(run)["seconds"]}
+        scoring = {}
         if self.validate and not (run / METRICS).is_file():
-            told |= self._score(run)
-        return told
+            clock = time.perf_counter()
+            self._score(run)
+            scoring = {"seconds_scoring": round(time.perf_counter() - clock, 1)}
+        return scoring | _results(run)
 
     def _train(self, run: Path, seed: int, link: Link) -> None:
-        begun = run.with_name(f"{run.name}.unfinished").exists()
+        begun = unfinished_name(run).exists()
         with link.stoppable() as stop:
             train_run(
                 self.sim,
@@ -224,27 +233,28 @@ class _Member:
                 monitor=_Forwarding(link, seed),
             )
 
-    def _score(self, run: Path) -> dict[str, Any]:
+    def _score(self, run: Path) -> None:
         # takes seconds to import in each process: only if needed
         from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 
-        clock = time.perf_counter()
-        metrics = evaluate(
-            run,
-            self.sim,
-            self.data,
-            # the same noise and bootstraps for all: they differ only in the training
-            ValidateOptions(self.truth, baselines=False, seed=0, device=self.device),
-            QUIET,
-        ).metrics
+        # the same noise and bootstraps for all: they differ only in the training
+        how = ValidateOptions(self.truth, baselines=False, seed=0, device=self.device)
+        metrics = evaluate(run, self.sim, self.data, how, QUIET).metrics
         write_json(run / METRICS, metrics)
-        scores = {
+
+
+def _results(run: Path) -> dict[str, Any]:
+    """Time of the training and, if the seed was scored, IoU by peak and parameter."""
+    results: dict[str, Any] = {"seconds": read_info(run)["seconds"]}
+    metrics = read_json(run / METRICS)
+    if metrics is not None:
+        results["iou"] = {
             peak: {
                 name: found["iou"].get("ren") for name, found in of_peak["parameters"].items()
             }
             for peak, of_peak in metrics["peaks"].items()
         }
-        return {"seconds_scoring": round(time.perf_counter() - clock, 1), "iou": scores}
+    return results
 
 
 class _Forwarding(Monitor):

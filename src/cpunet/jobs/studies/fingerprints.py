@@ -6,17 +6,15 @@ from typing import Any
 
 from cpunet.jobs.common.inputs import (
     InputFile,
-    InputSet,
     load_measured,
     load_simulated,
+    require_both_sides,
     require_same_sampling,
 )
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
-
-_TOLD = ("dt_ns", "used", "sha256")  # not the name: a file can be moved
 
 
 def fingerprints(
@@ -33,14 +31,9 @@ def fingerprints(
         If the input cannot be used.
     """
     selection = parse_selection(peak, recipe.peaks)
-    sides: dict[str, InputSet] = {
-        "simulation": load_simulated(sim, recipe, selection, monitor),
-        "data": load_measured(data, recipe, selection, monitor),
-    }
-    require_same_sampling(sides["simulation"], sides["data"])
-    all_parameters(sides["data"].prepared.pulses[:2], recipe.preparation, recipe.scores)
-    found = {}
-    for side, pulses in sides.items():
-        provenance = pulses.provenance()
-        found[side] = {key: provenance[key] for key in _TOLD}
-    return found
+    simulated = load_simulated(sim, recipe, selection, monitor)
+    measured = load_measured(data, recipe, selection, monitor)
+    require_same_sampling(simulated, measured)
+    require_both_sides(simulated, measured, selection)
+    all_parameters(measured.prepared.pulses[:2], recipe.preparation, recipe.scores)
+    return {"simulation": simulated.fingerprint(), "data": measured.fingerprint()}

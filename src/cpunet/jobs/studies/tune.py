@@ -22,7 +22,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.common.pool import Link, Outcome, cores, default_jobs, work_off
+from cpunet.jobs.common.pool import Link, Outcome, shared_cores, work_off
 from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tuning_study import (
@@ -130,9 +130,8 @@ def tune_recipe(
         study = open_study(folder, recipe)
         queue_first(study, recipe, space)
         left = range(max(0, trials - len(counted(study))))
-        jobs = max(1, min(jobs or default_jobs(device), len(left)))
+        jobs, threads = shared_cores(jobs, threads, len(left), device)
         tuner = _Tuner(sim, data, folder, recipe, peak, seed, device, trials)
-        threads = threads or max(1, cores() // jobs)
         outcomes = work_off(tuner, left, jobs=jobs, threads=threads, monitor=monitor)
         title = f"Trials in {jobs} processes"
         with monitor.stage(title, len(left)) as advance, closing(outcomes):

@@ -149,7 +149,11 @@ def suggested(trial: Trial, key: str, recipe: Recipe, config: SearchConfig) -> A
 
 def _labelled(values: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
     """Values in the form of the journal: choices as text, since they can be lists."""
-    return {k: v if space[k].choices is None else json.dumps(v) for k, v in values.items()}
+    labelled = dict(values)
+    for key, config in space.items():
+        if config.choices is not None:  # a setting of 4.0 is the choice 4 of the search space
+            labelled[key] = json.dumps(config.choices[config.choices.index(values[key])])
+    return labelled
 
 
 def _plain(params: Mapping[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
@@ -177,15 +181,16 @@ def found(study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> di
     ]
     scored = [row for row in rows if row["state"] == "complete"]  # pruned ones also have scores
     if not scored:
-        reason = next((row["reason"] for row in rows if row["reason"]), "none was ended")
+        reason = next((row["reason"] for row in rows if row["reason"]), "none was completed")
         raise CpunetError(f"none of {len(rows)} trials has a score; the first: {reason}")
     own = {key: value_of(recipe, key) for key in space}
     optuna = require_optuna()
     importances: dict[str, float] = {}
-    with suppress(ValueError, RuntimeError):  # too few trials, or all equal
-        importances = optuna.importance.get_param_importances(
-            study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
-        )
+    if len(scored) > 1:
+        with suppress(ValueError, RuntimeError):  # too few trials, or all equal
+            importances = optuna.importance.get_param_importances(
+                study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
+            )
     return {
         "best": min(scored, key=lambda row: row["score"]),
         "first": next((row["score"] for row in scored if row["values"] == own), None),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
@@ -23,7 +25,7 @@ from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.residual import fit_residual
-from cpunet.training.response_fit import fit_response
+from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run_folder import load_network, read_recipe
 
@@ -32,7 +34,7 @@ from cpunet.training.run_folder import load_network, read_recipe
 class Sides:
     """Prepared pulses of both sides, the file of the measured ones, and its prepared set.
 
-    Without the latter, `data_set`, remains of earlier pulses are not looked for.
+    Without `data_set`, remains of earlier pulses are not looked for.
     """
 
     sim: Pulses
@@ -127,66 +129,68 @@ def match(
         remains=drawn,
         listener=listen,
     )
-    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
-    monitor.note(f"compared (simulated/measured pulses): {compared}")
-    beside = (
-        len(sides.sim) - sum(n for n, _ in fit.bands.values()),
-        len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
-    )
-    if any(beside):
-        monitor.note(
-            f"in no band, since one side has too few of their energies: {beside[0]} simulated "
-            f"and {beside[1]} measured pulses"
-        )
-    monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
-    stretches = recipe.matching.training.drift_terms > 0
-    causes = diagnosis(fit.pulls, stretches=stretches) if fit.poor else []
-    for number, cause in enumerate(causes, 1):
-        monitor.note(f"  {number}. {cause}")
-    longer = stretched(response.describe())
-    for found in beyond(response.describe()) + longer:
-        monitor.note(f"warning: {found}")
+    told = _described(fit, response, noise, sides, recipe)
+    _note(fit, told, monitor)
+    if told_of_remains is not None:
+        told["remains"] = told_of_remains
     recipe = _with_config(recipe, response.config)
-    ren = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
-    ren.response = response
-    ren.set_noise(noise)
-    ren.remains = drawn
-    chain, parts, more = ren, {}, {}
+    chain = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
+    chain.response = response
+    chain.set_noise(noise)
+    chain.remains = drawn
+    ren, parts = chain, {}
+    windows, energy_kev = sides.sim.waveforms, sides.sim.energy_kev
     if isinstance(recipe.generator, HybridConfig):
         residual, kept = fit_residual(
-            chain,
-            sides.sim.waveforms,
-            sides.data.waveforms,
-            sides.sim.energy_kev,
-            recipe,
-            seed=seed,
+            chain, windows, sides.data.waveforms, energy_kev, recipe, seed=seed
         )
         if not kept.kept:
             monitor.note("the residual does not help held-out pulses and is left out")
         # stored beside the chain, which stays in its usual place for readers of chains
-        ren, parts, more = (
-            HybridGenerator(chain, residual),
-            {"residual": residual},
-            asdict(kept),
-        )
-    iren = fit_inverse(ren, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
-    told = {
-        "parameters": response.describe(),
+        ren, parts = HybridGenerator(chain, residual), {"residual": residual}
+        told["residual"] = asdict(kept)
+    iren = fit_inverse(ren, windows, energy_kev, recipe, seed=seed)
+    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
+
+
+def _described(
+    fit: Fit, response: ElectronicsResponse, noise: BaselineNoise, sides: Sides, recipe: Recipe
+) -> dict[str, Any]:
+    """Entry on the fit for ``run.json``."""
+    parameters = response.describe()
+    stretches = recipe.matching.training.drift_terms > 0
+    return {
+        "parameters": parameters,
         **asdict(fit),
-        "verdict": "; ".join([fit.verdict, *longer]),
-        "causes": causes,
-        "in_no_band": {"sim": beside[0], "data": beside[1]},
+        "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
+        "causes": diagnosis(fit.pulls, stretches=stretches) if fit.poor else [],
+        "in_no_band": {
+            "sim": len(sides.sim) - sum(n for n, _ in fit.bands.values()),
+            "data": len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+        },
         "noise": {
             "baselines": noise.n_baselines,
             "rms": noise.rms,
             "rms_error": noise.rms_error,
         },
     }
-    if told_of_remains is not None:
-        told["remains"] = told_of_remains
-    if more:
-        told["residual"] = more
-    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
+
+
+def _note(fit: Fit, told: Mapping[str, Any], monitor: Monitor) -> None:
+    """Note which pulses were compared, how well the fit describes them, and why not."""
+    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+    monitor.note(f"compared (simulated/measured pulses): {compared}")
+    beside = told["in_no_band"]
+    if any(beside.values()):
+        monitor.note(
+            f"in no band, since one side has too few of their energies: {beside['sim']} "
+            f"simulated and {beside['data']} measured pulses"
+        )
+    monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
+    for number, cause in enumerate(told["causes"], 1):
+        monitor.note(f"  {number}. {cause}")
+    for found in beyond(told["parameters"]) + stretched(told["parameters"]):
+        monitor.note(f"warning: {found}")
 
 
 def remains_of_sides(sides: Sides, recipe: Recipe, monitor: Monitor) -> FoundRemains:

@@ -8,9 +8,9 @@ equally), and current amplitudes (a readout only makes pulses slower).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
@@ -91,7 +91,7 @@ class Checked:
     @classmethod
     def refused(cls, side: str, error: CpunetError) -> Checked:
         """The finding that one side, ``"sim"`` or ``"data"``, cannot be read."""
-        return cls([_refusal(side, str(error))])
+        return cls([_refusal(f"{side} pulses", error)])
 
     @property
     def level(self) -> Level:
@@ -129,7 +129,7 @@ def check(
         try:
             sets[side] = load(file, recipe, selection, progress)
         except CpunetError as error:
-            findings.append(_refusal(side, str(error)))
+            findings.append(_refusal(f"{side} pulses", error))
     if len(sets) < 2:
         return Checked(findings)
     findings += compare_sides(sets["sim"], sets["data"], selection)
@@ -190,27 +190,27 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
     return findings
 
 
-def _refusal(side: str, message: str) -> Finding:
+def _refusal(what: str, error: CpunetError) -> Finding:
+    message = str(error)
     text, _, remedy = message.rpartition("; ")
-    return Finding(f"{side} pulses", Level.ERROR, text or message, remedy if text else "")
+    return Finding(what, Level.ERROR, text or message, remedy if text else "")
 
 
 def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
     """Check the conditions without which a training raises an error."""
-    asked: tuple[tuple[str, Callable[[], list[str] | None]], ...] = (
-        ("sampling", lambda: require_same_sampling(sim, data)),
-        ("energies", lambda: require_both_sides(sim, data, selection)),
-    )
-    for what, require in asked:
-        try:
-            notes = require()
-        except CpunetError as error:
-            yield replace(_refusal("", str(error)), what=what)
-        else:
-            if what == "sampling":
-                yield Finding(what, Level.FINE, f"every {data.dt_ns:g} ns")
-            for note in notes or ():
-                yield Finding(what, Level.WARNING, note.removeprefix("warning: "))
+    try:
+        require_same_sampling(sim, data)
+    except CpunetError as error:
+        yield _refusal("sampling", error)
+    else:
+        yield Finding("sampling", Level.FINE, f"every {data.dt_ns:g} ns")
+    try:
+        notes = require_both_sides(sim, data, selection)
+    except CpunetError as error:
+        yield _refusal("energies", error)
+    else:
+        for note in notes:
+            yield Finding("energies", Level.WARNING, note.removeprefix("warning: "))
 
 
 def _count(one: InputSet, side: str) -> Finding:
@@ -224,7 +224,7 @@ def _count(one: InputSet, side: str) -> Finding:
 
 
 REMEDIES = {
-    Rejection.SATURATED: "saturated traces tell nothing of the top; choose lower energies",
+    Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
     Rejection.WINDOW_OUTSIDE_RECORD: (
         "the traces end too soon before or after the pulse; write longer ones, or allow more "
         "padding (--set preparation.max_padding_before=…, max_padding_after)"

@@ -181,15 +181,10 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
     del recipe["search"]  # the search space does not affect the weights
     training = recipe["training"]
     recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
-    told = ("dt_ns", "used", "sha256")  # not the name: a file may have been moved
-    sides = (("simulation", job.sim), ("data", job.data))
     settings = {"recipe": recipe, "peak": job.options.peak, "seed": job.options.seed}
     if job.options.init is not None:
         settings["init"] = weights_sha256(job.options.init)
-    return settings | {
-        side: {k: v for k, v in pulses.provenance().items() if k in told}
-        for side, pulses in sides
-    }
+    return settings | {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
 
 
 def _environment(job: TrainingJob) -> dict[str, Any]:

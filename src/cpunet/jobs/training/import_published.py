@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,11 @@ from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.pickles import PickledPulse, as_pulse, entries
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
 from cpunet.restricted_unpickler import TruncatedError
 from cpunet.training.run_folder import RUN, versions, write_run
 from cpunet.translation.published import read_discriminator, read_generator
@@ -71,8 +73,9 @@ def import_weights(
     Raises
     ------
     CpunetError
-        If no generator is given, a file is not a plain state dict or has another
-        architecture, the two generators differ in width, or `out` cannot be written.
+        If no generator is given, `peak` cannot be understood, a file is not a plain state
+        dict or has another architecture, the two generators differ in width, or `out` cannot
+        be written.
     """
     given = {
         "ren": ren,
@@ -86,25 +89,8 @@ def import_weights(
         raise CpunetError("no generator given; name fep_REN.pt, fep_IREN.pt or both")
     if not (np.isfinite(dt_ns) and dt_ns > 0):
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
-    recipe = load_recipe("paper")
-    networks: dict[str, nn.Module] = {}
-    widths, overrides = set(), []
-    for part, path in files.items():
-        if part in ("ren", "iren"):
-            network = read_generator(path, recipe.preparation.length)
-            networks[part] = network
-            widths.add(network.latent_mean.out_channels // 8)
-        else:
-            networks[part], config = read_discriminator(path)
-            overrides = [
-                f"discriminator.{name}={getattr(config, name)}"
-                for name in ("embedding_rows", "embedding_dim", "hidden")
-            ]
-    if len(widths) > 1:
-        raise CpunetError(
-            f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
-        )
-    recipe = load_recipe("paper", [f"generator.width={widths.pop()}", *overrides])
+    networks, recipe = _read_networks(files)
+    parse_selection(peak, recipe.peaks)
     info = {
         "recipe": recipe.name,
         "peak": peak,
@@ -124,6 +110,30 @@ def import_weights(
     with folder_written_aside(out, RUN, force=force, note=monitor.note) as folder:
         write_run(folder, nn.ModuleDict(networks), recipe, info)
     return info
+
+
+def _read_networks(files: Mapping[str, Path]) -> tuple[dict[str, nn.Module], Recipe]:
+    """Networks by their part of a run, and the recipe of the paper with their dimensions."""
+    networks: dict[str, nn.Module] = {}
+    widths, overrides = set(), []
+    length = load_recipe("paper").preparation.length
+    for part, path in files.items():
+        if part in ("ren", "iren"):
+            network = read_generator(path, length)
+            networks[part] = network
+            widths.add(network.latent_mean.out_channels // 8)
+        else:
+            networks[part], config = read_discriminator(path)
+            overrides = [
+                f"discriminator.{name}={getattr(config, name)}"
+                for name in ("embedding_rows", "embedding_dim", "hidden")
+            ]
+    if len(widths) > 1:
+        raise CpunetError(
+            f"{files['ren']} and {files['iren']}: generators of widths {sorted(widths)}; give "
+            "a pair"
+        )
+    return networks, load_recipe("paper", [f"generator.width={widths.pop()}", *overrides])
 
 
 def import_pulses(

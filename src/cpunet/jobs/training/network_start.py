@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.measured_noise import measured_noise
@@ -141,12 +139,11 @@ def _require_same_windows(init: Path, recipe: Recipe) -> None:
     other = read_recipe(init)
     if not isinstance(other.generator, PunetConfig):
         return
-    pairs = (
-        (other.preparation.length, recipe.preparation.length),
-        (other.preparation.samples_before, recipe.preparation.samples_before),
-        (other.network_length, recipe.network_length),
+    theirs, own = (
+        (one.preparation.length, one.preparation.samples_before, one.network_length)
+        for one in (other, recipe)
     )
-    if any(not np.equal(theirs, own) for theirs, own in pairs):
+    if theirs != own:
         raise CpunetError(
             f"{init}: its networks know windows of {other.network_length} of "
             f"{other.preparation.samples_before} + {other.preparation.samples_after} samples, "

@@ -27,7 +27,7 @@ from cpunet.jobs.training.check import Level, compare_sides
 from cpunet.jobs.training.launched_group import group_for
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, write_run
 
@@ -84,24 +84,34 @@ def train_run(
         if group.leads:  # the others do not write
             place = trainer.workplace(out, read, options, told.note)
         with place as folder:
-            sim_set = load_simulated(sim, recipe, selection, told)
-            data_set = load_measured(data, recipe, selection, told)
-            require_same_sampling(sim_set, data_set)
-            for note in require_both_sides(sim_set, data_set, selection):
-                told.note(note)
-            for finding in compare_sides(sim_set, data_set, selection):
-                if finding.level != Level.FINE:
-                    told.note(f"warning: {finding}")
+            sim_set, data_set = _read(sim, data, recipe, selection, told)
             if options.init is not None:
                 _require_sampling(options.init, data_set)
             how = replace(options, device=device)
-            sides = sim_set, data_set, data
-            job = TrainingJob(recipe, how, group, *sides, folder, told, stop)
+            job = TrainingJob(recipe, how, group, sim_set, data_set, data, folder, told, stop)
             with enough_memory(trainer.less_memory(group.size)):
                 done = trainer.train(job)
             if done is None:
                 return {}
             return write_run(folder, done.model, done.recipe, done.info)
+
+
+def _read(
+    sim: InputFile,
+    data: InputFile,
+    recipe: Recipe,
+    selection: EnergySelection,
+    monitor: Monitor,
+) -> tuple[InputSet, InputSet]:
+    """Read and prepare both sides, and warn of what makes a training on them doubtful."""
+    sim_set = load_simulated(sim, recipe, selection, monitor)
+    data_set = load_measured(data, recipe, selection, monitor)
+    require_same_sampling(sim_set, data_set)
+    require_both_sides(sim_set, data_set, selection)
+    for finding in compare_sides(sim_set, data_set, selection):
+        if finding.level != Level.FINE:
+            monitor.note(f"warning: {finding}")
+    return sim_set, data_set
 
 
 def _require_sampling(init: Path, data: InputSet) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 from cpunet.electronics.baseline_methods.base import BaselineMethod
@@ -92,10 +93,7 @@ def fit_baseline_methods(
     )
     with monitor.stage("Fitting baseline methods", len(kinds)) as advance:
         for name, kind in kinds.items():
-
-            def fit(kind: type[BaselineMethod] = kind) -> BaselineMethod:
-                return kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
-
+            fit = partial(kind.fit, fit_sim, fit_data, sim.dt_ns, config.samples_before)
             method = _or_reason(result.missing, name, fit)
             if method is not None:
                 result.methods[name] = method

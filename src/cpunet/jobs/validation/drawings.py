@@ -62,7 +62,7 @@ class Drawing:
     Parameters
     ----------
     kind
-        Kind of figure, a key of `_DRAW`.
+        Kind of figure, one of `KINDS`.
     values
         Arguments of its function: numbers, text, arrays, and lists and mappings of them.
     """
@@ -85,7 +85,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     """All figures of a validation by name."""
     peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
-    made = {SPECTRUM: Drawing("spectrum", {"energy_kev": energies, "peaks": peaks})}
+    made = {SPECTRUM: Drawing(SPECTRUM, {"energy_kev": energies, "peaks": peaks})}
     made |= _remains(found.metrics["remains"] or {})
     if methods := found.metrics["ae_energy"].get("methods"):
         made[AE_ENERGY] = Drawing(AE_ENERGY, {"methods": methods})
@@ -118,7 +118,7 @@ def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
 
 def of_losses(records: list[Record]) -> Drawing:
     """The losses of a training."""
-    return Drawing("losses", {"records": records})
+    return Drawing(LOSSES, {"records": records})
 
 
 def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
@@ -215,7 +215,7 @@ def _roc(found: Evaluation, peaks: list[str]) -> Drawing:
         }
         for peak in peaks
     }
-    return Drawing("A over E survival", {"ae": ae, "dep": DEP})
+    return Drawing(ROC, {"ae": ae, "dep": DEP})
 
 
 def _plane(details: PeakDetails, name: str) -> Drawing:
@@ -271,7 +271,7 @@ def _draw_noise(noise: Mapping[str, Any], peak: str) -> Figure:
 
 
 _DRAW: Mapping[str, Callable[..., Figure]] = {
-    "spectrum": spectrum_figure,
+    SPECTRUM: spectrum_figure,
     REMAINS: sizes_figure,
     "cycle": cycle_figure,
     "histograms": _draw_histograms,
@@ -281,7 +281,8 @@ _DRAW: Mapping[str, Callable[..., Figure]] = {
     AE_ENERGY: ae_energy_figure,
     "A over E": ae_figure,
     "A over E and drift time": two_dimensional_figure,
-    "A over E survival": roc_figure,
+    ROC: roc_figure,
     "noise": _draw_noise,
-    "losses": loss_curves,
+    LOSSES: loss_curves,
 }
+KINDS = frozenset(_DRAW)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,7 @@ def validation_selection(
     chosen = parse_selection(",".join(names), recipe.peaks)
     more = [band for _, bands in _lines(recipe).values() for band in bands]
     more += [*recipe.scores.continuum_kev.values(), *more_kev]
-    return EnergySelection(
-        chosen.name, chosen.peaks, chosen.chosen, (*chosen.ranges_kev, *more)
-    )
+    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
 def range_survivals(

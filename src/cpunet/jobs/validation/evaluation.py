@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
 from cpunet.machine_memory import require_memory
 from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.run_folder import read_info, read_losses
 from cpunet.translation.translator import IREN, REN
@@ -127,16 +128,15 @@ def evaluate(
     """
     info, device = read_info(run), resolve_device(how.device)
     ren, iren = REN.load(run, device), IREN.load(run, device)
-    recipe = ren.recipe
-    names = list(dict.fromkeys([*recipe.peaks, str(info["peak"])]))
-    more = () if how.ae_range_kev is None else (how.ae_range_kev,)
-    sim_set, data_set = _load_both(ren, sim, data, names, more, how.most, monitor)
+    recipe, trained_on = ren.recipe, str(info["peak"])
+    names = list(dict.fromkeys([*recipe.peaks, trained_on]))
+    sim_set, data_set = _load_both(ren, sim, data, names, how, monitor)
     responses = None if how.truth is None else Responses(how.truth, sim_set)
     others = fit_baseline_methods(
         sim_set,
         data_set,
         data,
-        parse_selection(str(info["peak"]), recipe.peaks),
+        parse_selection(trained_on, recipe.peaks),
         recipe,
         remains=ren.remains,
         fitted=how.baselines,
@@ -145,25 +145,14 @@ def evaluate(
     made = translate_all(ren, others, sim_set, responses, how.seed, monitor)
     amplitudes = current_amplitudes(sim_set, data_set, made)
     sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
-    values: dict[str, ByMethod] = {}
-    peaks: dict[str, Any] = {}
-    with monitor.stage("Scoring", len(sets)) as advance:
-        for peak in sets:
-            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, how.seed)
-            advance(1)
-    if all("missing" in scores for scores in peaks.values()):
+    values, peaks = _scores(sets, recipe, how.seed, monitor)
+    scored = [peak for peak in sets if values[peak.name]]
+    if not scored:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides; "
             "check the calibration (--kev-per-adc, --data-energy)"
         )
-    scored = [peak for peak in sets if values[peak.name]]
-    with monitor.stage("Comparing in detail", len(scored)) as advance:
-        details = {}
-        for peak in scored:
-            details[peak.name] = peak_details(
-                peak, values[peak.name], recipe.scores.bootstraps, how.seed
-            )
-            advance(1)
+    details = _details(scored, values, recipe, how.seed, monitor)
     kept = survivals(values, how.seed)
     metrics = {
         "compared": _compared(run, info, sim_set, data_set),
@@ -190,8 +179,7 @@ def evaluate(
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
         },
-        "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed")}
-        | {"peak": info["peak"]},
+        "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed", "peak")},
         "remains": (info.get("fit") or {}).get("remains"),
         "rejections": {
             "sim": sim_set.prepared.rejections,
@@ -209,12 +197,12 @@ def _load_both(
     sim: InputFile,
     data: InputFile,
     names: list[str],
-    more_kev: tuple[Range, ...],
-    most: int,
+    how: ValidateOptions,
     monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
+    most, length = how.most, ren.recipe.preparation.length
+    more_kev = () if how.ae_range_kev is None else (how.ae_range_kev,)
     selection = validation_selection(names, ren.recipe, more_kev)
-    length = ren.recipe.preparation.samples_before + ren.recipe.preparation.samples_after
     # a file with an unknown number of pulses can contain the maximum
     numbers = [file.open().n_pulses for file in (sim, data)]
     pulses = max(most if n is None else min(most, n) for n in numbers)
@@ -234,11 +222,46 @@ def _load_both(
     return sim_set, data_set
 
 
+def _scores(
+    sets: Sequence[PeakSets], recipe: Recipe, seed: int, monitor: Monitor
+) -> tuple[dict[str, ByMethod], dict[str, Any]]:
+    """Parameters by peak and method, and the scores of each peak."""
+    values: dict[str, ByMethod] = {}
+    scores: dict[str, Any] = {}
+    with monitor.stage("Scoring", len(sets)) as advance:
+        for peak in sets:
+            values[peak.name], scores[peak.name] = score_peak(peak, recipe, seed)
+            advance(1)
+    return values, scores
+
+
+def _details(
+    scored: Sequence[PeakSets],
+    values: Mapping[str, ByMethod],
+    recipe: Recipe,
+    seed: int,
+    monitor: Monitor,
+) -> dict[str, PeakDetails]:
+    """Further comparisons of each scored peak."""
+    details, bootstraps = {}, recipe.scores.bootstraps
+    with monitor.stage("Comparing in detail", len(scored)) as advance:
+        for peak in scored:
+            details[peak.name] = peak_details(peak, values[peak.name], bootstraps, seed)
+            advance(1)
+    return details
+
+
 def _compared(
     run: Path, info: Mapping[str, Any], sim: InputSet, data: InputSet
 ) -> dict[str, Any]:
     """Description of the compared inputs, shown before the scores."""
     fit = info.get("fit") or {}
+    training = (
+        f"recipe {info['recipe']} on {info['peak']}",
+        "" if info["seed"] is None else f"seed {info['seed']}",
+        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses",
+        str(info.get("started", ""))[:10],
+    )
     known = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
@@ -249,9 +272,7 @@ def _compared(
         "simulation": _short(sim.path),
         "data": _short(data.path),
         "run": run.absolute().name,
-        "trained": f"recipe {info['recipe']} on {info['peak']}, seed {info['seed']}, "
-        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses, "
-        f"{str(info.get('started', ''))[:10]}",
+        "trained": ", ".join(filter(None, training)),
     }
     if fit.get("verdict"):
         compared["fit"] = str(fit["verdict"])

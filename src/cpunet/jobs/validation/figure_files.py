@@ -143,8 +143,8 @@ def _stored(
     if made_here(folder, REPORT):
         if sim is not None or data is not None:
             raise CpunetError(
-                f"{folder}: is a report, drawn of what it stores; leave out --sim and --data, "
-                "or give the run"
+                f"{folder}: is a report, whose stored results are drawn; leave out --sim and "
+                "--data, or give the run"
             )
         if not (folder / STORE).is_file():
             raise CpunetError(
@@ -158,9 +158,7 @@ def _stored(
         return None
     if (folder / STORE).is_file() and sim is None and data is None:
         return read_drawings(folder / STORE)[0]
-    chosen_names(
-        names, figure_names([*read_recipe(folder).peaks, str(read_info(folder)["peak"])])
-    )
+    chosen_names(names, _possible(folder))
     raise CpunetError(
         "simulated and measured pulses are needed; give --sim and --data, or a report"
     )

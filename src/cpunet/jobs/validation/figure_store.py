@@ -14,7 +14,7 @@ from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translation_record import run_print, source_print
-from cpunet.jobs.validation.drawings import Drawing
+from cpunet.jobs.validation.drawings import KINDS, Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
 
 STORE = "figures.npz"
@@ -66,8 +66,10 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
             for name, one in index["figures"].items()
         }
         made = index["made"]
+        if unknown := {one.kind for one in drawings.values()} - KINDS:
+            raise ValueError(f"no figures of kind {min(unknown)}")
         if not isinstance(made, dict):
-            raise ValueError("not said of what the figures were made")
+            raise ValueError("the inputs of the figures are missing")
     except (*npz_files.DAMAGED, AttributeError) as error:
         raise CpunetError(
             f"{file}: cannot be read ({npz_files.said(error)}); remove it, and score the run "
