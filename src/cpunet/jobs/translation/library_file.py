@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, require_stored, text_attribute
@@ -15,6 +16,8 @@ from cpunet.pulses.reading.columns import TIME_UNITS
 from cpunet.pulses.reading.source import MAX_SAMPLES
 
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
+# Templates of charge end near their maximum; templates of current do not.
+_MIN_END = 0.5
 
 
 def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
@@ -66,7 +69,7 @@ def n_templates(file: h5py.File, path: str, source: Path) -> int:
             f"{where}: no {missing[0]} beside the waveforms; complete the library"
         )
     for name in ("r", "z"):
-        if not is_column(library[name]) or library[name].ndim != 1:
+        if not is_column(library[name]) or library[name].ndim != 1 or not len(library[name]):
             raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
     total = 0
     for name in filter(WAVEFORM.fullmatch, library):
@@ -100,6 +103,35 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
     if not 1e-3 <= value <= 1e9:
         raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
     return value
+
+
+def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
+    """Number of templates that end below half of their maximum, as those of current do."""
+    charge = np.abs(templates)
+    return int((charge[:, -1] < _MIN_END * charge.max(axis=1)).sum())
+
+
+def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
+    """Raise an error if none of `n` templates has a signal, or most are no charge pulses.
+
+    Parameters
+    ----------
+    where
+        File, and library in it, for the message.
+    n, moving, not_ending
+        Numbers of templates, of those with a translated signal, and among these of those
+        that end low (`n_not_ending`).
+    """
+    if not moving:
+        raise CpunetError(
+            f"{where}: none of {n} templates can be translated; are they charge pulses?"
+        )
+    if 2 * not_ending > moving:
+        raise CpunetError(
+            f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
+            "these are currents, or behind electronics already; give the library of charge "
+            "pulses"
+        )
 
 
 def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:

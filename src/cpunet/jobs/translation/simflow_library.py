@@ -22,7 +22,7 @@ from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.translation.library_file import n_templates, require_whole
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
@@ -47,8 +47,6 @@ from cpunet.translation.translator import REN
 QUIET = Monitor()
 ROWS = 16  # rows of r translated at a time
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
-# Templates of charge end near their maximum; templates of current do not.
-MIN_END = 0.5
 
 Floats = npt.NDArray[np.float32]
 
@@ -117,8 +115,6 @@ def translate_for_simflow(
         require_whole(given, source, set())
         names = chosen_libraries(given, source, detectors, known_detector(run, info))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
-        for library in ideal:
-            n_templates(given, library.path, source)  # raises an error if damaged
         made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
@@ -166,24 +162,13 @@ def _look(
                 good = np.isfinite(times)
                 there[there] = good
                 mask[first : first + len(block)] = there
-                ends = np.abs(templates[good])
-                moving += len(ends)
-                not_ending += int((ends[:, -1] < MIN_END * ends.max(axis=1)).sum())
+                moving += int(good.sum())
+                not_ending += n_not_ending(templates[good])
                 amplitudes.append(heights(currents[good]))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
                 advance(block.shape[0] * block.shape[1])
             inside[angle] = mask
-    if not moving:
-        raise CpunetError(
-            f"{source}: {library.path}: none of {library.n_templates} templates can be "
-            "translated; are they charge pulses?"
-        )
-    if 2 * not_ending > moving:
-        raise CpunetError(
-            f"{source}: {library.path}: {not_ending} of {moving} templates end below half of "
-            "their maximum: these are currents, or behind electronics already; give the "
-            "library of charge pulses"
-        )
+    require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
     some = np.concatenate(kept)
