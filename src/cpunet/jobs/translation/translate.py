@@ -98,8 +98,7 @@ class FileTranslation:
         Parameters
         ----------
         noise_key
-            Name that is combined with the seed, so that the noise of files differs; None for
-            the noise of `cpunet.translation.translator.Translator.translate`.
+            See `translate_file`.
         """
         refuse_inputs(out, self.run, *source.files)
         with only_writer(out):
@@ -222,6 +221,7 @@ def translate_file(
     out: Path,
     options: TranslateOptions = DEFAULTS,
     *,
+    noise_key: str | None = None,
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
@@ -238,6 +238,9 @@ def translate_file(
         Folder of a training run.
     source
         Simulated pulses, or measured ones for the inverse.
+    noise_key
+        Name that is combined with the seed, so that the noise of files or channels differs;
+        None for the noise of `cpunet.translation.translator.Translator.translate`.
     resume
         Whether to keep an output that was made from this source with this run and options.
     device, force, monitor
@@ -258,7 +261,9 @@ def translate_file(
     translation = FileTranslation(run, options, device)
     for note in translation.notes:
         monitor.note(note)
-    return translation(source, out, resume=resume, force=force, monitor=monitor)
+    return translation(
+        source, out, noise_key=noise_key, resume=resume, force=force, monitor=monitor
+    )
 
 
 def _read(pulses: PulseSource, advance: Advance) -> Iterator[Pulses]:
