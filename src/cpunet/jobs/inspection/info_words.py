@@ -68,8 +68,8 @@ def _traces(told: Mapping[str, Any]) -> Lines:
         ("baseline", f"{told['baseline_samples']} samples before nearly all pulses"),
         ("decay", f"{decay:.3g} µs" if decay else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),
-        ("saturated", f"{told['saturated_percent']:.2g} %"),
-        ("pile-up", f"{told['pile_up_percent']:.2g} % (tails that are no single decay)"),
+        ("saturated", _percent(told["saturated_percent"])),
+        ("pile-up", f"{_percent(told['pile_up_percent'])} (tails that are no single decay)"),
         ("left out", f"{_counts(told['rejected']) or 'none'} of {told['looked_at']} traces"),
     ]
 
@@ -200,9 +200,9 @@ def _parameters(values: Mapping[str, Any]) -> str:
     words = []
     for name, value in values.items():
         stem, _, unit = name.rpartition("_")
-        share = re.fullmatch(r"(slow|decay)_\d+_(ns|us)|ringing_(sine|cosine)", name)
+        share = re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name)
         if share and isinstance(value, int | float):
-            words.append(f"{_called(name, stem, unit)} {100 * value:.2g} %")
+            words.append(f"{_called(name, stem, unit)} {_percent(100 * value)}")
         else:
             shown = f" {UNITS[unit]}" if unit in UNITS else ""
             words.append(f"{(stem if shown else name).replace('_', ' ')} {_text(value)}{shown}")
@@ -221,6 +221,11 @@ def _counts(counts: Mapping[str, Any]) -> str:
 def _span(values: Any, digits: int = 9) -> str:
     """Both ends to six digits, and no more than `digits` after the point."""
     return " … ".join(f"{round(v, digits):.6g}" for v in values) if values else NOTHING
+
+
+def _percent(value: float) -> str:
+    """Two digits, and whole numbers from 99.5 on."""
+    return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"
 
 
 def _text(value: Any) -> str:

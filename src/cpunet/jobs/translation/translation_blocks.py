@@ -23,8 +23,8 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
     seed
         Seed of the translation.
     key
-        Name of the file or the channel; None for a single file, whose first block then has `seed` itself, as
-        in `cpunet.translation.translator.Translator.translate`.
+        Name of the file or the channel; None for a single file, whose first block then has
+        `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
     block
         Number of the block in the file.
     realisation
