@@ -227,7 +227,7 @@ def _shape_numbers(
     response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
 ) -> Numbers:
     """Derived numbers of a response, which are not parameters of the fit."""
-    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    slow = list(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
     return slow_numbers(slow) | numbers
 
@@ -235,7 +235,7 @@ def _shape_numbers(
 def _told(run: _Learned) -> dict[str, Any]:
     slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
     values = {n: v for n, v in run.parameters.items() if n not in slow}
-    values |= slow_numbers({float(n.split("_")[1]): w for n, w in slow.items()})
+    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
     values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
     if run.fit.get("moments"):
         values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
