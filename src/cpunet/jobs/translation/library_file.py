@@ -99,10 +99,15 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
         raise CpunetError(
             f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
         )
-    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
+    value = number(dt) * TIME_UNITS[units]
     if not 1e-3 <= value <= 1e9:
         raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
     return value
+
+
+def number(item: h5py.Dataset) -> float:
+    """The value of a number, which may be stored as a column with one row."""
+    return float(np.asarray(item[()]).reshape(-1)[0])
 
 
 def n_not_ending(templates: npt.NDArray[np.floating]) -> int:

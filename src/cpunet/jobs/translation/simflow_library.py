@@ -29,7 +29,7 @@ from cpunet.jobs.translation.simflow_checks import (
     known_detector,
     require_complete,
 )
-from cpunet.jobs.translation.simflow_files import Made, describe
+from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
@@ -119,7 +119,7 @@ def translate_for_simflow(
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
                 looked = _look(ren, library, given[library.path], source, monitor)
-                group = made.h5.create_group(library.path)
+                group = made.h5.require_group(library.path)
                 job = _Writing(looked, library, rings, rank)
                 told[library.path] = job.write(given[library.path], group, made_from, monitor)
     return told
@@ -222,7 +222,8 @@ class _Writing:
             numbers["rank"] = len(basis)
             numbers["loss"] = loss.told()
         content = {"cpunet": cpunet.__version__, "rings": self.rings} | made_from | numbers
-        describe(group, json.dumps(content))
+        group.attrs[TOLD] = json.dumps(content)
+        describe(group)
         return numbers
 
     def _rows(
