@@ -114,6 +114,11 @@ def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
         ({"training": {"recipe": "fast", "peak": "SEP", "seed": 0}}, "of a run with peak SEP"),
         ({"ae_energy": {"missing": "two few events"}}, "no A/E against energy: two few"),
         ({"ae_energy": 3, "training": None}, "give the folder that `cpunet validate` made"),
+        ({"ae_energy": None}, "give the folder that `cpunet validate` made"),
+        (
+            {"ae_energy": {"methods": {"data": METHOD}}},
+            "give the folder that `cpunet validate`",
+        ),
     ],
 )
 def test_other_reports_are_refused(
