@@ -56,6 +56,11 @@ class Side:
 
         Energies are calibrated as in a measurement: a factor, determined from the lines in the
         first block, corrects the median loss by charge trapping.
+
+        Raises
+        ------
+        CpunetError
+            If no event gives a signal.
         """
         with monitor.stage(f"Fields of {self.detector.name}"):
             fields = compute_fields(self.detector)
@@ -75,6 +80,11 @@ class Side:
                     calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
                 advance(len(hits))
+        if not gain:
+            raise CpunetError(
+                f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
+                "give more with --events"
+            )
 
 
 @dataclass(frozen=True)
