@@ -193,6 +193,7 @@ def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
     assert told["energy_kev"] == [50.0, 2614.5]
     assert told["r_mm"] == [0.0, 5.0]
     assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
+    assert describe(path, recipe=RECIPE, table="all")["detectors"] == {"": told}
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(

@@ -358,6 +358,19 @@ def sequential(run, many, tmp_path_factory):
     return out, told
 
 
+def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch):
+    """And yet none may be another's input."""
+    seen = []
+    monkeypatch.setattr(
+        "cpunet.jobs.translation.translate_files.refuse_inputs",
+        lambda *paths: seen.append(len(paths)),
+    )
+    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
+    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
+        translate_files(run, many, tmp_path, device="cpu", force=True)
+    assert max(seen) <= 4
+
+
 def test_files_in_a_folder(sequential):
     out, told = sequential
     counts = {"read": 3 * N, "translated": 3 * N, "rejections": {}}

@@ -130,7 +130,9 @@ def describe(
         told: dict[str, Any] = {"kind": "run", "path": str(path), **_run(path)}
         spectra: Spectra = {}
     elif holds_hits(path) and without_remains is None:
-        told = describe_hits(path, table, recipe.peaks if recipe else {}, detector, hit_units)
+        chosen = None if table == ALL else table
+        peaks = recipe.peaks if recipe else {}
+        told = describe_hits(path, chosen, peaks, detector, hit_units)
         spectra = {}
     else:
         file = InputFile(path, table, energy, kev_per_adc, dt_ns)

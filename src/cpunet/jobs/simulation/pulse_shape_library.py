@@ -68,7 +68,8 @@ def write_library(
     Raises
     ------
     CpunetError
-        If the detector is not depleted, the grid is empty, or the file cannot be written.
+        If the detector is not depleted, no grid point has a template, or the file cannot be
+        written.
     """
     refuse_existing(out, force=force)
     if not (math.isfinite(grid_mm) and grid_mm > 0):
@@ -95,6 +96,12 @@ def write_library(
         for angle in angles_deg:
             _fill(library, angle, fields, settings, counts, advance)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
+        if not counts["written"]:
+            raise CpunetError(
+                f"{out}: none of {counts['templates']} grid points has a template: "
+                f"{counts['outside']} give no signal, {counts['late']} are not collected in "
+                "time; give a finer grid or longer records"
+            )
     return counts
 
 
