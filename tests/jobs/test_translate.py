@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 from contextlib import contextmanager
@@ -330,6 +331,40 @@ def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, l
         patch.setattr(translate_job, "BLOCK_SAMPLES", longest)
         translate_file(run, source, out, device="cpu")
     assert out.read_bytes() == expected
+
+
+def test_options_may_be_numbers_of_numpy(run, tmp_path):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    options = TranslateOptions(seed=np.int64(3), realisations=np.int32(2))
+    told = translate_file(run, source, out, options, device="cpu")
+    options = TranslateOptions(seed=3, realisations=2)
+    assert translate_file(run, source, out, options, device="cpu", resume=True) == told | {
+        "skipped": True
+    }
+
+
+def changed_record(path, change):
+    with h5py.File(path, "a") as file:
+        record = json.loads(file.attrs["cpunet_translation"])
+        change(record)
+        file.attrs["cpunet_translation"] = json.dumps(record)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda record: record["options"].update(former=3), r"other options \(former\)"),
+        (lambda record: record["options"].pop("seed"), r"other options \(seed\)"),
+        (lambda record: record["counts"].pop("rejections"), "does not say how many pulses"),
+    ],
+)
+def test_a_file_with_another_record_is_not_kept(run, tmp_path, change, said):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    translate_file(run, source, out, device="cpu")
+    assert translate_file(run, source, out, device="cpu", resume=True)["skipped"]
+    changed_record(out, change)
+    with pytest.raises(CpunetError, match=said):
+        translate_file(run, source, out, device="cpu", resume=True)
 
 
 def test_seeds_differ_by_file_block_and_realisation():

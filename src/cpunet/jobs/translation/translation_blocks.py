@@ -31,7 +31,7 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
         Number of times that its noise was drawn before.
     """
     if key is None and block == realisation == 0:
-        return seed
+        return int(seed)
     # names of files need not be UTF-8
     digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
     words = [seed, block, realisation, int.from_bytes(digest[:16])]

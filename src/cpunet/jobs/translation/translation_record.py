@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.inputs import InputFile
@@ -95,7 +97,8 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
             continue
         told = f"another {what}"
         if what == "options" and isinstance(found.get(what), dict):
-            other = [name for name in value if found[what].get(name, ...) != value[name]]
+            theirs = found[what]
+            other = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
             told = f"other options ({', '.join(other)})"
         raise CpunetError(f"{out}: was made with {told}; choose another --out or give --force")
     counts = found.get("counts")
@@ -109,7 +112,7 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
 
 def _counted(counts: Mapping[str, Any]) -> list[Any]:
     """Counts of a translation that must be whole numbers."""
-    rejections = counts.get("rejections", {})
+    rejections = counts.get("rejections")
     reasons = rejections.values() if isinstance(rejections, dict) else [None]
     optional = [counts[name] for name in ("saturated",) if name in counts]
     return [counts.get("read"), counts.get("translated"), *optional, *reasons]
@@ -121,7 +124,8 @@ def _is_count(value: Any) -> bool:
 
 def stamp(file: Stamped, record: Record) -> None:
     """Write the provenance into a file."""
-    file.stamp(TRANSLATION, json.dumps(record))
+    # options given from Python may be numbers of NumPy
+    file.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
 
 
 def _read(out: Path) -> Record:
