@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from torch import nn
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.translation.simflow_library import translate_for_simflow
 from cpunet.jobs.translation.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
@@ -96,6 +98,23 @@ def test_currents_of_whole_numbers_are_not_rounded(run: Path, tmp_path: Path) ->
         values = file["V01/waveform_000_deg"][()]
     # all charge is in the current
     assert 4.0 * values[1, 1].sum() == pytest.approx(1000, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "translate", [translate_for_simflow, partial(translate_library, currents=True)]
+)
+def test_currents_of_negative_charge_are_refused(
+    run: Path, tmp_path: Path, translate: Callable[[Path, Path, Path], Any]
+) -> None:
+    """Their maximum is not that of the signal; the charge itself is translated as it is."""
+    source = tmp_path / "psl.lh5"
+    put(source, "V01", 1.0, {"waveform_000_deg": -charge(2400, 1.0)}, "ns")
+    with h5py.File(source, "a") as file:
+        for name in ("r", "z"):
+            file[f"V01/{name}"].attrs["units"] = "mm"
+    with pytest.raises(CpunetError, match="12 of 12 templates end below half"):
+        translate(run, source, tmp_path / "ren.lh5")
+    assert translate_library(run, source, tmp_path / "ren.lh5")["translated"] == 12
 
 
 def test_an_empty_axis_is_told_in_one_line(run: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
-from cpunet.jobs.translation.library_file import require_whole
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
@@ -206,12 +206,14 @@ def _of_library(
         charge = _some(values)
     if not len(charge):
         raise CpunetError(f"{source}: {library.path}: no template of charge")
+    n = len(charge)
+    require_charge(f"{source}: {library.path}", n, n, n_not_ending(charge))
     rng = np.random.default_rng(0)
-    share = rng.random((len(charge), 1), np.float32)
-    two_sites = share * charge + (1 - share) * charge[rng.permutation(len(charge))]
+    share = rng.random((n, 1), np.float32)
+    two_sites = share * charge + (1 - share) * charge[rng.permutation(n)]
     alone = ae_ratios(charge, undecayed, nearest)
     usual = float(np.median(alone))  # divided out, since A/E is calibrated
-    return {"library": library.path, "templates": len(charge)} | {
+    return {"library": library.path, "templates": n} | {
         name: {"rms_percent": float(apart.std()), "largest_percent": float(np.abs(apart).max())}
         for name, apart in (
             ("single_site", 100 * (alone / usual - 1)),

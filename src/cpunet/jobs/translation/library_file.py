@@ -111,9 +111,8 @@ def number(item: h5py.Dataset) -> float:
 
 
 def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
-    """Number of templates that end below half of their maximum, as those of current do."""
-    charge = np.abs(templates)
-    return int((charge[:, -1] < _MIN_END * charge.max(axis=1)).sum())
+    """Number of templates that end below half of their height, as those of current do."""
+    return int((templates[:, -1] < _MIN_END * np.abs(templates).max(axis=1)).sum())
 
 
 def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
@@ -134,8 +133,8 @@ def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
     if 2 * not_ending > moving:
         raise CpunetError(
             f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
-            "these are currents, or behind electronics already; give the library of charge "
-            "pulses"
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
         )
 
 

@@ -43,6 +43,7 @@ KEPT = 256  # templates to measure the linearity with
 class _Tally:
     """Counts of the templates by outcome, and a sample of one length with its translator."""
 
+    currents: bool
     counts: Counter[str] = field(default_factory=Counter)
     not_ending: int = 0
     kept: list[FloatArray] = field(default_factory=list)
@@ -64,7 +65,9 @@ class _Tally:
             self.counts[Rejection(int(code)).label] += 1
         good = np.flatnonzero(accepted & templates.any(axis=1))
         self.counts["translated"] += int(accepted.sum())
-        self.not_ending += n_not_ending(templates[good])
+        # the maximum of a current is that of positive charge; charge may have either sign
+        rising = templates[good] if self.currents else np.abs(templates[good])
+        self.not_ending += n_not_ending(rising)
         self.counts["moving"] += len(good)
         if len(good):
             few = np.random.default_rng(seed).permutation(good)[:8]
@@ -128,14 +131,14 @@ def translate_library(
     """
     refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))
-    tally = _Tally()
+    tally = _Tally(currents)
     with opened(source) as given:
         require_whole(given, source, set())
         paths = libraries(given, source)
         total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
         with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
-            _copy(given, made.h5, _Job(ren, tally, source, currents, advance))
+            _copy(given, made.h5, _Job(ren, tally, source, advance))
         counts = tally.counts
         require_charge(str(source), counts["templates"], counts["moving"], tally.not_ending)
         assert tally.translate is not None
@@ -156,7 +159,6 @@ class _Job:
     ren: REN
     tally: _Tally
     source: Path
-    currents: bool
     advance: Advance
 
 
@@ -166,7 +168,8 @@ def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
         made.attrs[key] = value
     angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
     replaced = {f"waveform_{angle}" for angle in angles}
-    if job.currents and angles:
+    currents = job.tally.currents
+    if currents and angles:
         replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
     for name, item in given.items():
         if isinstance(item, h5py.Group):
@@ -181,12 +184,12 @@ def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
         item = given[f"waveform_{angle}"]
         arrays = (
             current_arrays(item, made, angle, dt_ns)
-            if job.currents
+            if currents
             else charge_arrays(item, made, angle)
         )
         _translate(item, arrays, translate, job)
     if "t0" not in made:
-        add_t0(given["dt"], made, dt_ns, BEFORE_NS if job.currents else 0.0)
+        add_t0(given["dt"], made, dt_ns, BEFORE_NS if currents else 0.0)
         made.attrs["datatype"] = f"struct{{{','.join(made)}}}"
 
 
