@@ -200,18 +200,14 @@ def _parameters(values: Mapping[str, Any]) -> str:
     words = []
     for name, value in values.items():
         stem, _, unit = name.rpartition("_")
+        shown = f" {UNITS[unit]}" if unit in UNITS else ""
+        called = (stem if shown else name).replace("_", " ")
         share = re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name)
         if share and isinstance(value, int | float):
-            words.append(f"{_called(name, stem, unit)} {_percent(100 * value)}")
+            words.append(f"{called}{shown} {_percent(100 * value)}")
         else:
-            shown = f" {UNITS[unit]}" if unit in UNITS else ""
-            words.append(f"{(stem if shown else name).replace('_', ' ')} {_text(value)}{shown}")
+            words.append(f"{called} {_text(value)}{shown}")
     return ", ".join(words)
-
-
-def _called(name: str, stem: str, unit: str) -> str:
-    called = f"{stem} {UNITS[unit]}" if unit in UNITS else name
-    return called.replace("_", " ")
 
 
 def _counts(counts: Mapping[str, Any]) -> str:

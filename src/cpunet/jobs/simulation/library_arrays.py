@@ -46,7 +46,9 @@ def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
     new = h5py.h5d.create(
         made.id, name, plain.get_type(), plain.get_space(), plain.get_create_plist()
     )
-    return Arrays(_with_attrs(h5py.Dataset(new), given))
+    waveforms = h5py.Dataset(new)
+    waveforms.attrs.update(given.attrs)
+    return Arrays(waveforms)
 
 
 def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str, dt_ns: float) -> Arrays:
@@ -64,7 +66,7 @@ def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str, dt_ns: flo
         chunks=(1, n_z, samples),
         **options,
     )
-    _with_attrs(waveforms, given).attrs["units"] = "1/ns"
+    waveforms.attrs.update({**given.attrs, "units": "1/ns"})
     times = made.create_dataset(f"drift_time_{angle}", (n_r, n_z), np.float64)
     times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
     return Arrays(waveforms, times)
@@ -75,9 +77,3 @@ def add_t0(dt: h5py.Dataset, made: h5py.Group, dt_ns: float, before_ns: float) -
     units = text_attribute(dt, "units")
     t0 = -round(before_ns / dt_ns) * dt_ns / TIME_UNITS[units]
     put_column(made, "t0", t0, units)
-
-
-def _with_attrs(made: h5py.Dataset, given: h5py.Dataset) -> h5py.Dataset:
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
-    return made

@@ -158,14 +158,12 @@ def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
         h5py.h5d.create(made.id, name.encode(), kind, space, dcpl=stored)
         copy = made[name]
         copy[()] = values
-    for key, value in item.attrs.items():
-        copy.attrs[key] = value
+    copy.attrs.update(item.attrs)
 
 
 def copy_group(given: h5py.Group, made: h5py.Group) -> None:
     """Copy a group and everything in it by value; see `copy_values`."""
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
+    made.attrs.update(given.attrs)
     for name, item in given.items():
         if isinstance(item, h5py.Group):
             copy_group(item, made.create_group(name))

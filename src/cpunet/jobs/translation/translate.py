@@ -25,18 +25,18 @@ from cpunet.jobs.translation.translation_blocks import (
     regrouped,
 )
 from cpunet.jobs.translation.translation_record import (
+    as_json,
     finished,
     require_unchanged,
     run_print,
     source_print,
-    stamp,
 )
 from cpunet.jobs.translation.translation_writers import Writer, other_columns, writer_of
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
-from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
+from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
@@ -117,7 +117,8 @@ class FileTranslation:
                 self._require_some(source, counts)
                 require_unchanged(source, before)
                 told = counts.told(adc=self.options.adc is not None)
-                stamp(writer, made | {"counts": told, "cpunet": cpunet.__version__})
+                record = made | {"counts": told, "cpunet": cpunet.__version__}
+                writer.stamp(TRANSLATION, as_json(record))
             return told
 
     def opened(self, source: InputFile) -> PulseSource:

@@ -164,8 +164,7 @@ class _Job:
 
 def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
     """Copy a group and everything in it, and translate the templates of libraries."""
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
+    made.attrs.update(given.attrs)
     angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
     replaced = {f"waveform_{angle}" for angle in angles}
     currents = job.tally.currents

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +18,6 @@ from cpunet.training.run_folder import RECIPE, WEIGHTS
 from cpunet.yaml_files import plain_json
 
 Record = dict[str, Any]
-
-
-class Stamped(Protocol):
-    """A file that is being written."""
-
-    def stamp(self, name: str, text: str) -> None:
-        """Set an attribute of the file."""
-        ...
 
 
 def source_print(source: InputFile) -> Record:
@@ -122,10 +114,9 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def stamp(file: Stamped, record: Record) -> None:
-    """Write the provenance into a file."""
-    # options given from Python may be numbers of NumPy
-    file.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
+def as_json(record: Record) -> str:
+    """The provenance as text; options given from Python may be numbers of NumPy."""
+    return json.dumps(record, default=np.generic.item)
 
 
 def _read(out: Path) -> Record:
