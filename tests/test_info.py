@@ -105,6 +105,19 @@ def test_a_run_folder(tmp_path):
     assert describe(tmp_path) == {"kind": "run", "path": str(tmp_path), **content}
 
 
+def test_a_run_with_a_damaged_fit_is_described_as_far_as_it_goes(tmp_path):
+    remains = {"rate_khz": 1.0, "percent_above": {}}
+    content = {
+        "kind": "pulses",
+        "recipe": "fast",
+        "fit": {"verdict": "good", "remains": remains},
+    }
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    lines = dict(in_words(describe(tmp_path)))
+    assert lines["fit"] == "good"
+    assert "remains" not in lines
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

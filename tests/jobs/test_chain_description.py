@@ -360,6 +360,14 @@ def test_runs_that_cannot_be_described(run, tmp_path):
     refused(other, parts=("weights.safetensors: no readable weights",))
 
 
+@pytest.mark.parametrize(
+    "fit", [{"moments": 9}, {"moments": 9, "chi_square": "9"}, {"noise": 3}]
+)
+def test_a_damaged_fit_is_told_in_one_line(tmp_path, fit):
+    run = write_response(tmp_path / "run", fit=fit)
+    one_line(lambda: describe_responses([run]), f"{run}: the fit in its run.json is damaged")
+
+
 def test_a_network_has_no_closed_form(tmp_path):
     write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), INFO | {"dt_ns": DT_NS})
     one_line(

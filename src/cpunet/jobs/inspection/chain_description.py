@@ -237,15 +237,21 @@ def _told(run: _Learned) -> dict[str, Any]:
     values = {n: v for n, v in run.parameters.items() if n not in slow}
     values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
     values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
-    if run.fit.get("moments"):
-        values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+    try:
+        if run.fit.get("moments"):
+            values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+        noise_error = _noise_error(run)
+    except (LookupError, TypeError, AttributeError) as error:
+        raise CpunetError(
+            f"{run.path}: the fit in its run.json is damaged ({error}); train again"
+        ) from error
     return {
         "path": str(run.path),
         "recipe": run.info["recipe"],
         "peak": run.info["peak"],
         "seed": run.info["seed"],
         "values": values,
-        "errors": {n: e for n, e in run.errors.items() if n in values} | _noise_error(run),
+        "errors": {n: e for n, e in run.errors.items() if n in values} | noise_error,
         "parameters": run.parameters,
         "parameter_errors": run.errors,
         "doubts": _doubts(run),

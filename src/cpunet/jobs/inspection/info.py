@@ -127,7 +127,7 @@ def describe(
     if path.is_dir():
         if without_remains is not None:
             raise CpunetError(f"{path}: a run has no traces; leave out --without-remains")
-        told: dict[str, Any] = {"kind": "run", "path": str(path), **_run(path)}
+        told = _run(path) | {"kind": "run", "path": str(path)}
         spectra: Spectra = {}
     elif holds_hits(path) and without_remains is None:
         chosen = None if table == ALL else table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 Lines = list[tuple[str, str]]
@@ -159,7 +160,8 @@ def _run(told: Mapping[str, Any]) -> Lines:
         value = with_std(noise["rms"], noise.get("rms_error"))
         lines.append(("noise", f"{value} keV{of}"))
     if "rate_khz" in (remains := _mapping(fit, "remains")):
-        lines += _remains(remains)
+        with suppress(LookupError, TypeError, ValueError):  # run.json is damaged
+            lines += _remains(remains)
     versions = _mapping(told, "versions")
     lines += [
         ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),

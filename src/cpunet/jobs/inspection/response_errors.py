@@ -48,7 +48,11 @@ def propagated(
     """
     moved = copy.deepcopy(response)
     parameters = Parameters(moved)
-    centre, matrix = parameters.vector(), np.asarray(covariance, float)
+    centre = parameters.vector()
+    try:
+        matrix = np.asarray(covariance, float)
+    except ValueError:  # rows of different lengths
+        return {}
     if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
         return {}
     variances, axes = np.linalg.eigh(matrix)

@@ -279,9 +279,10 @@ def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
         "|---|---|---|",
     ]
     for peak, content in peaks.items():
-        if not isinstance(content, dict):
+        parameters = content.get("parameters", content) if isinstance(content, dict) else None
+        if not isinstance(parameters, dict):
             continue
-        for name, values in content.get("parameters", content).items():
+        for name, values in parameters.items():
             iou = values.get("iou") if isinstance(values, dict) else None
             if not isinstance(iou, dict):
                 continue
