@@ -120,7 +120,8 @@ def describe_responses(
     if not learned:
         raise CpunetError("no run was given; give the folder of one")
     first = learned[0]
-    _require_alike(learned, truth)
+    require_alike([(run.path, run.dt_ns, run.preparation) for run in learned], "describe")
+    _require_sampling(first, truth)
     told: dict[str, Any] = {
         "cpunet": cpunet.__version__,
         "dt_ns": first.dt_ns,
@@ -309,19 +310,25 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
-def _require_alike(runs: Sequence[_Learned], truth: Electronics | None) -> None:
-    first = runs[0]
-    for run in runs[1:]:
-        if not np.isclose(run.dt_ns, first.dt_ns):
+def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]], do: str) -> None:
+    """Raise a `CpunetError` unless all runs have the period (ns) and preparation of the first.
+
+    `do` is the verb of what can be done with each of them instead.
+    """
+    (first, first_ns, preparation), *others = runs
+    for run, dt_ns, other in others:
+        if not np.isclose(dt_ns, first_ns):
             raise CpunetError(
-                f"{run.path}: trained on pulses sampled every {run.dt_ns:g} ns, {first.path} "
-                f"every {first.dt_ns:g} ns; describe them one by one"
+                f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
+                f"{first_ns:g} ns; {do} them one by one"
             )
-        if run.preparation != first.preparation:
+        if other != preparation:
             raise CpunetError(
-                f"{run.path}: trained with another preparation than {first.path}; describe "
-                "them one by one"
+                f"{run}: trained with another preparation than {first}; {do} them one by one"
             )
+
+
+def _require_sampling(first: _Learned, truth: Electronics | None) -> None:
     if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
         raise CpunetError(
             f"{first.path}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "

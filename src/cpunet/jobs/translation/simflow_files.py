@@ -230,18 +230,14 @@ def _is_realistic(group: h5py.Group) -> bool:
     if not all(is_column(item) and item.size == 1 for item in numbers):
         return False
     shape = tuple(map(len, axes))
-    names = [n for n in group if n.startswith(("waveform_", "coefficients_"))]
-    times = [f"drift_time_{n.split('_', 1)[1]}" for n in names]
-    whole = [n for n in names if isinstance(group[n], h5py.Dataset) and group[n].ndim == 3]
-    return (
-        bool(names)
-        and whole == names
-        and all(
-            isinstance(group.get(t), h5py.Dataset)
-            and group[t].shape == shape == group[n].shape[:2]
-            for t, n in zip(times, names, strict=True)
-        )
-    )
+    names = [name for name in group if name.startswith(("waveform_", "coefficients_"))]
+    for name in names:
+        values, times = group[name], group.get(f"drift_time_{name.split('_', 1)[1]}")
+        if not (isinstance(values, h5py.Dataset) and isinstance(times, h5py.Dataset)):
+            return False
+        if values.ndim != 3 or not values.shape[:2] == times.shape == shape:
+            return False
+    return bool(names)
 
 
 def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) -> list[str]:
