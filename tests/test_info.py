@@ -16,6 +16,7 @@ import pytest
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info import describe
+from cpunet.jobs.inspection.info_words import in_words
 from cpunet.jobs.inspection.trace_properties import _last_below, trace_properties
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
@@ -102,6 +103,19 @@ def test_a_run_folder(tmp_path):
     content = {"recipe": {"name": "paper"}, "seed": 7, "seconds": 12.5, "device": "cpu"}
     (tmp_path / "run.json").write_text(json.dumps(content))
     assert describe(tmp_path) == {"kind": "run", "path": str(tmp_path), **content}
+
+
+def test_a_run_with_a_damaged_fit_is_described_as_far_as_it_goes(tmp_path):
+    remains = {"rate_khz": 1.0, "percent_above": {}}
+    content = {
+        "kind": "pulses",
+        "recipe": "fast",
+        "fit": {"verdict": "good", "remains": remains},
+    }
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    lines = dict(in_words(describe(tmp_path)))
+    assert lines["fit"] == "good"
+    assert "remains" not in lines
 
 
 @pytest.mark.parametrize(
@@ -192,6 +206,7 @@ def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
     assert told["energy_kev"] == [50.0, 2614.5]
     assert told["r_mm"] == [0.0, 5.0]
     assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
+    assert describe(path, recipe=RECIPE, table="all")["detectors"] == {"": told}
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(
@@ -231,7 +246,8 @@ def test_the_properties_are_those_that_were_made():
     assert told["trigger_sample"] == [at, at, at]
     assert told["baseline_samples"] == at
     assert told["noise_adc"] == pytest.approx(6, rel=0.1)
-    assert told["noise_kev"] == pytest.approx(3, rel=0.15)
+    # 1000 keV are 2000 ADC, of which an eighth has decayed at the end of a window
+    assert told["noise_kev"] == pytest.approx(3, rel=0.04)
     assert told["decay_us"] == pytest.approx(50, rel=0.02)
     assert told["saturated_percent"] == pytest.approx(5)
     with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
@@ -295,6 +311,41 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
         main()
     assert f"{told['fits']['options']}\n" in capsys.readouterr().out
     assert re.fullmatch(r"--origin [\d.,-]+ --flip-z", told["fits"]["options"])
+
+
+def test_files_to_write_are_not_each_other_and_not_in_vain(tmp_path, reference_data):
+    raw, out, run = reference_data / "real" / "th228.fcio", tmp_path / "out", tmp_path / "run"
+    with pytest.raises(CpunetError, match="for the page and for the traces"):
+        describe(raw, recipe=RECIPE, without_remains=out, out=tmp_path / "." / "out")
+    run.mkdir()
+    (run / "run.json").write_text("{}")
+    with pytest.raises(CpunetError, match="a run has no traces; leave out --without-remains"):
+        describe(run, without_remains=out)
+    assert not out.exists()
+
+
+def test_a_page_of_traces_that_are_no_numbers(tmp_path):
+    np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
+    told = describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "page.html")
+    assert told["n_not_finite"] == 30
+    assert "What is in pulses.npy" in (tmp_path / "page.html").read_text("utf-8")
+
+
+def test_shares_are_percent_whatever_their_time():
+    fit = {"parameters": {"slow_12.5_ns": 0.02, "decay_2.9_us": 0.05, "decay_us": 50.0}}
+    lines = dict(in_words({"kind": "run", "path": "run", "fit": fit}))
+    assert lines["response"] == "slow 12.5 ns 2 %, decay 2.9 µs 5 %, decay 50 µs"
+
+
+def test_all_of_the_traces_are_saturated():
+    traces = {"trigger_sample": [1, 1, 1], "noise_adc": 1.0, "baseline_samples": 1}
+    traces |= {"saturated_percent": 100.0, "pile_up_percent": 0.25, "rejected": {}}
+    pulses = {"format": "HDF5", "table": "t", "n_pulses": 9, "length": 9, "dt_ns": 16.0}
+    pulses |= {"columns": [], "energy": "", "energy_kev": None, "peaks": {}, "samples": None}
+    pulses |= {"n_not_finite": 0, "n_constant": 0, "traces": traces | {"looked_at": 9}}
+    lines = dict(in_words({"kind": "pulses", "path": "raw.h5"} | pulses))
+    assert lines["saturated"] == "100 %"
+    assert lines["pile-up"].startswith("0.25 % ")
 
 
 def test_a_page_replaces_nothing_unasked(tmp_path):

@@ -19,8 +19,12 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.chain_description import describe_responses, stand_electronics
-from cpunet.jobs.inspection.closed_forms import learned_chain, true_chain_of
+from cpunet.jobs.inspection.chain_description import (
+    chain_of,
+    describe_responses,
+    stand_electronics,
+)
+from cpunet.jobs.inspection.closed_forms import learned_chain, true_chain_of, true_parameters
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
@@ -123,6 +127,22 @@ def test_an_overshoot_is_found_without_the_decays(tmp_path):
     assert numbers["overshoot"] == pytest.approx(0.1, abs=2e-3)
     assert numbers["slow_share"] == pytest.approx(-0.1)
     assert numbers["slow_time_ns"] == pytest.approx(1600)
+
+
+def test_parts_of_the_same_time_add_up(tmp_path):
+    time_ns = np.array([50.0, 200.0, 600.0])
+    found = [
+        chain_of(
+            write_response(tmp_path / name, f"generator.slow_ns={slow_ns}", slow=weights)
+        ).undecayed.step(time_ns)
+        for name, slow_ns, weights in (
+            ("a", [400], {0: 0.06}),
+            ("b", [400, 400], {0: 0.04, 1: 0.02}),
+        )
+    ]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+    both = electronics(overshoot={"fraction": 0.02, "tau_ns": 400})
+    assert true_parameters(both)["slow_share"] == pytest.approx(0.065 - 0.02)
 
 
 def test_noise_is_told_in_kev(tmp_path):
@@ -338,6 +358,14 @@ def test_runs_that_cannot_be_described(run, tmp_path):
     refused(coarse, truth=electronics(), parts=(f"{coarse}: ", "electronics known samples"))
     (other / "weights.safetensors").write_bytes(b"")
     refused(other, parts=("weights.safetensors: no readable weights",))
+
+
+@pytest.mark.parametrize(
+    "fit", [{"moments": 9}, {"moments": 9, "chi_square": "9"}, {"noise": 3}]
+)
+def test_a_damaged_fit_is_told_in_one_line(tmp_path, fit):
+    run = write_response(tmp_path / "run", fit=fit)
+    one_line(lambda: describe_responses([run]), f"{run}: the fit in its run.json is damaged")
 
 
 def test_a_network_has_no_closed_form(tmp_path):

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -96,6 +97,21 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
 
 
+def test_a_library_of_currents_is_refused(chain: Path, tmp_path: Path) -> None:
+    source, time = tmp_path / "currents.lh5", np.arange(600.0)
+    with h5py.File(source, "w") as file:
+        library = file.create_group("V01")
+        for name, values, units in (("r", [0, 1], "mm"), ("z", [0, 1], "mm"), ("dt", 1, "ns")):
+            library[name] = values
+            library[name].attrs["units"] = units
+        library["waveform_000_deg"] = np.tile(
+            np.exp(-0.5 * ((time - 300) / 30) ** 2), (2, 2, 1)
+        )
+    with pytest.raises(CpunetError, match="these are currents"):
+        export_legend_pars(chain, tmp_path / "pars", library=source)
+    assert not (tmp_path / "pars").exists()
+
+
 @pytest.mark.slow  # a library is made
 def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
     detector = read_detector("ppc", ["grid_mm=0.2"])
@@ -114,6 +130,11 @@ def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
         ({"training": {"recipe": "fast", "peak": "SEP", "seed": 0}}, "of a run with peak SEP"),
         ({"ae_energy": {"missing": "two few events"}}, "no A/E against energy: two few"),
         ({"ae_energy": 3, "training": None}, "give the folder that `cpunet validate` made"),
+        ({"ae_energy": None}, "give the folder that `cpunet validate` made"),
+        (
+            {"ae_energy": {"methods": {"data": METHOD}}},
+            "give the folder that `cpunet validate`",
+        ),
     ],
 )
 def test_other_reports_are_refused(

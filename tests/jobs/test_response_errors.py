@@ -28,7 +28,20 @@ def test_what_is_known_together_has_a_small_error() -> None:
     assert found["difference"] == pytest.approx(np.sqrt(0.08 + 2 * 0.0399))
 
 
-@pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((4, 4), np.nan).tolist()])
+def test_a_number_that_is_not_always_defined_has_no_error() -> None:
+    """Along the other axes its error would be too small."""
+
+    def partly(response: ElectronicsResponse) -> dict[str, float]:
+        found = numbers(response)
+        return found if response.slow_weights.item() > -0.1 else {"sum": found["sum"]}
+
+    found = propagated(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0]).tolist(), partly)
+    assert list(found) == ["sum"]
+
+
+@pytest.mark.parametrize(
+    "covariance", [[], [[1.0]], [[1.0], [1.0, 2.0]], np.full((4, 4), np.nan).tolist()]
+)
 def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
     assert propagated(RESPONSE, covariance, numbers) == {}
 

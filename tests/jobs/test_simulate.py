@@ -23,6 +23,7 @@ from cpunet.jobs.simulation.hit_sources import (
     Window,
     energy_windows,
 )
+from cpunet.jobs.simulation.pulse_shape_library import write_library
 from cpunet.jobs.simulation.simulate import Resolution, simulate_file
 from cpunet.jobs.simulation.simulation_settings import load_settings
 from cpunet.pulses.peaks import parse_selection
@@ -316,3 +317,14 @@ def test_wrong_settings_name_the_file(tmp_path: Path, text: str, said: str):
         load_settings(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
+
+
+def test_a_library_without_templates_is_not_written(ppc, tmp_path):
+    short = SimulationSettings(dt_ns=1, length_ns=50)
+    for grid_mm, said in (
+        (100, "none of 2 .* 2 give no signal"),
+        (20, r"\d+ are not collected in time"),
+    ):
+        with pytest.raises(CpunetError, match=said):
+            write_library(ppc, tmp_path / "psl.lh5", settings=short, grid_mm=grid_mm)
+    assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,15 @@ import pytest
 from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation import stand_plan
-from cpunet.jobs.simulation.hit_sources import Window
-from cpunet.jobs.simulation.stand import make_stand
+from cpunet.jobs.simulation.hit_sources import GammaSource, OpenHits, Window
+from cpunet.jobs.simulation.stand import make_stand, write_stand
+from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.field_lookup import Maps
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
@@ -63,6 +67,25 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     monkeypatch.setattr(stand_plan, "build_library", build)
     monkeypatch.setattr("cpunet.jobs.simulation.stand._LIBRARY_FROM_EVENTS", sum(EVENTS))
     return built
+
+
+class Dead(GammaSource):
+    """Two hits beside the crystal."""
+
+    def open(self, detector: Detector) -> OpenHits:
+        place = [[0.0, 0.0, 2 * detector.crystal_length]] * 2
+        return OpenHits(2, iter([Hits.of(place, [2614.5] * 2, [0, 1, 2])]))
+
+
+@pytest.mark.parametrize("side", ["sim", "data"])
+def test_a_side_without_any_signal_is_told_in_one_line(tmp_path: Path, side: str) -> None:
+    plan = StandPlan.of(read_electronics("ornl"), DETECTOR, WINDOWS[:1], (2,))
+    dead = replace(getattr(plan, side), source=Dead(WINDOWS[:1], (2,), 20.0, 5.0, 0))
+    with pytest.raises(
+        CpunetError, match="none of 2 events gives a signal in small; give more"
+    ):
+        write_stand(replace(plan, **{side: dead}), tmp_path / "stand")
+    assert list(tmp_path.iterdir()) == []
 
 
 def made(out: Path, seed: int = 0, kind: str = "matched") -> dict[str, npt.NDArray[Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 from contextlib import contextmanager
@@ -27,8 +28,10 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.output_lock import only_writer
 from cpunet.jobs.common.pool import work_off
+from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
+from cpunet.jobs.translation.translate_channels import translate_channels
 from cpunet.jobs.translation.translate_files import expanded, translate_files
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.jobs.translation.translation_blocks import noise_seed, regrouped
@@ -36,6 +39,7 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
@@ -225,6 +229,38 @@ def test_realisations_repeat_rows(run, tmp_path):
     assert together == pytest.approx(-0.5, abs=0.03)  # three independent draws about their mean
 
 
+def test_channels_have_noise_of_their_own(run, tmp_path):
+    source = sim_file(tmp_path / "sim.lh5")
+    with h5py.File(source, "a") as file:
+        for channel in ("ch1", "ch2"):
+            file.copy("geds/sim", f"{channel}/sim")
+        del file["geds"]
+    outcome = translate_channels(run, InputFile(source, "all"), tmp_path / "out", device="cpu")
+    assert {name: told["translated"] for name, told in outcome.done.items()} == {
+        "ch1": N,
+        "ch2": N,
+    }
+    first, second = (values(tmp_path / "out" / f"ch{i}.lh5")[:, :300] for i in (1, 2))
+    together = (first * second).mean() / (first.std() * second.std())
+    assert together == pytest.approx(0, abs=0.05)
+
+
+def test_the_options_of_a_translation_are_told(busy, tmp_path):
+    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    adc = Adc(baseline=0.0)
+    for number, (options, said) in enumerate(
+        [
+            (TranslateOptions(), None),
+            (TranslateOptions(noise=False), "noise False"),
+            (TranslateOptions(seed=4, remains="learned"), "seed 4, remains learned"),
+            (TranslateOptions(adc=adc, realisations=2), "realisations 2, adc baseline 0.0"),
+        ]
+    ):
+        out = tmp_path / f"{number}.lh5"
+        translate_file(busy, source, out, options, device="cpu")
+        assert provenance(open_pulses(out)).get("options") == said
+
+
 def test_a_column_appended_to_a_copy(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5", **many_columns())
     with h5py.File(source, "a") as file:
@@ -297,6 +333,40 @@ def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, l
     assert out.read_bytes() == expected
 
 
+def test_options_may_be_numbers_of_numpy(run, tmp_path):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    options = TranslateOptions(seed=np.int64(3), realisations=np.int32(2))
+    told = translate_file(run, source, out, options, device="cpu")
+    options = TranslateOptions(seed=3, realisations=2)
+    assert translate_file(run, source, out, options, device="cpu", resume=True) == told | {
+        "skipped": True
+    }
+
+
+def changed_record(path, change):
+    with h5py.File(path, "a") as file:
+        record = json.loads(file.attrs["cpunet_translation"])
+        change(record)
+        file.attrs["cpunet_translation"] = json.dumps(record)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda record: record["options"].update(former=3), r"other options \(former\)"),
+        (lambda record: record["options"].pop("seed"), r"other options \(seed\)"),
+        (lambda record: record["counts"].pop("rejections"), "does not say how many pulses"),
+    ],
+)
+def test_a_file_with_another_record_is_not_kept(run, tmp_path, change, said):
+    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    translate_file(run, source, out, device="cpu")
+    assert translate_file(run, source, out, device="cpu", resume=True)["skipped"]
+    changed_record(out, change)
+    with pytest.raises(CpunetError, match=said):
+        translate_file(run, source, out, device="cpu", resume=True)
+
+
 def test_seeds_differ_by_file_block_and_realisation():
     seeds = [
         noise_seed(seed, key, block, realisation)
@@ -307,6 +377,7 @@ def test_seeds_differ_by_file_block_and_realisation():
     ]
     assert len(set(seeds)) == len(seeds)
     assert noise_seed(5, None, 0) == 5
+    assert noise_seed(5, "s\udcff.lh5", 0) != 5  # a name that is not UTF-8
 
 
 @pytest.fixture(scope="module")
@@ -320,6 +391,19 @@ def sequential(run, many, tmp_path_factory):
     out = tmp_path_factory.mktemp("sequential") / "out"
     told = translate_files(run, many, out, device="cpu")
     return out, told
+
+
+def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch):
+    """And yet none may be another's input."""
+    seen = []
+    monkeypatch.setattr(
+        "cpunet.jobs.translation.translate_files.refuse_inputs",
+        lambda *paths: seen.append(len(paths)),
+    )
+    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
+    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
+        translate_files(run, many, tmp_path, device="cpu", force=True)
+    assert max(seen) <= 4
 
 
 def test_files_in_a_folder(sequential):
@@ -637,6 +721,8 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
         ({"pile_up_khz": 1.0, "noise": False}, "leave out --no-noise"),
         ({"pile_up_khz": 1.0, "inverse": True}, "leave out --pile-up-khz"),
         ({"table": ""}, "--out-table is empty"),
+        ({"seed": -1}, "seed -1: expected a whole number from 0"),
+        ({"seed": 2**64}, "expected a whole number from 0"),
         ({"table": "/"}, "--out-table is empty"),
         ({"remains": "many"}, "--remains many: expected learned, none, or a rate in kHz"),
         ({"remains": "-1"}, "expected learned, none, or a rate"),

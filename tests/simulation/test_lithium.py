@@ -97,5 +97,5 @@ def test_the_file_serves_reboosts_surface_model(tmp_path: Path) -> None:
     assert (np.diff(highest[20:]) > 0).all()
     with pytest.raises(CpunetError, match="exists already"):
         write_lithium_library(LithiumLayer(1.0), tmp_path / "lithium.lh5")
-    with pytest.raises(CpunetError, match="give less"):
-        write_lithium_library(LithiumLayer(1.0), tmp_path / "x.lh5", step_mm=2.0)
+    with pytest.raises(CpunetError, match="give a thicker one"):
+        write_lithium_library(LithiumLayer(0.005, 0.001), tmp_path / "x.lh5")

@@ -120,7 +120,8 @@ def describe_responses(
     if not learned:
         raise CpunetError("no run was given; give the folder of one")
     first = learned[0]
-    _require_alike(learned, truth)
+    require_alike([(run.path, run.dt_ns, run.preparation) for run in learned], "describe")
+    _require_sampling(first, truth)
     told: dict[str, Any] = {
         "cpunet": cpunet.__version__,
         "dt_ns": first.dt_ns,
@@ -227,7 +228,7 @@ def _shape_numbers(
     response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
 ) -> Numbers:
     """Derived numbers of a response, which are not parameters of the fit."""
-    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
+    slow = list(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
     numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
     return slow_numbers(slow) | numbers
 
@@ -235,17 +236,23 @@ def _shape_numbers(
 def _told(run: _Learned) -> dict[str, Any]:
     slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
     values = {n: v for n, v in run.parameters.items() if n not in slow}
-    values |= slow_numbers({float(n.split("_")[1]): w for n, w in slow.items()})
+    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
     values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
-    if run.fit.get("moments"):
-        values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+    try:
+        if run.fit.get("moments"):
+            values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
+        noise_error = _noise_error(run)
+    except (LookupError, TypeError, AttributeError) as error:
+        raise CpunetError(
+            f"{run.path}: the fit in its run.json is damaged ({error}); train again"
+        ) from error
     return {
         "path": str(run.path),
         "recipe": run.info["recipe"],
         "peak": run.info["peak"],
         "seed": run.info["seed"],
         "values": values,
-        "errors": {n: e for n, e in run.errors.items() if n in values} | _noise_error(run),
+        "errors": {n: e for n, e in run.errors.items() if n in values} | noise_error,
         "parameters": run.parameters,
         "parameter_errors": run.errors,
         "doubts": _doubts(run),
@@ -303,19 +310,25 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
-def _require_alike(runs: Sequence[_Learned], truth: Electronics | None) -> None:
-    first = runs[0]
-    for run in runs[1:]:
-        if not np.isclose(run.dt_ns, first.dt_ns):
+def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]], do: str) -> None:
+    """Raise a `CpunetError` unless all runs have the period (ns) and preparation of the first.
+
+    `do` is the verb of what can be done with each of them instead.
+    """
+    (first, first_ns, preparation), *others = runs
+    for run, dt_ns, other in others:
+        if not np.isclose(dt_ns, first_ns):
             raise CpunetError(
-                f"{run.path}: trained on pulses sampled every {run.dt_ns:g} ns, {first.path} "
-                f"every {first.dt_ns:g} ns; describe them one by one"
+                f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
+                f"{first_ns:g} ns; {do} them one by one"
             )
-        if run.preparation != first.preparation:
+        if other != preparation:
             raise CpunetError(
-                f"{run.path}: trained with another preparation than {first.path}; describe "
-                "them one by one"
+                f"{run}: trained with another preparation than {first}; {do} them one by one"
             )
+
+
+def _require_sampling(first: _Learned, truth: Electronics | None) -> None:
     if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
         raise CpunetError(
             f"{first.path}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,22 +22,21 @@ _FOREVER_US = 1e9  # decay time of a chain without decay
 def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     """The closed form of a fitted chain: a sum of exponentials, like a true chain."""
     poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
-    slow = dict(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
-    fast = dict(
-        zip(response.fast_times_us.tolist(), response.decay_weights.tolist(), strict=True)
-    )
-    taus = moved_apart([*poles, *slow, 1e3 * main, *(1e3 * tau for tau in fast)])
+    slow, fast = response.slow_weights.tolist(), response.decay_weights.tolist()
+    fast_ns = [1e3 * tau for tau in response.fast_times_us.tolist()]
+    taus = moved_apart([*poles, *response.slow_ns.tolist(), 1e3 * main, *fast_ns])
     n, n_slow = len(poles), len(slow)
+    slow_taus = taus[n : n + n_slow]
     undecayed = Exponentials.of_real(
-        1 - sum(slow.values()),
-        taus[n : n + n_slow],
-        [weight / tau for weight, tau in zip(slow.values(), taus[n:], strict=False)],
+        1 - sum(slow),
+        slow_taus,
+        [weight / tau for weight, tau in zip(slow, slow_taus, strict=True)],
     )
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
     if len(response.ringing):
         undecayed = undecayed * _ringing(response)
-    shares = [1 - sum(fast.values()), *fast.values()]
+    shares = [1 - sum(fast), *fast]
     whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
     return Chain(name, whole, undecayed)
 
@@ -99,7 +98,9 @@ def true_parameters(electronics: Electronics) -> Numbers:
     numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
     # an overshoot is a slow part of negative sign
     parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
-    numbers |= slow_numbers({part.tau_ns: sign * part.fraction for part, sign in parts if part})
+    numbers |= slow_numbers(
+        [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
+    )
     if ring := electronics.ringing:
         numbers["ringing"] = ring.fraction
         numbers["ringing_mhz"] = ring.frequency_MHz
@@ -109,10 +110,10 @@ def true_parameters(electronics: Electronics) -> Numbers:
     return numbers | {f"decay_{part.tau_us:g}_us": part.fraction for part in fast}
 
 
-def slow_numbers(shares: Mapping[float, float]) -> Numbers:
-    """Total late share and its mean time, from shares by time in ns."""
-    total = sum(shares.values())
+def slow_numbers(parts: Sequence[tuple[float, float]]) -> Numbers:
+    """Total late share and its mean time, from times in ns and their shares."""
+    total = sum(share for _, share in parts)
     numbers = {"slow_share": total}
     if abs(total) >= _MIN_SLOW:
-        numbers["slow_time_ns"] = sum(tau * w for tau, w in shares.items()) / total
+        numbers["slow_time_ns"] = sum(tau * share for tau, share in parts) / total
     return numbers

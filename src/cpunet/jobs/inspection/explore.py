@@ -18,6 +18,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile, load_measured
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.inspection.chain_description import require_alike
 from cpunet.jobs.inspection.places import Places, place_pulses, settings_at
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
@@ -167,18 +168,8 @@ def _load(runs: Sequence[Path], device: str) -> list[REN]:
     if not runs:
         raise CpunetError("no run was given; name the folder of at least one")
     translators = [REN.load(run, device) for run in runs]
-    first = translators[0]
-    for run, ren in zip(runs, translators, strict=True):
-        if not np.isclose(ren.dt_ns, first.dt_ns):
-            raise CpunetError(
-                f"{run}: trained on pulses sampled every {ren.dt_ns:g} ns, {runs[0]} every "
-                f"{first.dt_ns:g} ns; explore them one by one"
-            )
-        if ren.recipe.preparation != first.recipe.preparation:
-            raise CpunetError(
-                f"{run}: trained with another preparation than {runs[0]}; explore them one "
-                "by one"
-            )
+    alike = [(r, t.dt_ns, t.recipe.preparation) for r, t in zip(runs, translators, strict=True)]
+    require_alike(alike, "explore")
     return translators
 
 

@@ -19,7 +19,7 @@ from cpunet.jobs.inspection.hits_info import Units, describe_hits
 from cpunet.jobs.inspection.info_page import Spectra, write_info_page
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
-from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.outputs import refuse_existing, resolved
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
@@ -115,14 +115,24 @@ def describe(
     path = Path(path)
     for target in (without_remains, out):
         if target is not None:
-            refuse_inputs(target, path, energy)
-    if out is not None:
-        refuse_existing(out, force=force)
+            refuse_existing(target, path, energy, force=force)
+    if (
+        out is not None
+        and without_remains is not None
+        and resolved(out) == resolved(without_remains)
+    ):
+        raise CpunetError(
+            f"{out}: is given for the page and for the traces; choose another --out"
+        )
     if path.is_dir():
-        told: dict[str, Any] = {"kind": "run", "path": str(path), **_run(path)}
+        if without_remains is not None:
+            raise CpunetError(f"{path}: a run has no traces; leave out --without-remains")
+        told = _run(path) | {"kind": "run", "path": str(path)}
         spectra: Spectra = {}
     elif holds_hits(path) and without_remains is None:
-        told = describe_hits(path, table, recipe.peaks if recipe else {}, detector, hit_units)
+        chosen = None if table == ALL else table
+        peaks = recipe.peaks if recipe else {}
+        told = describe_hits(path, chosen, peaks, detector, hit_units)
         spectra = {}
     else:
         file = InputFile(path, table, energy, kev_per_adc, dt_ns)
@@ -166,13 +176,19 @@ def _of_pulses(
     counts = _Counts(dict.fromkeys(peaks, 0))
     for block in source.blocks():
         counts.add(block, peaks)
-    told = {"kind": "pulses", "path": str(path), **source.describe(), **counts.summary()}
+    spectrum = counts.spectrum()
+    told = {
+        "kind": "pulses",
+        "path": str(path),
+        **source.describe(),
+        **counts.summary(spectrum),
+    }
     made = provenance(source)
     told |= {"provenance": made} if made else {}
     if recipe is None or _side(source) != "measured":
         if without_remains is not None:
             raise CpunetError(f"{path}: remains are taken off measured traces; these are none")
-        return told, counts.spectrum()
+        return told, spectrum
     try:
         told["traces"] = trace_properties(source.blocks(BLOCK), recipe)
     except CpunetError as error:
@@ -182,10 +198,10 @@ def _of_pulses(
     except CpunetError as error:
         if without_remains is not None:
             raise CpunetError(f"{path}: {error}") from error
-        return told | {"remains": f"not known: {error}"}, counts.spectrum()
+        return told | {"remains": f"not known: {error}"}, spectrum
     if without_remains is not None:
         _write_without(source, remains, without_remains, force=force)
-    return told | {"remains": remains.describe()}, counts.spectrum()
+    return told | {"remains": remains.describe()}, spectrum
 
 
 def _told_of(
@@ -270,20 +286,15 @@ class _Counts:
         values = np.concatenate(self.energies or self.amplitudes or [np.empty(0)])
         return Spectrum(values, in_kev=known, found=suggested_calibration(values))
 
-    def _likely_calibration(self) -> dict[str, str]:
-        """Calibration suggested by lines in the amplitudes, if no energy is known."""
-        if self.energies or not self.amplitudes:
-            return {}
-        found = self.spectrum().found
-        return {"amplitudes": "no lines that stand out" if found is None else f"like {found}"}
-
-    def summary(self) -> dict[str, Any]:
+    def summary(self, spectrum: Spectrum) -> dict[str, Any]:
+        found = spectrum.found
+        amplitudes = "no lines that stand out" if found is None else f"like {found}"
         return {
             "n_pulses": self.n_pulses,
             "energy_kev": self.energy_kev or None,
             "n_without_energy": self.n_without_energy,
             "peaks": self.peaks,
-            **self._likely_calibration(),
+            **({} if spectrum.in_kev else {"amplitudes": amplitudes}),
             "samples": self.samples or None,
             "n_not_finite": self.n_not_finite,
             "n_constant": self.n_constant,

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cpunet.analysis.html_pages import figure_html, rendered
 from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.files import written_aside
@@ -64,7 +66,7 @@ def _section(
     }
     if not isinstance(told, str):
         section["lines"] = in_words(told) if "kind" in told else list(told.items())
-    if spectrum is not None and len(spectrum.values):
+    if spectrum is not None and np.isfinite(spectrum.values).any():
         caption = "Energies" if spectrum.in_kev else "Amplitudes"
         section["figure"] = figure_html(f"{caption} {name}".strip(), spectrum_figure(spectrum))
         section["found"] = _found(spectrum)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 Lines = list[tuple[str, str]]
@@ -68,8 +69,8 @@ def _traces(told: Mapping[str, Any]) -> Lines:
         ("baseline", f"{told['baseline_samples']} samples before nearly all pulses"),
         ("decay", f"{decay:.3g} µs" if decay else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),
-        ("saturated", f"{told['saturated_percent']:.2g} %"),
-        ("pile-up", f"{told['pile_up_percent']:.2g} % (tails that are no single decay)"),
+        ("saturated", _percent(told["saturated_percent"])),
+        ("pile-up", f"{_percent(told['pile_up_percent'])} (tails that are no single decay)"),
         ("left out", f"{_counts(told['rejected']) or 'none'} of {told['looked_at']} traces"),
     ]
 
@@ -159,7 +160,8 @@ def _run(told: Mapping[str, Any]) -> Lines:
         value = with_std(noise["rms"], noise.get("rms_error"))
         lines.append(("noise", f"{value} keV{of}"))
     if "rate_khz" in (remains := _mapping(fit, "remains")):
-        lines += _remains(remains)
+        with suppress(LookupError, TypeError, ValueError):  # run.json is damaged
+            lines += _remains(remains)
     versions = _mapping(told, "versions")
     lines += [
         ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
@@ -200,18 +202,14 @@ def _parameters(values: Mapping[str, Any]) -> str:
     words = []
     for name, value in values.items():
         stem, _, unit = name.rpartition("_")
-        share = re.fullmatch(r"(slow|decay)_\d+_(ns|us)|ringing_(sine|cosine)", name)
+        shown = f" {UNITS[unit]}" if unit in UNITS else ""
+        called = (stem if shown else name).replace("_", " ")
+        share = re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name)
         if share and isinstance(value, int | float):
-            words.append(f"{_called(name, stem, unit)} {100 * value:.2g} %")
+            words.append(f"{called}{shown} {_percent(100 * value)}")
         else:
-            shown = f" {UNITS[unit]}" if unit in UNITS else ""
-            words.append(f"{(stem if shown else name).replace('_', ' ')} {_text(value)}{shown}")
+            words.append(f"{called} {_text(value)}{shown}")
     return ", ".join(words)
-
-
-def _called(name: str, stem: str, unit: str) -> str:
-    called = f"{stem} {UNITS[unit]}" if unit in UNITS else name
-    return called.replace("_", " ")
 
 
 def _counts(counts: Mapping[str, Any]) -> str:
@@ -221,6 +219,11 @@ def _counts(counts: Mapping[str, Any]) -> str:
 def _span(values: Any, digits: int = 9) -> str:
     """Both ends to six digits, and no more than `digits` after the point."""
     return " … ".join(f"{round(v, digits):.6g}" for v in values) if values else NOTHING
+
+
+def _percent(value: float) -> str:
+    """Two digits, and whole numbers from 99.5 on."""
+    return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"
 
 
 def _text(value: Any) -> str:

@@ -19,8 +19,14 @@ from cpunet.pulses.side import (
 )
 from cpunet.yaml_files import plain_json
 
-# default values of the options of a translation
-_PLAIN = {"noise": True, "remains": "none"}
+# default values of the options of a translation; that of all others is None
+_DEFAULTS = {
+    "inverse": False,
+    "noise": True,
+    "seed": 0,
+    "remains": "none",
+    "pile_up_khz": 0.0,
+}
 
 
 def provenance(source: PulseSource) -> dict[str, str]:
@@ -94,6 +100,16 @@ def _of_translation(record: Mapping[str, Any]) -> dict[str, str]:
         names = [str(one.get("name")) for one in source["files"] if isinstance(one, Mapping)]
         words["from"] = ", ".join(names)
     if isinstance(chosen, Mapping):
-        given = {k: v for k, v in chosen.items() if v not in (None, False, _PLAIN.get(k))}
-        words["options"] = ", ".join(f"{name} {value}" for name, value in given.items())
+        words["options"] = ", ".join(_given(chosen))
+    return words
+
+
+def _given(options: Mapping[str, Any]) -> list[str]:
+    """Names and values of the options that differ from their defaults."""
+    words = []
+    for name, value in options.items():
+        if isinstance(value, Mapping):  # settings of traces in ADC counts
+            words.append(" ".join([name, *_given(value)]))
+        elif value != _DEFAULTS.get(name):
+            words.append(f"{name} {value}")
     return words

@@ -43,24 +43,31 @@ def propagated(
     Returns
     -------
     dict
-        Standard deviation by name; empty if the covariance does not match the parameters.
+        Standard deviation by name, of numbers that are defined at both ends of every axis;
+        empty if the covariance does not match the parameters.
     """
     moved = copy.deepcopy(response)
     parameters = Parameters(moved)
-    centre, matrix = parameters.vector(), np.asarray(covariance, float)
+    centre = parameters.vector()
+    try:
+        matrix = np.asarray(covariance, float)
+    except ValueError:  # rows of different lengths
+        return {}
     if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
         return {}
     variances, axes = np.linalg.eigh(matrix)
-    squares: Numbers = {}
+    ends = []
     for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
-        ends = []
-        for sign in (1, -1):
-            parameters.set(centre + sign * axis)
+        for end in (centre + axis, centre - axis):
+            parameters.set(end)
             ends.append(numbers(moved))
-        for name in ends[0].keys() & ends[1].keys():
-            half = 0.5 * (ends[0][name] - ends[1][name])
-            squares[name] = squares.get(name, 0.0) + half**2
-    return {name: float(np.sqrt(square)) for name, square in squares.items()}
+    errors: Numbers = {}
+    for name in ends[0]:
+        if all(name in end for end in ends):
+            values = np.array([end[name] for end in ends])
+            half = 0.5 * (values[::2] - values[1::2])
+            errors[name] = float(np.sqrt(sum(half**2)))
+    return errors
 
 
 def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:

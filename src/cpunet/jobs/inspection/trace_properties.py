@@ -13,6 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
+from cpunet.pulses.reading.energies import amplitude
 from cpunet.recipes.schema import Recipe
 
 BLOCKS, BLOCK = 4, 1024  # number of blocks, traces per block: a few thousand are enough
@@ -62,10 +63,11 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
         "baseline_samples": int(np.nanquantile(start, SHORTEST)),
         "noise_adc": float(np.nanmedian(noise)),
     }
-    prepared = Prepared.concatenate([prepare(b, recipe.preparation, "measured") for b in seen])
-    kev = prepared.pulses.energy_kev / prepared.scale
+    kev = np.concatenate([block.energy_kev for block in seen])[with_pulse]
+    kev /= np.concatenate([amplitude(block.waveforms) for block in seen])[with_pulse]
     if np.isfinite(kev).sum() >= MIN_NUMBER:
         told["noise_kev"] = told["noise_adc"] * float(np.nanmedian(kev))
+    prepared = Prepared.concatenate([prepare(b, recipe.preparation, "measured") for b in seen])
     if len(prepared) >= MIN_NUMBER:
         slope = float(np.median(prepared.tail_slope))
         if slope < 0:

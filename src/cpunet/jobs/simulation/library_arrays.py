@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.hdf5_files import text_attribute
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.reading.columns import TIME_UNITS
 from cpunet.translation.library_mode import AFTER_NS, BEFORE_NS, aligned_currents
@@ -45,38 +46,34 @@ def charge_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
     new = h5py.h5d.create(
         made.id, name, plain.get_type(), plain.get_space(), plain.get_create_plist()
     )
-    return Arrays(_with_attrs(h5py.Dataset(new), given))
+    waveforms = h5py.Dataset(new)
+    waveforms.attrs.update(given.attrs)
+    return Arrays(waveforms)
 
 
-def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str) -> Arrays:
-    """Create datasets for currents and for the times of their maxima in ns."""
-    dt = given.parent["dt"]
-    dt_ns = float(dt[()]) * TIME_UNITS[dt.attrs["units"]]
+def current_arrays(given: h5py.Dataset, made: h5py.Group, angle: str, dt_ns: float) -> Arrays:
+    """Create datasets for currents and for the times of their maxima in ns.
+
+    Currents of templates of whole numbers are float32, since in 1/ns they are below 1.
+    """
     samples = round(BEFORE_NS / dt_ns) + round(AFTER_NS / dt_ns)
     n_r, n_z, _ = given.shape
     options: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     waveforms = made.create_dataset(
         f"waveform_{angle}",
         (n_r, n_z, samples),
-        given.dtype,
+        given.dtype if given.dtype.kind == "f" else np.float32,
         chunks=(1, n_z, samples),
         **options,
     )
-    _with_attrs(waveforms, given).attrs["units"] = "1/ns"
+    waveforms.attrs.update({**given.attrs, "units": "1/ns"})
     times = made.create_dataset(f"drift_time_{angle}", (n_r, n_z), np.float64)
     times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
     return Arrays(waveforms, times)
 
 
-def add_t0(dt: h5py.Dataset, made: h5py.Group, before_ns: float) -> None:
+def add_t0(dt: h5py.Dataset, made: h5py.Group, dt_ns: float, before_ns: float) -> None:
     """Add ``t0``, `before_ns` before time 0, in the units of ``dt``."""
-    ns_per_unit = TIME_UNITS[dt.attrs["units"]]
-    dt_ns = float(dt[()]) * ns_per_unit
-    t0 = -round(before_ns / dt_ns) * dt_ns / ns_per_unit
-    put_column(made, "t0", t0, dt.attrs["units"])
-
-
-def _with_attrs(made: h5py.Dataset, given: h5py.Dataset) -> h5py.Dataset:
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
-    return made
+    units = text_attribute(dt, "units")
+    t0 = -round(before_ns / dt_ns) * dt_ns / TIME_UNITS[units]
+    put_column(made, "t0", t0, units)

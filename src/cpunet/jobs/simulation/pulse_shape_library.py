@@ -18,7 +18,7 @@ from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import Signals, hit_signals
+from cpunet.simulation.signals import hit_signals
 
 QUIET = Monitor()
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
@@ -68,7 +68,8 @@ def write_library(
     Raises
     ------
     CpunetError
-        If the detector is not depleted, the grid is empty, or the file cannot be written.
+        If the detector is not depleted, no grid point has a template, or the file cannot be
+        written.
     """
     refuse_existing(out, force=force)
     if not (math.isfinite(grid_mm) and grid_mm > 0):
@@ -95,6 +96,12 @@ def write_library(
         for angle in angles_deg:
             _fill(library, angle, fields, settings, counts, advance)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
+        if not counts["written"]:
+            raise CpunetError(
+                f"{out}: none of {counts['templates']} grid points has a template: "
+                f"{counts['outside']} give no signal, {counts['late']} are not collected in "
+                "time; give a finer grid or longer records"
+            )
     return counts
 
 
@@ -122,17 +129,13 @@ def _fill(
         x, y = r * math.cos(phi), r * math.sin(phi)
         signals = hit_signals(fields, x, y, z_mm, ENERGY_KEV, settings)
         good = signals.valid & signals.collected
-        waveforms[i] = _kept(signals, good)
+        waveforms[i] = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
         drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
         counts["templates"] += len(z_mm)
         counts["written"] += int(good.sum())
         counts["outside"] += int((~signals.valid).sum())
         counts["late"] += int((signals.valid & ~signals.collected).sum())
         advance(len(z_mm))
-
-
-def _kept(signals: Signals, good: np.ndarray[Any, np.dtype[np.bool_]]) -> Any:
-    return np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
 
 
 def _array(

@@ -125,13 +125,16 @@ def simulate_file(
     blocks = _merged(opened.blocks, detector, cluster_mm, summary)
     first = next(blocks)
     clock.lap("first hits")
-    summary.mode = _resolved(mode, len(first.edep_kev) / len(first) * opened.n_events)
-    library = _library(fields, settings, monitor) if summary.mode == "library" else None
+    resolved = _resolved(mode, len(first.edep_kev) / len(first) * opened.n_events)
+    summary.mode = resolved
+    library = _library(fields, settings, monitor) if resolved == "library" else None
     clock.lap("library")
     with writer, monitor.stage(f"Simulating {detector.name}", opened.n_events) as advance:
         for block in chain([first], blocks):
             clock.lap("waiting for hits")
-            events = _simulate(fields, block, settings, library, advance)
+            events = simulate_events(
+                fields, block, settings, resolved, _steps_of(advance), library
+            )
             clock.lap("pulses")
             summary.add(detector, block, events, windows)
             _append(writer, block, events, settings, resolution, seed)
@@ -189,17 +192,6 @@ def _merged(
     for block in blocks:
         summary.hits_before_merging += len(block.edep_kev)
         yield merge_hits(block, detector, distance_mm)
-
-
-def _simulate(
-    fields: FieldMaps,
-    hits: Hits,
-    settings: SimulationSettings,
-    library: Library | None,
-    advance: Advance,
-) -> EventPulses:
-    mode: Literal["exact", "library"] = "exact" if library is None else "library"
-    return simulate_events(fields, hits, settings, mode, _steps_of(advance), library)
 
 
 def _steps_of(advance: Advance) -> Callable[[int, int], None]:

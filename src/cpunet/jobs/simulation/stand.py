@@ -82,8 +82,6 @@ def make_stand(
     kind: Kind = "matched",
     shift: Shift | None = None,
     settings: SimulationSettings | None = None,
-    height_mm: float = 20.0,
-    radius_mm: float = 5.0,
     seed: int = 0,
     force: bool = False,
     monitor: Monitor = QUIET,
@@ -118,8 +116,6 @@ def make_stand(
     settings
         Settings of the simulated pulses, without the period; those of the data differ by the
         shift.
-    height_mm, radius_mm
-        Height and radius of the source, a disc above the crystal.
     seed
         Seed of all random numbers; the sides are independent.
     force, monitor
@@ -139,8 +135,6 @@ def make_stand(
         kind=kind,
         shift=shift,
         settings=settings,
-        height_mm=height_mm,
-        radius_mm=radius_mm,
         seed=seed,
     )
     return write_stand(plan, out, force=force, monitor=monitor)

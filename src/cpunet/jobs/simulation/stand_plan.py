@@ -32,6 +32,8 @@ LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
 OTHER = 3
 # Period of the simulated pulses at the input of the chain; same as that of the library.
 _FINE_NS = 4.0
+# The source, a disc above the crystal.
+_HEIGHT_MM, _RADIUS_MM = 20.0, 5.0
 # Default of `cpunet simulate`.
 CLUSTER_MM = 0.05
 
@@ -56,6 +58,11 @@ class Side:
 
         Energies are calibrated as in a measurement: a factor, determined from the lines in the
         first block, corrects the median loss by charge trapping.
+
+        Raises
+        ------
+        CpunetError
+            If no event gives a signal.
         """
         with monitor.stage(f"Fields of {self.detector.name}"):
             fields = compute_fields(self.detector)
@@ -75,6 +82,11 @@ class Side:
                     calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
                 advance(len(hits))
+        if not gain:
+            raise CpunetError(
+                f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
+                "give more with --events"
+            )
 
 
 @dataclass(frozen=True)
@@ -114,8 +126,6 @@ class StandPlan:
         kind: Kind = "matched",
         shift: Shift | None = None,
         settings: SimulationSettings | None = None,
-        height_mm: float = 20.0,
-        radius_mm: float = 5.0,
         seed: int = 0,
     ) -> Self:
         """Plan a stand, see `cpunet.jobs.simulation.stand.make_stand`.
@@ -139,7 +149,8 @@ class StandPlan:
             int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
         )
         sim_hits, data_hits = (
-            GammaSource(windows, events, height_mm, radius_mm, s) for s in (sim_seed, data_seed)
+            GammaSource(windows, events, _HEIGHT_MM, _RADIUS_MM, s)
+            for s in (sim_seed, data_seed)
         )
         sim = Side(detector, settings, sim_hits)
         data = Side(

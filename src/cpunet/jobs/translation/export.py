@@ -77,7 +77,7 @@ def export_run(
     report
         Folder of a report on this run, whose scores are copied to the card.
     force
-        Whether to replace existing files.
+        Whether to replace existing files; those of noise are removed if there is none.
     monitor
         Receiver of the progress.
 
@@ -95,14 +95,19 @@ def export_run(
     info = read_info(run)
     scores = None if report is None else _scores(report)
     noise = _kept_noise(translator.backend)
-    with monitor.stage("Exporting"), written_aside(out) as aside:
-        difference = export(graph_of(translator), aside, form)
-    if noise is not None:
-        with written_aside(noise_file) as aside:
-            _write_noise(aside, noise)
-    done = Exported(out, card, None if noise is None else noise_file, difference)
-    with written_aside(card) as aside:
-        aside.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
+    with (
+        monitor.stage("Exporting"),
+        written_aside(out) as graph,
+        written_aside(card) as text,
+    ):
+        difference = export(graph_of(translator), graph, form)
+        done = Exported(out, card, None if noise is None else noise_file, difference)
+        text.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
+        if noise is not None:
+            with written_aside(noise_file) as aside:
+                _write_noise(aside, noise)
+    if noise is None:
+        noise_file.unlink(missing_ok=True)  # of an export that this one replaces
     return done
 
 
@@ -279,9 +284,10 @@ def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
         "|---|---|---|",
     ]
     for peak, content in peaks.items():
-        if not isinstance(content, dict):
+        parameters = content.get("parameters", content) if isinstance(content, dict) else None
+        if not isinstance(parameters, dict):
             continue
-        for name, values in content.get("parameters", content).items():
+        for name, values in parameters.items():
             iou = values.get("iou") if isinstance(values, dict) else None
             if not isinstance(iou, dict):
                 continue

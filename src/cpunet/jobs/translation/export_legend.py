@@ -23,20 +23,16 @@ from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.inspection.chain_description import describe_responses
-from cpunet.jobs.inspection.closed_forms import learned_chain
-from cpunet.jobs.translation.library_file import require_whole
+from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
     known_detector,
 )
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.outputs import FolderKind, refuse_existing
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info, weights_sha256
-from cpunet.translation.backends import ResponseBackend
-from cpunet.translation.translator import REN
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
@@ -104,8 +100,8 @@ def export_legend_pars(
         monitor.note(f"warning: {doubt}")
     known = known_detector(run, info)
     name = detector or known or EVERY_DETECTOR
-    ae = None if report is None else _against_energy(report, info)
-    undecayed = _chain(run).undecayed
+    methods, ae_pars = ({}, {}) if report is None else _against_energy(report, info)
+    undecayed = chain_of(run).undecayed
     with monitor.stage("Two numbers for the chain"):
         nearest = fitted_kernel(undecayed)
         equivalent: dict[str, Any] = asdict(nearest)
@@ -128,10 +124,9 @@ def export_legend_pars(
             "current_maximum_delay_ns": current_delay_ns(undecayed),
             "about": "time of the largest averaged current less this is a charge's drift time",
         },
-        "ae_against_energy": {} if ae is None else ae["methods"],
+        "ae_against_energy": methods,
     }
-    pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}}
-    pars |= {} if ae is None else _ae_pars(ae)
+    pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}} | ae_pars
     with folder_written_aside(
         out, LEGEND_PARS, *given, force=force, note=monitor.note
     ) as folder:
@@ -155,20 +150,19 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _chain(run: Path) -> Any:
-    backend = REN.load(run).backend
-    assert isinstance(backend, ResponseBackend)  # or `describe_responses` would have raised
-    chain: ResponseGenerator = backend.chain
-    return learned_chain(chain.response, run.name)
-
-
-def _against_energy(report: Path, info: Mapping[str, Any]) -> dict[str, Any]:
+def _against_energy(
+    report: Path, info: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A/E against energy of a report on this run, and the entries of production for it."""
     path = report / "metrics.json"
     try:
         metrics = plain_json(read_text(path, MAX_BYTES))
         training, found = metrics["training"], metrics["ae_energy"]
         other = [key for key in SAME if training[key] != info[key]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        missing = found.get("missing")
+        methods = {} if missing else dict(found["methods"])
+        pars = {} if missing else _ae_pars(methods)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
         ) from error
@@ -177,15 +171,14 @@ def _against_energy(report: Path, info: Mapping[str, Any]) -> dict[str, Any]:
             f"{report}: of a run with {other[0]} {training[other[0]]}, this one has "
             f"{info[other[0]]}; validate this run"
         )
-    if "missing" in found:
-        raise CpunetError(f"{report}: no A/E against energy: {found['missing']}")
-    return dict(found)
+    if missing:
+        raise CpunetError(f"{report}: no A/E against energy: {missing}")
+    return methods, pars
 
 
-def _ae_pars(ae: Mapping[str, Any]) -> dict[str, Any]:
+def _ae_pars(methods: Mapping[str, Any]) -> dict[str, Any]:
     """Production entries for A/E: mean of the translation and width of the data."""
-    mean = ae["methods"]["ren"]["mean"]
-    width = ae["methods"]["data"]["resolution"]
+    mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
     return {
         "aoemeanmod": {
             "psl": {"expression": "x*a+b", "pars": {k: mean[k] for k in ("a", "b")}}
@@ -213,12 +206,14 @@ def _of_library(
         charge = _some(values)
     if not len(charge):
         raise CpunetError(f"{source}: {library.path}: no template of charge")
+    n = len(charge)
+    require_charge(f"{source}: {library.path}", n, n, n_not_ending(charge))
     rng = np.random.default_rng(0)
-    share = rng.random((len(charge), 1), np.float32)
-    two_sites = share * charge + (1 - share) * charge[rng.permutation(len(charge))]
+    share = rng.random((n, 1), np.float32)
+    two_sites = share * charge + (1 - share) * charge[rng.permutation(n)]
     alone = ae_ratios(charge, undecayed, nearest)
     usual = float(np.median(alone))  # divided out, since A/E is calibrated
-    return {"library": library.path, "templates": len(charge)} | {
+    return {"library": library.path, "templates": n} | {
         name: {"rms_percent": float(apart.std()), "largest_percent": float(np.abs(apart).max())}
         for name, apart in (
             ("single_site", 100 * (alone / usual - 1)),

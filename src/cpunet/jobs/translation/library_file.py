@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, require_stored, text_attribute
@@ -15,6 +16,8 @@ from cpunet.pulses.reading.columns import TIME_UNITS
 from cpunet.pulses.reading.source import MAX_SAMPLES
 
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
+# Templates of charge end near their maximum; templates of current do not.
+_MIN_END = 0.5
 
 
 def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
@@ -66,7 +69,7 @@ def n_templates(file: h5py.File, path: str, source: Path) -> int:
             f"{where}: no {missing[0]} beside the waveforms; complete the library"
         )
     for name in ("r", "z"):
-        if not is_column(library[name]) or library[name].ndim != 1:
+        if not is_column(library[name]) or library[name].ndim != 1 or not len(library[name]):
             raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
     total = 0
     for name in filter(WAVEFORM.fullmatch, library):
@@ -96,10 +99,43 @@ def sampling_period_ns(library: h5py.Group, where: str) -> float:
         raise CpunetError(
             f"{where}: dt is in {str(units)!r}; known units are {', '.join(TIME_UNITS)}"
         )
-    value = float(np.asarray(dt[()]).reshape(-1)[0]) * TIME_UNITS[units]
+    value = number(dt) * TIME_UNITS[units]
     if not 1e-3 <= value <= 1e9:
         raise CpunetError(f"{where}: dt is {value:g} ns; expected 0.001 to 1e9")
     return value
+
+
+def number(item: h5py.Dataset) -> float:
+    """The value of a number, which may be stored as a column with one row."""
+    return float(np.asarray(item[()]).reshape(-1)[0])
+
+
+def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
+    """Number of templates that end below half of their height, as those of current do."""
+    return int((templates[:, -1] < _MIN_END * np.abs(templates).max(axis=1)).sum())
+
+
+def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
+    """Raise an error if none of `n` templates has a signal, or most are no charge pulses.
+
+    Parameters
+    ----------
+    where
+        File, and library in it, for the message.
+    n, moving, not_ending
+        Numbers of templates, of those with a translated signal, and among these of those
+        that end low (`n_not_ending`).
+    """
+    if not moving:
+        raise CpunetError(
+            f"{where}: none of {n} templates can be translated; are they charge pulses?"
+        )
+    if 2 * not_ending > moving:
+        raise CpunetError(
+            f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
+        )
 
 
 def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
@@ -122,14 +158,12 @@ def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
         h5py.h5d.create(made.id, name.encode(), kind, space, dcpl=stored)
         copy = made[name]
         copy[()] = values
-    for key, value in item.attrs.items():
-        copy.attrs[key] = value
+    copy.attrs.update(item.attrs)
 
 
 def copy_group(given: h5py.Group, made: h5py.Group) -> None:
     """Copy a group and everything in it by value; see `copy_values`."""
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
+    made.attrs.update(given.attrs)
     for name, item in given.items():
         if isinstance(item, h5py.Group):
             copy_group(item, made.create_group(name))

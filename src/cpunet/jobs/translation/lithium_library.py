@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,7 +23,6 @@ def write_lithium_library(
     layer: LithiumLayer,
     out: Path,
     *,
-    step_mm: float = STEP_MM,
     force: bool = False,
 ) -> dict[str, float]:
     """Tabulate the charge that arrives from a lithium layer by depth and time.
@@ -37,8 +35,6 @@ def write_lithium_library(
     ----------
     layer
         Lithium layer.
-    step_mm
-        Spacing of the depths in mm.
     force
         Whether to replace an existing file.
 
@@ -51,14 +47,15 @@ def write_lithium_library(
     Raises
     ------
     CpunetError
-        If the step exceeds the thickness of the layer, or the file cannot be written.
+        If the layer is thinner than the spacing of the depths, or the file cannot be written.
     """
     refuse_existing(out, force=force)
-    if not (math.isfinite(step_mm) and 0 < step_mm <= layer.thickness_mm):
+    if layer.thickness_mm < STEP_MM:
         raise CpunetError(
-            f"depths every {step_mm} mm in a layer of {layer.thickness_mm} mm; give less"
+            f"depths every {STEP_MM} mm in a layer of {layer.thickness_mm} mm; give a thicker "
+            "one"
         )
-    depth = step_mm * np.arange(round(layer.thickness_mm / step_mm))
+    depth = STEP_MM * np.arange(round(layer.thickness_mm / STEP_MM))
     time = np.arange(LENGTH_NS, dtype=float)
     share = arrived(layer, depth, time)
     arrays = {

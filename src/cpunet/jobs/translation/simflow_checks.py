@@ -72,7 +72,8 @@ class IdealLibrary:
         if not np.isclose(dt_ns, PERIOD_NS):
             raise CpunetError(
                 f"{where}: sampled every {dt_ns:g} ns, production reads templates of 1 ns; "
-                "make the library with a period of 1 ns, or leave out --format simflow"
+                "make the library with a period of 1 ns (`cpunet library translate` without "
+                "--format simflow takes any)"
             )
         names = sorted(filter(WAVEFORM.fullmatch, group))
         angles = tuple(name.removeprefix("waveform_") for name in names)

@@ -15,13 +15,14 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
-from cpunet.hdf5_files import is_column, opened, require_all_stored
+from cpunet.hdf5_files import is_column, opened, require_all_stored, text_attribute
 from cpunet.jobs.simulation.library_arrays import put_column
-from cpunet.jobs.translation.library_file import copy_group
+from cpunet.jobs.translation.library_file import copy_group, number
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.translation.low_rank import Loss
 from cpunet.translation.peak_currents import LENGTH, PEAK
+from cpunet.yaml_files import plain_json
 
 Floats = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
@@ -90,14 +91,11 @@ class Made:
         return AngleArrays(values, times, self.basis)
 
 
-def describe(group: h5py.Group, told: str) -> None:
-    """Add LH5 attributes and the provenance to a complete library."""
-    group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
-    group.attrs[TOLD] = told
-    parent = group.parent
-    while parent.name != "/":  # LH5 requires this attribute on every level
-        parent.attrs["datatype"] = f"struct{{{','.join(sorted(parent))}}}"
-        parent = parent.parent
+def describe(group: h5py.Group) -> None:
+    """Add LH5's attribute to a complete library and to every level above it."""
+    while group.name != "/":
+        group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
+        group = group.parent
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,25 +187,28 @@ def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
             held = ", ".join(names) or "none"
             wish = "name the detector" if detector is None else f"no library of {detector}"
             raise CpunetError(f"{path}: {wish}; the file has {held}")
-        group = file[detector]
-        basis = group.get(_COMPONENTS)
-        prefix = "waveform_" if basis is None else "coefficients_"
-        arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
-        try:
-            told = json.loads(group.attrs.get(TOLD, "{}"))
-        except ValueError:
-            told = {}
-        return RealisticLibrary(
-            str(detector),
-            np.asarray(group["r"][()], np.float64),
-            np.asarray(group["z"][()], np.float64),
-            float(group["dt"][()]),
-            float(group["t0"][()]),
-            {angle: group[n.replace(prefix, "drift_time_")][()] for angle, n in arrays.items()},
-            told,
-            {angle: group[name][()] for angle, name in arrays.items()},
-            None if basis is None else basis[()],
-        )
+        return _read(file[detector], detector)
+
+
+def _read(group: h5py.Group, detector: str) -> RealisticLibrary:
+    basis = group.get(_COMPONENTS)
+    prefix = "waveform_" if basis is None else "coefficients_"
+    arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
+    try:
+        told = plain_json(text_attribute(group, TOLD) or "{}")
+    except ValueError:
+        told = {}
+    return RealisticLibrary(
+        detector,
+        np.asarray(group["r"][()], np.float64),
+        np.asarray(group["z"][()], np.float64),
+        number(group["dt"]),
+        number(group["t0"]),
+        {angle: group[n.replace(prefix, "drift_time_")][()] for angle, n in arrays.items()},
+        told if isinstance(told, dict) else {},
+        {angle: group[name][()] for angle, name in arrays.items()},
+        None if basis is None else basis[()],
+    )
 
 
 def realistic_libraries(file: h5py.File) -> list[str]:
@@ -223,21 +224,20 @@ def realistic_libraries(file: h5py.File) -> list[str]:
 
 
 def _is_realistic(group: h5py.Group) -> bool:
-    if not all(is_column(group.get(name)) for name in ("r", "z", "dt", "t0")):
+    axes, numbers = ([group.get(n) for n in names] for names in (("r", "z"), ("dt", "t0")))
+    if not all(is_column(item) and item.ndim == 1 for item in axes):
         return False
-    shape = (len(group["r"]), len(group["z"]))
-    names = [n for n in group if n.startswith(("waveform_", "coefficients_"))]
-    times = [f"drift_time_{n.split('_', 1)[1]}" for n in names]
-    whole = [n for n in names if isinstance(group[n], h5py.Dataset) and group[n].ndim == 3]
-    return (
-        bool(names)
-        and whole == names
-        and all(
-            isinstance(group.get(t), h5py.Dataset)
-            and group[t].shape == shape == group[n].shape[:2]
-            for t, n in zip(times, names, strict=True)
-        )
-    )
+    if not all(is_column(item) and item.size == 1 for item in numbers):
+        return False
+    shape = tuple(map(len, axes))
+    names = [name for name in group if name.startswith(("waveform_", "coefficients_"))]
+    for name in names:
+        values, times = group[name], group.get(f"drift_time_{name.split('_', 1)[1]}")
+        if not (isinstance(values, h5py.Dataset) and isinstance(times, h5py.Dataset)):
+            return False
+        if values.ndim != 3 or not values.shape[:2] == times.shape == shape:
+            return False
+    return bool(names)
 
 
 def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) -> list[str]:
@@ -279,15 +279,22 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
                     axis = _time_axis(file[name])
                     _require_new(name, path, axis, first)
                     first[name] = (path, axis)
-                    copy_group(file[name], made.h5.create_group(name))
+                    _copy(file[name], made.h5)
     return sorted(first)
+
+
+def _copy(group: h5py.Group, made: h5py.File) -> None:
+    """Copy a library to the same place in another file."""
+    copy = made.create_group(group.name)
+    copy_group(group, copy)
+    describe(copy.parent)
 
 
 def _time_axis(group: h5py.Group) -> tuple[float, float, int]:
     """Period, first time and number of samples."""
     waveforms = (name for name in group if name.startswith("waveform_"))
     array = _COMPONENTS if _COMPONENTS in group else next(waveforms)
-    return float(group["dt"][()]), float(group["t0"][()]), int(group[array].shape[-1])
+    return number(group["dt"]), number(group["t0"]), int(group[array].shape[-1])
 
 
 def _require_new(
@@ -313,32 +320,42 @@ def _require_new(
 def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]:
     """Expand components to whole templates, so that reboost can read the file.
 
+    Libraries of whole templates are copied.
+
+    Returns
+    -------
+    list of str
+        Names of all libraries.
+
     Raises
     ------
     CpunetError
         If the file contains no library of components.
     """
     refuse_existing(out, source, force=force)
-    done: list[str] = []
     with opened(source) as file:
         require_all_stored(source, file)
         names = realistic_libraries(file)
-    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
-        for name in names:
-            library = read_library(source, name)
-            if library.rank is None:
-                continue
-            group = made.h5.create_group(name)
-            arrays = Made.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
-            for angle, times in library.drift_time_ns.items():
-                whole = arrays.angle(f"{angle:03d}_deg")
-                whole.put(slice(0, len(times)), library.currents(angle), Loss())
-                whole.put_times(times)
-            describe(group, json.dumps(library.told))
-            done.append(name)
-        if not done:
+        if not any(_COMPONENTS in file[name] for name in names):
             raise CpunetError(
                 f"{source}: no library of components; make one with --low-rank, or use the "
                 "file as it is"
             )
-    return done
+        with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+            for name in names:
+                if _COMPONENTS in file[name]:
+                    _write_whole(_read(file[name], name), made.h5.create_group(name))
+                else:
+                    _copy(file[name], made.h5)
+    return names
+
+
+def _write_whole(library: RealisticLibrary, group: h5py.Group) -> None:
+    """Write the templates of a library of components."""
+    made = Made.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
+    for angle, times in library.drift_time_ns.items():
+        whole = made.angle(f"{angle:03d}_deg")
+        whole.put(slice(0, len(times)), library.currents(angle), Loss())
+        whole.put_times(times)
+    group.attrs[TOLD] = json.dumps(library.told)
+    describe(group)

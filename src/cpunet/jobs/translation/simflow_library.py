@@ -22,14 +22,14 @@ from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.translation.library_file import n_templates, require_whole
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
     known_detector,
     require_complete,
 )
-from cpunet.jobs.translation.simflow_files import Made, describe
+from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
@@ -47,8 +47,6 @@ from cpunet.translation.translator import REN
 QUIET = Monitor()
 ROWS = 16  # rows of r translated at a time
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
-# Templates of charge end near their maximum; templates of current do not.
-MIN_END = 0.5
 
 Floats = npt.NDArray[np.float32]
 
@@ -117,13 +115,11 @@ def translate_for_simflow(
         require_whole(given, source, set())
         names = chosen_libraries(given, source, detectors, known_detector(run, info))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
-        for library in ideal:
-            n_templates(given, library.path, source)  # raises an error if damaged
         made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
                 looked = _look(ren, library, given[library.path], source, monitor)
-                group = made.h5.create_group(library.path)
+                group = made.h5.require_group(library.path)
                 job = _Writing(looked, library, rings, rank)
                 told[library.path] = job.write(given[library.path], group, made_from, monitor)
     return told
@@ -166,24 +162,13 @@ def _look(
                 good = np.isfinite(times)
                 there[there] = good
                 mask[first : first + len(block)] = there
-                ends = np.abs(templates[good])
-                moving += len(ends)
-                not_ending += int((ends[:, -1] < MIN_END * ends.max(axis=1)).sum())
+                moving += int(good.sum())
+                not_ending += n_not_ending(templates[good])
                 amplitudes.append(heights(currents[good]))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
                 advance(block.shape[0] * block.shape[1])
             inside[angle] = mask
-    if not moving:
-        raise CpunetError(
-            f"{source}: {library.path}: none of {library.n_templates} templates can be "
-            "translated; are they charge pulses?"
-        )
-    if 2 * not_ending > moving:
-        raise CpunetError(
-            f"{source}: {library.path}: {not_ending} of {moving} templates end below half of "
-            "their maximum: these are currents, or behind electronics already; give the "
-            "library of charge pulses"
-        )
+    require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
     some = np.concatenate(kept)
@@ -237,7 +222,8 @@ class _Writing:
             numbers["rank"] = len(basis)
             numbers["loss"] = loss.told()
         content = {"cpunet": cpunet.__version__, "rings": self.rings} | made_from | numbers
-        describe(group, json.dumps(content))
+        group.attrs[TOLD] = json.dumps(content)
+        describe(group)
         return numbers
 
     def _rows(

@@ -25,18 +25,18 @@ from cpunet.jobs.translation.translation_blocks import (
     regrouped,
 )
 from cpunet.jobs.translation.translation_record import (
+    as_json,
     finished,
     require_unchanged,
     run_print,
     source_print,
-    stamp,
 )
 from cpunet.jobs.translation.translation_writers import Writer, other_columns, writer_of
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
-from cpunet.pulses.side import TRANSLATED_BY, recorded_side, require_side
+from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
@@ -98,8 +98,7 @@ class FileTranslation:
         Parameters
         ----------
         noise_key
-            Name that is combined with the seed, so that the noise of files differs; None for
-            the noise of `cpunet.translation.translator.Translator.translate`.
+            See `translate_file`.
         """
         refuse_inputs(out, self.run, *source.files)
         with only_writer(out):
@@ -118,7 +117,8 @@ class FileTranslation:
                 self._require_some(source, counts)
                 require_unchanged(source, before)
                 told = counts.told(adc=self.options.adc is not None)
-                stamp(writer, made | {"counts": told, "cpunet": cpunet.__version__})
+                record = made | {"counts": told, "cpunet": cpunet.__version__}
+                writer.stamp(TRANSLATION, as_json(record))
             return told
 
     def opened(self, source: InputFile) -> PulseSource:
@@ -222,6 +222,7 @@ def translate_file(
     out: Path,
     options: TranslateOptions = DEFAULTS,
     *,
+    noise_key: str | None = None,
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
@@ -238,6 +239,9 @@ def translate_file(
         Folder of a training run.
     source
         Simulated pulses, or measured ones for the inverse.
+    noise_key
+        Name that is combined with the seed, so that the noise of files or channels differs;
+        None for the noise of `cpunet.translation.translator.Translator.translate`.
     resume
         Whether to keep an output that was made from this source with this run and options.
     device, force, monitor
@@ -258,7 +262,9 @@ def translate_file(
     translation = FileTranslation(run, options, device)
     for note in translation.notes:
         monitor.note(note)
-    return translation(source, out, resume=resume, force=force, monitor=monitor)
+    return translation(
+        source, out, noise_key=noise_key, resume=resume, force=force, monitor=monitor
+    )
 
 
 def _read(pulses: PulseSource, advance: Advance) -> Iterator[Pulses]:

@@ -26,6 +26,8 @@ def translate_channels(
 ) -> Outcome[dict[str, Any]]:
     """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
+    The noise depends on the seed and the name of the channel, so that of channels differs.
+
     Parameters
     ----------
     runs
@@ -51,7 +53,9 @@ def translate_channels(
     def translate(name: str, pair: Pair, place: Path) -> dict[str, Any]:
         run = own_folder(runs, name, INFO)
         target = place.with_name(f"{name}.lh5")
-        return translate_file(run, pair[0], target, options, monitor=monitor, **how)
+        return translate_file(
+            run, pair[0], target, options, noise_key=name, monitor=monitor, **how
+        )
 
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
     return one_by_one(channels, out, translate, monitor.note)

@@ -83,11 +83,9 @@ def translate_files(
         or `force`) or would have the same names; at the end, if files failed.
     """
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
-    read = [run, *(given for source in sources for given in source.files)]
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    for task in tasks:
-        refuse_inputs(task.out, *read)
+    _refuse_inputs(tasks, run)
     _require_apart(tasks, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
     for note in FileTranslation(run, options, device).notes:
@@ -193,6 +191,27 @@ def _threads_kept() -> Iterator[None]:
 
 def _name(path: Path) -> str:
     return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
+
+
+def _refuse_inputs(tasks: Sequence[_Task], run: Path) -> None:
+    """Raise a `CpunetError` if an output is an input of any task, or lies in the run.
+
+    Thousands of files are compared by their identity, and not each with each other.
+    """
+    inputs = {_identity(task.source.path) for task in tasks} - {None}
+    for task in tasks:
+        refuse_inputs(task.out, run, *task.source.files)
+        if _identity(task.out) in inputs:
+            raise CpunetError(f"{task.out}: is the input; choose another --out")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Device and number of a file, the same under all its names; None if there is none."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_dev, stat.st_ino
 
 
 def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None:

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
@@ -21,7 +20,9 @@ from cpunet.jobs.translation.library_file import (
     WAVEFORM,
     copy_values,
     libraries,
+    n_not_ending,
     n_templates,
+    require_charge,
     require_whole,
     sampling_period_ns,
 )
@@ -36,37 +37,49 @@ from cpunet.translation.translator import REN
 QUIET = Monitor()
 TEMPLATES_AT_A_TIME = 1024
 KEPT = 256  # templates to measure the linearity with
-# Templates of charge end near their maximum; templates of current do not.
-MIN_END = 0.5
 
 
 @dataclass
 class _Tally:
-    """Counts of the templates by outcome, and a sample of them."""
+    """Counts of the templates by outcome, and a sample of one length with its translator."""
 
+    currents: bool
     counts: Counter[str] = field(default_factory=Counter)
-    libraries: list[str] = field(default_factory=list)
     not_ending: int = 0
     kept: list[FloatArray] = field(default_factory=list)
     translate: TemplateTranslator | None = None
 
     def add(
-        self, templates: npt.NDArray[np.floating], codes: npt.NDArray[np.uint8], seed: int
+        self,
+        templates: npt.NDArray[np.floating],
+        codes: npt.NDArray[np.uint8],
+        translate: TemplateTranslator,
+        seed: int,
     ) -> None:
-        known = codes != Rejection.NAN
-        moving = known & templates.any(axis=1)
+        outside = np.isnan(templates).all(axis=1)
+        unknown, accepted = codes == Rejection.NAN, codes == Rejection.ACCEPTED
         self.counts["templates"] += len(codes)
-        self.counts["outside"] += int(np.isnan(templates).all(axis=1).sum())
-        self.counts["damaged"] += int((~known & ~np.isnan(templates).all(axis=1)).sum())
-        for code in codes[known & (codes != Rejection.ACCEPTED)]:
+        self.counts["outside"] += int(outside.sum())
+        self.counts["damaged"] += int((unknown & ~outside).sum())
+        for code in codes[~(unknown | accepted)]:
             self.counts[Rejection(int(code)).label] += 1
-        good = np.flatnonzero(moving & (codes == Rejection.ACCEPTED))
-        self.counts["translated"] += int((known & (codes == Rejection.ACCEPTED)).sum())
-        highest = np.abs(templates[good]).max(axis=1)
-        self.not_ending += int((np.abs(templates[good, -1]) < MIN_END * highest).sum())
+        good = np.flatnonzero(accepted & templates.any(axis=1))
+        self.counts["translated"] += int(accepted.sum())
+        # the maximum of a current is that of positive charge; charge may have either sign
+        rising = templates[good] if self.currents else np.abs(templates[good])
+        self.not_ending += n_not_ending(rising)
         self.counts["moving"] += len(good)
-        few = np.random.default_rng(seed).permutation(good)[:8]
-        self.kept.append(np.asarray(templates[few], np.float32))
+        if len(good):
+            few = np.random.default_rng(seed).permutation(good)[:8]
+            self._keep(np.asarray(templates[few], np.float32), translate)
+
+    def _keep(self, few: FloatArray, translate: TemplateTranslator) -> None:
+        if self.translate is not None:
+            before = self.translate.dt_ns, self.kept[-1].shape[1]
+            if before != (translate.dt_ns, few.shape[1]):  # no sums of these with those
+                self.kept = []
+        self.kept.append(few)
+        self.translate = translate
 
 
 def translate_library(
@@ -118,24 +131,25 @@ def translate_library(
     """
     refuse_existing(out, run, source, force=force)
     ren = REN.load(run, resolve_device(device))
-    tally = _Tally()
+    tally = _Tally(currents)
     with opened(source) as given:
         require_whole(given, source, set())
         paths = libraries(given, source)
         total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
         with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
-            _copy(given, made.h5, _Job(ren, tally, source, currents, advance))
-        _check(tally, source)
+            _copy(given, made.h5, _Job(ren, tally, source, advance))
+        counts = tally.counts
+        require_charge(str(source), counts["templates"], counts["moving"], tally.not_ending)
         assert tally.translate is not None
         apart = linearity(tally.translate, np.concatenate(tally.kept)[-KEPT:])
     numbers = {"templates", "translated", "outside", "moving"}
     return {
         "libraries": paths,
-        "templates": tally.counts["templates"],
-        "translated": tally.counts["translated"],
-        "outside": tally.counts["outside"],
-        "rejections": {k: n for k, n in tally.counts.items() if k not in numbers and n},
+        "templates": counts["templates"],
+        "translated": counts["translated"],
+        "outside": counts["outside"],
+        "rejections": {k: n for k, n in counts.items() if k not in numbers and n},
         "linearity": asdict(apart),
     }
 
@@ -145,38 +159,42 @@ class _Job:
     ren: REN
     tally: _Tally
     source: Path
-    currents: bool
     advance: Advance
 
 
 def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
     """Copy a group and everything in it, and translate the templates of libraries."""
-    for key, value in given.attrs.items():
-        made.attrs[key] = value
+    made.attrs.update(given.attrs)
     angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
     replaced = {f"waveform_{angle}" for angle in angles}
-    if angles:
-        where = f"{job.source}: {given.name.strip('/') or '/'}"
-        job.tally.translate = TemplateTranslator(job.ren, sampling_period_ns(given, where))
-        if job.currents:
-            replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
+    currents = job.tally.currents
+    if currents and angles:
+        replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
     for name, item in given.items():
         if isinstance(item, h5py.Group):
             _copy(item, made.create_group(name), job)
         elif name not in replaced:
             copy_values(item, made, name)
+    if not angles:
+        return
+    dt_ns = sampling_period_ns(given, f"{job.source}: {given.name.strip('/') or '/'}")
+    translate = TemplateTranslator(job.ren, dt_ns)
     for angle in sorted(angles):
         item = given[f"waveform_{angle}"]
-        arrays = (current_arrays if job.currents else charge_arrays)(item, made, angle)
-        _translate(item, arrays, job)
-    if angles and "t0" not in made:
-        add_t0(given["dt"], made, BEFORE_NS if job.currents else 0.0)
+        arrays = (
+            current_arrays(item, made, angle, dt_ns)
+            if currents
+            else charge_arrays(item, made, angle)
+        )
+        _translate(item, arrays, translate, job)
+    if "t0" not in made:
+        add_t0(given["dt"], made, dt_ns, BEFORE_NS if currents else 0.0)
         made.attrs["datatype"] = f"struct{{{','.join(made)}}}"
 
 
-def _translate(given: h5py.Dataset, made: Arrays, job: _Job) -> None:
-    translate = job.tally.translate
-    assert translate is not None
+def _translate(
+    given: h5py.Dataset, made: Arrays, translate: TemplateTranslator, job: _Job
+) -> None:
     n_r, n_z, n_samples = given.shape
     step = max(TEMPLATES_AT_A_TIME // n_z, given.chunks[0] if given.chunks else 1)
     step = min(step, max(1, BLOCK_BYTES // (4 * n_z * n_samples)))
@@ -188,19 +206,5 @@ def _translate(given: h5py.Dataset, made: Arrays, job: _Job) -> None:
         unknown = codes == Rejection.NAN
         results[unknown] = templates[unknown]
         made.put(rows, results, translate.dt_ns)
-        job.tally.add(templates, codes, seed=first)
+        job.tally.add(templates, codes, translate, seed=first)
         job.advance(len(templates))
-
-
-def _check(tally: _Tally, source: Path) -> None:
-    if not tally.counts["moving"]:
-        raise CpunetError(
-            f"{source}: none of {tally.counts['templates']} templates can be translated; are "
-            "they charge pulses?"
-        )
-    if 2 * tally.not_ending > tally.counts["moving"]:
-        raise CpunetError(
-            f"{source}: {tally.not_ending} of {tally.counts['moving']} templates end below "
-            "half of their maximum: these are currents, or behind electronics already; give "
-            "the library of charge pulses"
-        )

@@ -57,6 +57,8 @@ class TranslateOptions:
     pile_up_khz: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**64:
+            raise CpunetError(f"seed {self.seed}: expected a whole number from 0 to 2^64 - 1")
         if self.realisations is not None and self.realisations < 1:
             raise CpunetError(f"--realisations is {self.realisations}; expected 1 or more")
         if (self.realisations or 1) > 1 and not self.noise:

@@ -23,16 +23,17 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
     seed
         Seed of the translation.
     key
-        Name of the file; None for a single file, whose first block then has `seed` itself, as
-        in `cpunet.translation.translator.Translator.translate`.
+        Name of the file or the channel; None for a single file, whose first block then has
+        `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
     block
         Number of the block in the file.
     realisation
         Number of times that its noise was drawn before.
     """
     if key is None and block == realisation == 0:
-        return seed
-    digest = hashlib.sha256((key or "").encode()).digest()
+        return int(seed)
+    # names of files need not be UTF-8
+    digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
     words = [seed, block, realisation, int.from_bytes(digest[:16])]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
 

@@ -6,7 +6,9 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
@@ -16,14 +18,6 @@ from cpunet.training.run_folder import RECIPE, WEIGHTS
 from cpunet.yaml_files import plain_json
 
 Record = dict[str, Any]
-
-
-class Stamped(Protocol):
-    """A file that is being written."""
-
-    def stamp(self, name: str, text: str) -> None:
-        """Set an attribute of the file."""
-        ...
 
 
 def source_print(source: InputFile) -> Record:
@@ -95,7 +89,8 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
             continue
         told = f"another {what}"
         if what == "options" and isinstance(found.get(what), dict):
-            other = [name for name in value if found[what].get(name, ...) != value[name]]
+            theirs = found[what]
+            other = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
             told = f"other options ({', '.join(other)})"
         raise CpunetError(f"{out}: was made with {told}; choose another --out or give --force")
     counts = found.get("counts")
@@ -109,7 +104,7 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
 
 def _counted(counts: Mapping[str, Any]) -> list[Any]:
     """Counts of a translation that must be whole numbers."""
-    rejections = counts.get("rejections", {})
+    rejections = counts.get("rejections")
     reasons = rejections.values() if isinstance(rejections, dict) else [None]
     optional = [counts[name] for name in ("saturated",) if name in counts]
     return [counts.get("read"), counts.get("translated"), *optional, *reasons]
@@ -119,9 +114,9 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def stamp(file: Stamped, record: Record) -> None:
-    """Write the provenance into a file."""
-    file.stamp(TRANSLATION, json.dumps(record))
+def as_json(record: Record) -> str:
+    """The provenance as text; options given from Python may be numbers of NumPy."""
+    return json.dumps(record, default=np.generic.item)
 
 
 def _read(out: Path) -> Record:
