@@ -76,9 +76,13 @@ def test_equal_values_share_one_bin():
     assert histogram(np.array([7.0, 6.9, 7.1]), axis).tolist() == [1, 1, 1, 0]
 
 
-def test_the_largest_value_is_no_overflow():
-    data = np.linspace(0, 1, 11)
-    assert histogram(data, data_axis(data, 49))[-2:].tolist() == [0, 0]
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 1), (-20, -0.1), (-1, 1e-9), (-3, 0), (1e9, 1e9 + 1)]
+)
+def test_the_largest_value_is_no_overflow(low, high):
+    for n in range(11, 60):
+        data = np.linspace(low, high, n)
+        assert histogram(data, data_axis(data, 49))[-2:].tolist() == [0, 0]
 
 
 def test_without_finite_data_there_is_no_axis():
