@@ -130,8 +130,9 @@ def _rows_told(names: Sequence[str]) -> str:
     """
     told: list[tuple[str, str]] = []
     for name in names:
-        if told and name.isdecimal() and int(name) - 1 == int(told[-1][1]):
-            told[-1] = (told[-1][0], name)
+        first, last = told[-1] if told else ("", "")
+        if name.isdecimal() and last.isdecimal() and int(name) == int(last) + 1:
+            told[-1] = (first, name)
         else:
             told.append((name, name))
     return ", ".join(words_of(a) if a == b else f"{a}–{b}" for a, b in told)

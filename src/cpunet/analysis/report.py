@@ -171,15 +171,16 @@ def write_report(
 def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
     """Figures by their place on the page, see `PLACES`.
 
-    Mean pulses and noise are shown for a few peaks, preferably not that of the training.
+    Mean pulses and noise are shown for a few peaks, preferably not those of the training.
     """
+    trained = tuple(f"{peak} " for peak in [trained_on, *str(trained_on).split(",")])
     names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
     for name in drawn:
         told = name.replace("_", " ")
         end = next((end for end in PLACES if told.endswith(end)), None)
         names[PLACES[end] if end else "others"].append(name)
     for place in ("first", "noise"):
-        held_out = [n for n in names[place] if not n.startswith(f"{trained_on} ")]
+        held_out = [name for name in names[place] if not name.startswith(trained)]
         few = (held_out or names[place])[:FIRST]
         names["others"] += [name for name in names[place] if name not in few]
         names[place] = few
