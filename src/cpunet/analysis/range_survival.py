@@ -147,7 +147,7 @@ def _survival(
             "missing": f"the sidebands leave no events of {counts['peak']} "
             f"from {peak[0]:g} to {peak[1]:g} keV"
         }
-    if not scale:
+    if not scale or not std:
         # standard deviation of the posterior with a flat prior: not 0 if none or all survive
         n, p = counts["peak"], (counts["peak_pass"] + 1) / (counts["peak"] + 2)
         std = float(100 * np.sqrt(p * (1 - p) / (n + 3)))
