@@ -1,10 +1,11 @@
 // Mean pulses by slice of rise time, and single events; both above their differences.
 const EDGE = [0.01, 0.99]; // of the maximum
 
-// the times at which a pulse begins and ends its rise, with some room
+// the times at which a pulse begins and ends its rise, with some room; null if there is no pulse
 function edgeOf(xs, ys) {
   const top = Math.max(...ys.filter(Number.isFinite));
-  const begin = xs[ys.findIndex((y) => y > EDGE[0] * top)], end = xs[ys.findIndex((y) => y > EDGE[1] * top)];
+  const [begin, end] = EDGE.map((part) => xs[ys.findIndex((y) => y > part * top)]);
+  if (begin === undefined) return null;
   const room = Math.max((end - begin) * 0.15, xs[1] - xs[0]);
   return [begin - room, end + room];
 }
