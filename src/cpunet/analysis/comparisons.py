@@ -90,12 +90,12 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
         bins = int(np.clip(np.ceil((high - low) / width), 1, max_bins))
     else:
         # Half of the values are equal: one bin contains them, the others are outside.
-        margin = 1e-3 * max(abs(lower), 1.0)
-        low, high, bins = lower - margin, upper + margin, 1
-    # the last edge is exclusive, but a maximum inside the fence is not an overflow; the step
-    # is one of the larger edge, since (x - low) / (high - low) must round to less than 1
-    step = 2 * np.spacing(max(abs(low), abs(high)))
-    return hist.axis.Regular(bins, low, high + step)
+        half_width = 1e-3 * max(abs(lower), 1.0)
+        low, high, bins = lower - half_width, upper + half_width, 1
+    # The last edge is exclusive, but a maximum inside the fence is not an overflow: after
+    # rounding, (maximum - low) / (last edge - low) must be less than 1.
+    margin = 4 * np.spacing(max(abs(low), abs(high)))
+    return hist.axis.Regular(bins, low, high + margin)
 
 
 def histogram(values: Values, axis: hist.axis.Regular) -> Values:
