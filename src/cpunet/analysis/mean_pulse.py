@@ -7,7 +7,6 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.paired import align_half_maximum
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -18,16 +17,11 @@ class MeanPulse(NamedTuple):
 
     n: int
     mean: Values
-    before: int = 100
-
-    @classmethod
-    def of(cls, waveforms: FloatArray, before: int = 100, after: int = 150) -> Self:
-        """Average pulses of shape ``(n, length)``."""
-        return cls.of_aligned(align_half_maximum(waveforms, before, after), before)
+    before: int
 
     @classmethod
     def of_aligned(cls, aligned: FloatArray, before: int) -> Self:
-        """Average pulses already aligned by `align_half_maximum`."""
+        """Average pulses aligned by `paired.align_half_maximum`; NaN where none is known."""
         known = np.isfinite(aligned)
         count = known.sum(axis=0)
         total = np.where(known, aligned, 0).sum(axis=0, dtype=float)
