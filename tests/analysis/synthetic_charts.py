@@ -95,7 +95,7 @@ def views_of(n: int = EVENTS, more: int = 1) -> dict[str, Any]:
     return {
         "methods": method_looks(METHODS),
         "distributions": distributions(values, scores_of(values)),
-        "slices": superpulse_views(superpulses(len(labels)), labels, DT_NS),
+        "slices": superpulse_views(superpulses(len(labels)), {"SEP": labels}, DT_NS),
         "pulses": pulse_views({"SEP": clean, "DEP": {}}, DT_NS, {"SEP": measured}),
         "scatter": scatter_views(values),
     }

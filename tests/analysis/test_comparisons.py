@@ -27,7 +27,7 @@ from cpunet.analysis.distances import (
     null_distances,
     wasserstein,
 )
-from cpunet.analysis.resampling import both_resampled, resampled_twice
+from cpunet.analysis.resampling import Draws, Resampled, resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 
@@ -39,6 +39,12 @@ any_floats = arrays(
     st.integers(1, 60),
     elements=st.one_of(st.floats(-1e6, 1e6), st.just(np.nan), st.just(np.inf)),
 )
+
+
+def both_resampled(n_a: int, n_b: int, draws: int, seed: int) -> Draws:
+    """Bootstraps of two sets, each of its own size."""
+    rng = np.random.default_rng(seed)
+    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
 
 
 def test_range_comes_from_the_bulk_of_the_data():

@@ -200,7 +200,7 @@ def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> fl
     axis
         Common binning, see `data_axis`.
     draws
-        Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
+        Bootstraps of both, each of its own size.
     """
     drawn = (d.counts(*_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
     return float(_overlap(*drawn).std())

@@ -43,10 +43,8 @@ def nested_html(value: Any, level: int = 4) -> Markup:
     level
         Level of the headings, 1 … 6.
     """
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if value and all(isinstance(item, Mapping) for item in value):
-            return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
-        return part("p", _cell(value))
+    if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+        return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
     if not isinstance(value, Mapping):
         return part("p", _cell(value))
     parts = []

@@ -21,17 +21,13 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> Markup:
         return Markup()
     parts = []
     if verdicts.get("summary"):
-        parts.append(part("points", _texts(verdicts["summary"])))
-    if "missing" in verdicts:
-        parts.append(part("gap", verdicts["missing"]))
-    rows = []
-    for peak, methods in verdicts.get("table", {}).items():
-        for method, quantities in methods.items():
-            for quantity, found in quantities.items():
-                sigma = _sigma(found.get("sigma"))
-                rows.append(
-                    [peak, label(method), words_of(quantity), sigma, found.get("words", "")]
-                )
+        parts.append(part("points", verdicts["summary"]))
+    rows = [
+        [peak, label(method), words_of(quantity), _sigma(found["sigma"]), found["words"]]
+        for peak, methods in verdicts.get("table", {}).items()
+        for method, quantities in methods.items()
+        for quantity, found in quantities.items()
+    ]
     if rows:
         head = ["Peak", "Method", "Quantity", "σ", "In words"]
         table = html_table(head, rows, words={0, 1, 2, 4})
@@ -176,15 +172,6 @@ def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> Markup:
 
 def _thousandths(value: float | None) -> str:
     return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
-
-
-def _texts(value: Any) -> list[str]:
-    """Return all strings in nested lists and mappings, in order."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    return (
-        [t for item in value for t in _texts(item)] if isinstance(value, list) else [str(value)]
-    )
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
