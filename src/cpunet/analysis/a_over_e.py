@@ -255,17 +255,24 @@ def sideband_survival(
     return 100 * survival, float(100 * np.sqrt(variance))
 
 
+def survival_error(passing: int, n: int) -> float:
+    """Standard deviation of the posterior of a survival (0 … 1) with a flat prior.
+
+    Unlike a binomial error it is not 0 if none or all of the `n` events survive.
+    """
+    p = (passing + 1) / (n + 2)
+    return float(np.sqrt(p * (1 - p) / (n + 3)))
+
+
 def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
     finite = np.sort(values[np.isfinite(values)])
     n = finite.size
     if not n:
         return PeakSurvival(float("nan"), float("nan"))
     passing = n - int(np.searchsorted(finite, cut))
-    # standard deviation of the posterior with a flat prior: not 0 if none or all survive
-    p = (passing + 1) / (n + 2)
-    counting = np.sqrt(p * (1 - p) / (n + 3))
     of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
-    return PeakSurvival(100 * passing / n, float(100 * np.hypot(counting, of_cut)))
+    error = float(100 * np.hypot(survival_error(passing, n), of_cut))
+    return PeakSurvival(100 * passing / n, error)
 
 
 def _cut_rows(found: Mapping[str, Survival | None]) -> PeakTable:

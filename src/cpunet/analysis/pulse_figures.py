@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.style import DATA_FILL, colours, label, styled
+from cpunet.analysis.style import DATA_FILL, colours, label, linear_within, styled
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -277,9 +277,7 @@ def _draw_differences(
             axes.plot(time_ns, difference, color=palette[method], linewidth=1.0)
     for axes in panels:
         axes.axhline(0, color="black", linewidth=0.8)
-    # so that small differences show beside those of an untranslated simulation
-    panels[0].set_yscale("symlog", linthresh=LINEAR)
-    panels[0].yaxis.set_major_formatter("{x:g}")
+    linear_within(panels[0], LINEAR)
 
 
 def _aligned(method: str, window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:

@@ -18,7 +18,15 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import Comparison, histogram
 from cpunet.analysis.mean_pulse import MeanPulse
-from cpunet.analysis.style import COLOURS, DATA_FILL, colours, label, styled
+from cpunet.analysis.style import (
+    COLOURS,
+    DATA_FILL,
+    colours,
+    label,
+    line_look,
+    linear_within,
+    styled,
+)
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
@@ -215,12 +223,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     # the translation last, so that it is on top
     for method in sorted(means, key=lambda name: name == "ren"):
         mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
-        # a broad grey line, so that a method which agrees does not hide the data
-        look = (
-            {"color": "0.65", "linewidth": 4.0}
-            if method == "data"
-            else {"color": palette[method]}
-        )
+        look = line_look(method, palette[method])
         above.plot(time_ns, mean, label=text, **look)
         if method == "raw":
             # its different height would dominate the difference
@@ -236,9 +239,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         ylabel="Method − data\n[% of full charge,\nlinear within ± 1]",
         xlim=(time_ns[0], time_ns[-1]),
     )
-    # so that small differences show beside those of an untranslated simulation
-    below.set_yscale("symlog", linthresh=1.0)
-    below.yaxis.set_major_formatter("{x:g}")
+    linear_within(below, 1.0)
     return figure
 
 
