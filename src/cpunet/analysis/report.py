@@ -57,14 +57,14 @@ VIEWS = {
     "distributions": (
         "Parameter distributions",
         "In the bins in which they are scored, with the data's statistical errors; below, the "
-        "pull of each bin: method less data in standard deviations of both. The frame is "
-        "fitted without the raw simulation's points. The IoU beside the data is the ceiling.",
+        "pull of each bin: method minus data, divided by the error of the difference. Pulls of "
+        "the raw simulation do not set the scale. The IoU of the data is the ceiling.",
     ),
     "slices": (
         "Mean pulses by rise time",
         "Pulses aligned at half maximum and averaged within slices of rise time, 1 to 90 %; "
-        "below, the differences from the data's, with the standard error of each mean as a "
-        "band and that of the data in grey about zero. Errors of neighbouring samples are "
+        "below, the differences from the data, with the standard error of each mean as a band "
+        "and that of the data in grey about zero. Errors of neighbouring samples are "
         "correlated.",
     ),
     "pulses": (
@@ -73,9 +73,9 @@ VIEWS = {
     ),
     "scatter": (
         "Current amplitude and drift time",
-        "One point a pulse, data in grey and one method beside them; of larger sets a part, "
-        "drawn at random. The drift time ends at the maximum, which on a flat top is that of "
-        "the noise.",
+        "One point per pulse, the data in grey and one method beside them; of larger sets, a "
+        "random sample. The drift time ends at the maximum, which on a flat top is that of the "
+        "noise.",
     ),
 }
 # parts of the metrics that are shown as nested tables
@@ -105,8 +105,8 @@ def write_report(
         ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by
         method) and, if the truth is known, ``paired`` (result of `paired.paired_scores` by
         method); or ``missing`` with the reason why the peak is not scored.
-        ``verdicts``: ``summary``, a list of sentences, and ``table`` with ``sigma`` and
-        ``words`` by peak, method and quantity.  ``ae_survival``, ``ae_details``,
+        ``verdicts``: ``summary``, a list of sentences, and ``table``, see
+        `verdicts.verdict_table`.  ``ae_survival``, ``ae_details``,
         ``drift_slices``, ``linearity``, ``noise``: nested values, shown as tables.
         ``compared``: names and values of the compared inputs.  ``training``: how the network
         was trained.  ``rejections``: counts by reason, possibly nested.  ``ae_energy``: result

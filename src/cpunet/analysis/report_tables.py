@@ -101,7 +101,7 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
                 ]
             )
             title = ""
-    head = ["Peak", "Method", "Survival [%]", "Less data [points]", "In sigma"]
+    head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
     return html_table(head, rows, words={0, 1})
 
 
@@ -150,7 +150,7 @@ def _parameter_table(
 
 
 def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> Markup:
-    head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
+    head = ["Distinguished from data by a classifier", "AUC", "Same with shuffled labels"]
     rows = []
     for method, found in tested.items():
         if "missing" in found:

@@ -25,7 +25,7 @@ function nearestTo(xs) {
 const percent = (v) => (Number.isFinite(v) ? `${v < 0 ? "−" : "+"}${Math.abs(v).toPrecision(2)} %` : "–");
 
 function mountSuperpulses(host, data) {
-  const columns = [["n", "Pulses"], ["at", "Height"], ["off", "Less data"]];
+  const columns = [["n", "Pulses"], ["at", "Height"], ["off", "Minus data"]];
   let xs = [], means = {}, residuals = {}, sigma = {};
   const edge = () => xs.length && view.plot.zoomTo(edgeOf(xs, means.data || Object.values(means)[0]));
   const view = new View(host, {
@@ -81,7 +81,7 @@ function mountSuperpulses(host, data) {
       snap: nearestTo(xs),
       panels: [
         { label: "Pulse height", share: 1.3, series: upper },
-        { label: base ? "Less data [% of charge]" : "No data to compare", share: 1, symmetric: true, series: lower },
+        { label: base ? "Minus data [% of charge]" : "No data to compare", share: 1, symmetric: true, series: lower },
       ],
     });
     readout(null);
@@ -100,7 +100,7 @@ function mountSuperpulses(host, data) {
 // whether the differences of the untranslated simulation, tens of percent, set the scale
 function scaleBox(view, update) {
   const label = document.createElement("label");
-  label.innerHTML = "<input type=\"checkbox\"> scale to the raw simulation too";
+  label.innerHTML = "<input type=\"checkbox\"> include the raw simulation in the scale";
   view.controls.append(label);
   const box = label.querySelector("input");
   box.addEventListener("change", update);
@@ -148,7 +148,7 @@ function mountPulses(host, data) {
     xs = times(data, pulses[names[0]].length);
     const upper = [], lower = [];
     const what = reference && methodOf(reference).label.toLowerCase();
-    view.legend.build(names, [["at", "Height"], ["off", reference ? `Less ${what}` : "–"], ["rms", "RMS of that"]]);
+    view.legend.build(names, [["at", "Height"], ["off", reference ? `Minus ${what}` : "–"], ["rms", "Its RMS"]]);
     const wide = names.includes("nearest") && isShown("nearest");
     if (wide) upper.push(line(xs, pulses.nearest, methodOf("nearest")));
     for (const name of onTop(names)) {
@@ -169,7 +169,7 @@ function mountPulses(host, data) {
       snap: nearestTo(xs),
       panels: [
         { label: "Pulse height", share: 1.3, series: upper },
-        ...(reference ? [{ label: reference === "truth" ? "Less truth [%]" : "Less measured [%]", share: 1, symmetric: true, series: lower }] : []),
+        ...(reference ? [{ label: reference === "truth" ? "Minus truth [%]" : "Minus measured [%]", share: 1, symmetric: true, series: lower }] : []),
       ],
     });
     readout(null);
