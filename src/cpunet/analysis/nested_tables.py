@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -79,12 +78,14 @@ def with_std(value: Any, error: Any) -> str:
 
     Examples
     --------
-    >>> with_std(0.52094, 0.0171), with_std(1327.2, 41.0), with_std(0.1, None)
-    ('0.521 ± 0.017', '1327 ± 41', '0.1')
+    >>> with_std(0.52094, 0.0171), with_std(0.52094, 0.0996), with_std(0.1, None)
+    ('0.521 ± 0.017', '0.52 ± 0.10', '0.1')
     """
     if value is None or error is None:
         return number(value)
-    digits = max(1 - math.floor(math.log10(error)), 0) if error > 0 else MAX_DIGITS
+    # the exponent of the rounded error: 0.0996 is 0.10
+    exponent = int(f"{error:.1e}".partition("e")[2]) if error > 0 else -MAX_DIGITS
+    digits = max(1 - exponent, 0)
     if digits >= MAX_DIGITS:
         return f"{number(value)} ± {error:.2g}"
     return f"{value:.{digits}f} ± {error:.{digits}f}"
