@@ -130,6 +130,14 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
     assert difference[100] == pytest.approx(0.5, rel=1e-2)
 
 
+def test_pulses_without_a_crossing_are_not_in_the_mean():
+    windows = pulses(5)
+    windows[1], windows[2] = 0, np.nan
+    found, expected = mean_pulse(windows), mean_pulse(windows[[0, 3, 4]])
+    assert found.n == expected.n == 3
+    np.testing.assert_array_equal(found.mean, expected.mean)
+
+
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
     means = [mean_pulse(windows) for windows in (pulses(5), pulses(5, 700.0))]
     require_drawn(

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.analysis.mean_pulse import known_mean
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
@@ -218,11 +219,8 @@ def slice_table(
 
 
 def _mean(aligned: FloatArray) -> Superpulse:
-    known = np.isfinite(aligned)
-    count = known.sum(axis=0)
-    values = np.where(known, aligned, 0.0)
-    mean = values.sum(axis=0) / np.maximum(count, 1)
-    squares = np.where(known, (aligned - mean) ** 2, 0.0).sum(axis=0)
+    mean, count = known_mean(aligned)
+    squares = np.nansum((aligned - mean) ** 2, axis=0)
     error = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
     enough = count >= 2
     return Superpulse(
