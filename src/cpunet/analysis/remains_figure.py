@@ -149,7 +149,7 @@ def _slopes(axes: Axes, slopes: Slopes) -> None:
     axes.plot([], [], " ", label=f"empty baselines: {noise:.2f} keV")
     axes.set_yscale("log")
     axes.set_ylim(0.7, 10 * len(slopes.before) ** 0.7)
-    axes.set_xlabel("remainder that the slope tells (keV)")
+    axes.set_xlabel("remainder according to the slope (keV)")
     axes.set_ylabel("traces")
     axes.legend(loc="upper right")
 

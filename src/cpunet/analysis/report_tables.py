@@ -66,8 +66,8 @@ def peak_html(
         parts.append(part("folded", "Scores without noise", without, screen=True))
     if scores.get("not_prepared"):
         counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
-        text = "Simulated pulses left out because they cannot be prepared as data are once "
-        parts.append(part("p", f"{text}they are translated: {'; '.join(counts)}."))
+        text = "Simulated pulses left out because, once translated, they cannot be prepared "
+        parts.append(part("p", f"{text}like data: {'; '.join(counts)}."))
     tables = []
     if scores.get("two_sample"):
         title = "The classifier as a table"
