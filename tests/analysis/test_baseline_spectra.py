@@ -114,7 +114,7 @@ def test_equal_noise_and_none_at_all_are_numbers_and_drawn():
     assert (equal["ren"]["sigma"], equal["ren"]["spectrum_sigma"]) == (0, None)
     silent = spectra({"data": none, "ren": some})
     assert silent["ren"]["rms_ratio"] is None
-    for found in (equal, silent):
+    for found in (equal, silent, spectra({"data": none, "ren": none})):
         json.dumps(found, allow_nan=False)
         spectrum_of_noise(found, "SEP").canvas.draw()
 

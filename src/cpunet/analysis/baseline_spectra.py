@@ -136,11 +136,12 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
                 frequency, ratio, spread, marker="o", markersize=3, color=palette[method]
             )
     below.axhline(1, color="black", linewidth=0.8)
+    silent = not any(np.any(found[method]["power"]) for method in methods)
     above.set(
         title=f"{peak}: noise before the pulse",
         ylabel="Mean square per band\n[pulse height²]",
         xscale="log",
-        yscale="log",
+        yscale="linear" if silent else "log",
     )
     above.legend()
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
