@@ -75,6 +75,10 @@
   seen.live = getComputedStyle(host("distributions").querySelector("th.live")).visibility;
   seen.bin = cell("distributions", "data/at");
 
+  choose("slices", 1, "3");
+  button("slices", "Edge");
+  seen.lone = ticks("slices");
+  button("slices", "All");
   // the cursor's first step is from the middle; the next ones are whole samples
   choose("slices", 1, "2");
   key("slices", "ArrowRight");

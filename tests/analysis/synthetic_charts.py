@@ -80,6 +80,9 @@ def superpulses(slices: int, samples: int = 400) -> dict[str, dict[str, dict[str
         error = np.full(pulses.shape, 5e-4) * (1 + 3 * pulses * (1 - pulses))
         noise = np.random.default_rng(len(method)).normal(0, 2e-4, pulses.shape)
         found[method] = {"n": [75] * slices, "mean": pulses + noise, "error": error}
+    # the last slice has a single measured pulse
+    found["data"]["n"][-1] = 1
+    found["data"]["mean"][-1] = found["data"]["error"][-1] = np.nan
     return {"SEP": found, "DEP": {}}
 
 
@@ -88,11 +91,11 @@ def views_of(n: int = EVENTS, more: int = 1) -> dict[str, Any]:
     values = values_of(n, more)
     clean = {m: windows(r, 0, 60, seed=7) for m, (r, _, _) in METHODS.items() if m != "data"}
     measured = windows(9.0, 0.004, 400, seed=8)
-    labels = [f"{low} … {low + 200} ns" for low in (600, 800, 1000)]
+    labels = [f"{low} … {low + 200} ns" for low in (600, 800, 1000, 1200)]
     return {
         "methods": method_looks(METHODS),
         "distributions": distributions(values, scores_of(values)),
-        "slices": superpulse_views(superpulses(len(labels)), labels, DT_NS),
+        "slices": superpulse_views(superpulses(len(labels)), {"SEP": labels}, DT_NS),
         "pulses": pulse_views({"SEP": clean, "DEP": {}}, DT_NS, {"SEP": measured}),
         "scatter": scatter_views(values),
     }

@@ -108,6 +108,17 @@ def test_missing_noise_is_seen():
     assert found["sigma"] < -20
 
 
+def test_equal_noise_and_none_at_all_are_numbers_and_drawn():
+    some, none = noise(np.random.default_rng(10), 1e-3, 50), np.zeros((50, 800), np.float32)
+    equal = spectra({"data": some, "ren": some})
+    assert (equal["ren"]["sigma"], equal["ren"]["spectrum_sigma"]) == (0, None)
+    silent = spectra({"data": none, "ren": some})
+    assert silent["ren"]["rms_ratio"] is None
+    for found in (equal, silent, spectra({"data": none, "ren": none})):
+        json.dumps(found, allow_nan=False)
+        spectrum_of_noise(found, "SEP").canvas.draw()
+
+
 def test_too_few_and_unusable_baselines_are_named():
     rng = np.random.default_rng(5)
     broken = noise(rng, 1.0, 12)

@@ -96,7 +96,7 @@ def test_what_cannot_be_shown_is_said():
     assert found["DEP"] == {"missing": "no measured pulses were scored"}
     assert found["SEP"]["drift_time"]["missing"] == "no measured pulse has a value"
     assert scatter_views({"DEP": {}})["peaks"]["DEP"]["missing"]
-    assert superpulse_views({"DEP": {}}, ["all"], 16.0)["peaks"]["DEP"]["missing"]
+    assert superpulse_views({"DEP": {}}, {}, 16.0)["peaks"]["DEP"]["missing"]
     lost = {"raw": np.full((3, 400), np.nan, np.float32)}
     assert pulse_views({"DEP": lost, "SEP": {}}, 16.0)["peaks"]["DEP"]["missing"]
 

@@ -27,7 +27,7 @@ from cpunet.analysis.distances import (
     null_distances,
     wasserstein,
 )
-from cpunet.analysis.resampling import both_resampled, resampled_twice
+from cpunet.analysis.resampling import Draws, Resampled, resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 
@@ -39,6 +39,12 @@ any_floats = arrays(
     st.integers(1, 60),
     elements=st.one_of(st.floats(-1e6, 1e6), st.just(np.nan), st.just(np.inf)),
 )
+
+
+def both_resampled(n_a: int, n_b: int, draws: int, seed: int) -> Draws:
+    """Bootstraps of two sets, each of its own size."""
+    rng = np.random.default_rng(seed)
+    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
 
 
 def test_range_comes_from_the_bulk_of_the_data():
@@ -76,9 +82,13 @@ def test_equal_values_share_one_bin():
     assert histogram(np.array([7.0, 6.9, 7.1]), axis).tolist() == [1, 1, 1, 0]
 
 
-def test_the_largest_value_is_no_overflow():
-    data = np.linspace(0, 1, 11)
-    assert histogram(data, data_axis(data, 49))[-2:].tolist() == [0, 0]
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 1), (-20, -0.1), (-1, 1e-9), (-3, 0), (-12, 5), (1e9, 1e9 + 1)]
+)
+def test_the_largest_value_is_no_overflow(low, high):
+    rng = np.random.default_rng(0)
+    for data in (np.linspace(low, high, 11), *rng.uniform(low, high, (200, 100))):
+        assert histogram(data, data_axis(data, 49))[-2:].tolist() == [0, 0]
 
 
 def test_without_finite_data_there_is_no_axis():

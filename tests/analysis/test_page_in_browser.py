@@ -153,6 +153,10 @@ def test_the_edge_is_shown_at_a_click(seen):
     assert min(edge) < 0 < max(edge)
 
 
+def test_without_a_mean_pulse_of_the_data_the_edge_is_the_whole(seen):
+    assert seen["lone"] == seen["all"]
+
+
 def test_counts_are_those_of_the_values(seen):
     values = synthetic.values_of()["SEP"]["data"]
     axis = synthetic.views_of()["distributions"]["SEP"]["current_amplitude"]
@@ -166,7 +170,7 @@ def test_counts_are_those_of_the_values(seen):
 
 def test_the_cursor_reads_the_pulse(seen):
     time = float(seen["cursor"]["time"].removesuffix(" ns").replace("−", "-"))
-    mean = synthetic.superpulses(3)["SEP"]["data"]["mean"][2]
+    mean = synthetic.superpulses(4)["SEP"]["data"]["mean"][2]
     sample = round(time / synthetic.DT_NS) + 160
     assert float(seen["cursor"]["height"]) == pytest.approx(mean[sample], abs=1e-4)
 

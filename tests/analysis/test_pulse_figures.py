@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -97,7 +95,7 @@ def test_spectra_hold_all_events_and_name_the_peaks():
         "data": np.append(rng.normal(2614.5, 2, 500), [np.nan, 100.0]),
         "raw": rng.normal(2614.5, 0.3, 900),
     }
-    figure = spectrum_figure(energies, {"FEP": 2614.5, "far": 9000.0}, bin_kev=2)
+    figure = spectrum_figure(energies, {"FEP": 2614.5, "far": 9000.0})
     require_drawn(figure)
     axes = figure.axes[0]
     for patch, n in zip(axes.patches, (501, 900), strict=True):
@@ -110,7 +108,7 @@ def test_spectra_hold_all_events_and_name_the_peaks():
 
 
 def test_spectra_of_any_width_are_drawn_in_so_many_bins():
-    require_drawn(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}, bin_kev=1))
+    require_drawn(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}))
     assert len(figure.axes[0].patches[0].get_data().values) < 2100
     require_drawn(spectrum_figure({"data": np.full(3, 2614.5)}, {}))
 
@@ -118,8 +116,6 @@ def test_spectra_of_any_width_are_drawn_in_so_many_bins():
 def test_spectra_without_energies_are_refused():
     with pytest.raises(CpunetError, match="no pulse has an energy"):
         spectrum_figure({"data": np.full(3, np.nan)}, {})
-    with pytest.raises(CpunetError, match="more than 0"):
-        spectrum_figure({"data": np.ones(3)}, {}, bin_kev=0)
 
 
 def run(ren, ceiling=85.0, peak="SEP"):
@@ -133,16 +129,12 @@ def test_seeds_are_summed_up():
     row = found["SEP"]["drift_time"]
     assert row["iou"] == [80, 84, 85]
     assert row["missing"] == 2
-    assert (row["median"], row["low"], row["high"]) == (84, 80, 85)
-    assert row["mean"] == 83
-    assert row["std"] == pytest.approx(np.sqrt(7))
+    assert row["median"] == 84
     assert (row["ceiling"], row["ceiling_std"]) == (85, 2)
-    json.dumps(found, allow_nan=False)
-    require_drawn(seed_figure(found, marked=runs[0]))
+    require_drawn(seed_figure(found))
 
 
-def test_one_seed_has_no_spread_and_none_no_scores():
-    assert seed_distributions([run(80.0)])["SEP"]["drift_time"]["std"] is None
+def test_no_seed_has_no_scores():
     nothing = seed_distributions([run(None, ceiling=None)])["SEP"]["drift_time"]
     assert nothing["median"] is None
     assert nothing["ceiling"] is None

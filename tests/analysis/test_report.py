@@ -303,6 +303,21 @@ def test_any_nesting_becomes_tables():
     assert checker.open == []
 
 
+def test_peaks_named_after_their_energy_may_be_missing_together():
+    few = {"missing": "few pulses"}
+    html = nested_html({"FEP": few, "583": few, "584": few, "DEP": few})
+    assert "<p>Missing: FEP, 583–584, DEP: few pulses.</p>" in html
+
+
+def test_no_peak_of_a_combined_training_is_shown_first(tmp_path):
+    names = [f"{peak} mean pulse" for peak in ("FEP", "SEP", "DEP", "FEP,1000-1580")]
+    found = {"training": {"peak": "FEP,1000-1580"}}
+    write_report(tmp_path, found, {name: figure() for name in names}, [])
+    html = (tmp_path / "report.html").read_text()
+    first = re.findall(r'<img alt="([^"]*)"', html[: html.index('id="scores"')])
+    assert first == ["SEP mean pulse", "DEP mean pulse"]
+
+
 def test_a_figure_has_the_pixels_that_it_would_be_saved_with():
     def made() -> Figure:
         drawn = Figure(figsize=(4, 3), layout="constrained")

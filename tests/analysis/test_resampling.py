@@ -15,15 +15,16 @@ from cpunet.analysis.distances import (
     null_distances,
     wasserstein,
 )
-from cpunet.analysis.resampling import (
-    Resampled,
-    both_resampled,
-    resampled_quantiles,
-    resampled_twice,
-)
+from cpunet.analysis.resampling import Draws, Resampled, resampled_quantiles, resampled_twice
 
 DRAWS = 400
 WAYS = {"events": resampling.MAX_EVENTS, "bins": 0}  # what is drawn
+
+
+def both_resampled(n_a: int, n_b: int, draws: int, seed: int) -> Draws:
+    """Bootstraps of two sets, each of its own size."""
+    rng = np.random.default_rng(seed)
+    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())

@@ -11,6 +11,7 @@ from scipy.special import ndtr
 from cpunet.analysis import run_figures
 from cpunet.analysis.comparisons import compare, data_axis
 from cpunet.analysis.mean_pulse import MeanPulse
+from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
@@ -41,7 +42,7 @@ def pulses(n: int, centre: float = 350.0) -> np.ndarray:
 
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():
-    figure = run_figures.loss_curves(log(50), window=10)
+    figure = run_figures.loss_curves(log(50))
     require_drawn(figure)
     lines = [line for axes in figure.axes for line in axes.lines]
     assert len(lines) == 2 * len(LOSSES) == 16
@@ -76,8 +77,8 @@ def test_an_empty_log_is_refused():
         run_figures.loss_curves([])
 
 
-def test_cycle_figure_draws_ten_pulses_in_each_panel():
-    sets = pulses(15)
+def test_cycle_figure_draws_all_pulses_in_each_panel():
+    sets = pulses(10)
     figure = run_figures.cycle_figure(sets, sets, sets, ("A", "B", "C"), 16.0)
     require_drawn(figure)
     assert [len(axes.lines) for axes in figure.axes] == [10, 10, 10]
@@ -114,10 +115,14 @@ def test_histograms_of_one_event_and_of_none_are_drawn():
     require_drawn(histogram_figure({"data": np.array([1.0]), "ren": np.array([])}))
 
 
+def mean_pulse(windows: np.ndarray) -> MeanPulse:
+    return MeanPulse.of_aligned(align_half_maximum(windows, 100, 150), 100)
+
+
 def test_mean_pulse_differences_are_in_percent_of_the_charge():
     data = pulses(40)
     sets = {"data": data, "ren": 1.01 * data}
-    means = {method: MeanPulse.of(windows) for method, windows in sets.items()}
+    means = {method: mean_pulse(windows) for method, windows in sets.items()}
     figure = run_figures.mean_pulses(means, 16.0, "DEP")
     require_drawn(figure)
     difference = figure.axes[1].lines[0].get_ydata()
@@ -125,8 +130,16 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
     assert difference[100] == pytest.approx(0.5, rel=1e-2)
 
 
+def test_pulses_without_a_crossing_are_not_in_the_mean():
+    windows = pulses(5)
+    windows[1], windows[2] = 0, np.nan
+    found, expected = mean_pulse(windows), mean_pulse(windows[[0, 3, 4]])
+    assert found.n == expected.n == 3
+    np.testing.assert_array_equal(found.mean, expected.mean)
+
+
 def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
-    means = [MeanPulse.of(windows) for windows in (pulses(5), pulses(5, 700.0))]
+    means = [mean_pulse(windows) for windows in (pulses(5), pulses(5, 700.0))]
     require_drawn(
         run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP")
     )

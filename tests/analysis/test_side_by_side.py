@@ -48,7 +48,7 @@ def test_rows_and_what_they_show():
         ("SEP", "tail slope"),
         ("SEP", "classifier"),
         ("SEP", "edge RMSE"),
-        ("SEP", "A/E survival less data"),
+        ("SEP", "A/E survival minus data"),
     ]
     shown = [[cell.text for cell in row.cells] for row in table.rows]
     assert shown[0] == ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 import xml.etree.ElementTree as ET
@@ -117,7 +118,10 @@ def test_no_score_at_all_is_an_error():
         summary_page([Entry("V01", "p03", {"peaks": {}})])
 
 
-@pytest.mark.parametrize("ends", [(0.0, 100.0), (-3.0, 3.0), (0.49, 0.52), (1e-9, 2e-9)])
+@pytest.mark.parametrize(
+    "ends",
+    [(0.0, 100.0), (-3.0, 3.0), (0.49, 0.52), (1e-9, 2e-9), (0.0, math.nextafter(2000.0, 0))],
+)
 def test_ticks_are_few_and_inside(ends):
     found = ticks(*ends)
     assert 2 <= len(found) <= 5

@@ -2,7 +2,7 @@
 
 A is the maximum current of a pulse, E its energy.  Events of the double-escape peak
 (DEP) deposit their energy at one site, like the decay that is searched for.  The cut is
-placed where a given fraction of them survives.  A pulse-shape simulation must predict
+placed where 90 % of them survive.  A pulse-shape simulation must predict
 what fraction of other peaks survives it.
 
 Prepared pulses are normalised, so that `parameters.current_amplitude` is A/E already.
@@ -25,7 +25,8 @@ from cpunet.errors import CpunetError
 Values = npt.NDArray[np.float64]
 PeakTable = dict[str, dict[str, float | None]]
 
-MIN_N = 20  # events of the DEP: two below a cut at 90 %
+ACCEPTANCE = 0.9  # fraction of the DEP that survives
+MIN_N = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 
@@ -39,14 +40,10 @@ class PeakSurvival:
     survival, std
         Survival and its error in percent; NaN without events.  The error combines those of
         the number of survivors and of the cut in quadrature.
-    n, missing
-        Number of events with a finite amplitude, and of those without.
     """
 
     survival: float
     std: float
-    n: int
-    missing: int
 
 
 @dataclass(frozen=True)
@@ -57,46 +54,41 @@ class Survival:
     ----------
     cut, cut_std
         Lowest A/E that survives, in pulse heights per sample, and its error.
-    n, missing
-        Number of events that define the cut, and of those without a finite amplitude.
     peaks
         Survival of the other peaks.
     """
 
     cut: float
     cut_std: float
-    n: int
-    missing: int
     peaks: dict[str, PeakSurvival]
 
 
 def ae_survival(
     dep_ae: Values,
     others: Mapping[str, Values],
-    acceptance: float = 0.9,
     *,
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
 ) -> Survival:
-    r"""Survival of other peaks after a low-A/E cut that keeps a given fraction of the DEP.
+    r"""Survival of other peaks after a low-A/E cut that keeps 90 % of the DEP.
+
+    The acceptance is exact on average for *new* events of the same kind, however few events
+    set the cut.
 
     .. math:: S = \frac{k}{n}, \qquad \sigma_S^2 = \sigma_k^2 + \sigma_c^2
 
-    with :math:`k` of :math:`n` events at or above the cut :math:`c`, the :math:`1 - a`
-    quantile of the DEP for the acceptance :math:`a`.  :math:`\sigma_k` is the standard
-    deviation of the posterior with a flat prior, and :math:`\sigma_c` the spread of :math:`S`
-    over bootstraps of the cut.
+    with :math:`k` of :math:`n` events at or above the cut :math:`c`, the 10 % quantile of the
+    DEP.  :math:`\sigma_k` is the standard deviation of the posterior with a flat prior, and
+    :math:`\sigma_c` the spread of :math:`S` over bootstraps of the cut.
 
     Parameters
     ----------
     dep_ae
-        A/E of the events of the double-escape peak (DEP).
+        A/E of the events of the double-escape peak (DEP).  Values that are not finite are left
+        out, here and below.
     others
-        A/E of the events of other peaks or ranges, by name.  The DEP itself would survive
-        with `acceptance` by construction, and its error would be meaningless.
-    acceptance
-        Fraction of the DEP that survives, between 0 and 1.  It is exact on average for *new*
-        events of the same kind, also for small samples.
+        A/E of the events of other peaks or ranges, by name.  The DEP itself would survive with
+        90 % by construction, and its error would be meaningless.
     bootstraps, seed
         Number and seed of the bootstraps of the DEP, for the error of the cut.
 
@@ -108,20 +100,17 @@ def ae_survival(
     Raises
     ------
     CpunetError
-        If `acceptance` is not between 0 and 1, or fewer than 20 events of the DEP have a
-        finite amplitude.
+        If fewer than 20 events of the DEP have a finite amplitude.
 
     Examples
     --------
-    Of 99 equidistant values the cut at 90 % is the 10th, and 90 of the 99 survive:
+    Of 99 equidistant values the cut is the 10th, and 90 of the 99 survive:
 
     >>> ae = np.arange(1.0, 100.0)
-    >>> found = ae_survival(ae, {"SEP": ae}, acceptance=0.9)
+    >>> found = ae_survival(ae, {"SEP": ae})
     >>> round(found.cut, 6), round(found.peaks["SEP"].survival, 2)
     (10.0, 90.91)
     """
-    if not 0 < acceptance < 1:
-        raise CpunetError(f"acceptance is {acceptance}; give a fraction such as 0.9")
     if bootstraps < 2:
         raise CpunetError(f"bootstraps is {bootstraps}; a spread needs 2 or more")
     dep = dep_ae[np.isfinite(dep_ae)]
@@ -131,13 +120,12 @@ def ae_survival(
             f"a cut needs {MIN_N} or more"
         )
     rng = np.random.default_rng(seed)
-    cut = _cut(dep, acceptance)
-    cuts = resampled_quantiles(dep, 1 - acceptance, bootstraps, rng)
+    # for this quantile the acceptance of new events is exact on average for any sample size
+    cut = float(np.quantile(dep, 1 - ACCEPTANCE, method="weibull"))
+    cuts = resampled_quantiles(dep, 1 - ACCEPTANCE, bootstraps, rng)
     return Survival(
         cut=cut,
         cut_std=float(cuts.std(ddof=1)),
-        n=dep.size,
-        missing=len(dep_ae) - dep.size,
         peaks={name: _peak_survival(values, cut, cuts) for name, values in others.items()},
     )
 
@@ -267,27 +255,24 @@ def sideband_survival(
     return 100 * survival, float(100 * np.sqrt(variance))
 
 
-def _cut(dep: Values, acceptance: float) -> float:
-    """Quantile whose acceptance for new events is exact on average for any sample size."""
-    return float(np.quantile(dep, 1 - acceptance, method="weibull"))
+def survival_error(passing: int, n: int) -> float:
+    """Standard deviation of the posterior of a survival (0 … 1) with a flat prior.
+
+    Unlike a binomial error it is not 0 if none or all of the `n` events survive.
+    """
+    p = (passing + 1) / (n + 2)
+    return float(np.sqrt(p * (1 - p) / (n + 3)))
 
 
 def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
     finite = np.sort(values[np.isfinite(values)])
-    n, missing = finite.size, len(values) - finite.size
+    n = finite.size
     if not n:
-        return PeakSurvival(float("nan"), float("nan"), 0, missing)
+        return PeakSurvival(float("nan"), float("nan"))
     passing = n - int(np.searchsorted(finite, cut))
-    # standard deviation of the posterior with a flat prior: not 0 if none or all survive
-    p = (passing + 1) / (n + 2)
-    counting = np.sqrt(p * (1 - p) / (n + 3))
     of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
-    return PeakSurvival(
-        survival=100 * passing / n,
-        std=float(100 * np.hypot(counting, of_cut)),
-        n=n,
-        missing=missing,
-    )
+    error = float(100 * np.hypot(survival_error(passing, n), of_cut))
+    return PeakSurvival(100 * passing / n, error)
 
 
 def _cut_rows(found: Mapping[str, Survival | None]) -> PeakTable:

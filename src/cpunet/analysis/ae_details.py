@@ -47,11 +47,12 @@ def ae_against_drift_time(
         are outside the edges or lack a finite amplitude or time; and ``methods``, for each
         method and the data a list of bins with ``n``, ``time_ns`` (median), and ``q16``,
         ``median`` and ``q84`` with ``…_error`` of each; or ``missing`` with the reason.
+        Only ``missing`` if no measured pulse has both values.
 
     Raises
     ------
     CpunetError
-        If the data have no event, or the arrays of a method differ in length.
+        If the arrays of a method differ in length.
     """
     known = {
         method: _finite_pairs(method, values, drift_time[method])
@@ -59,11 +60,7 @@ def ae_against_drift_time(
     }
     measured = known["data"][1]
     if not measured.size:
-        raise CpunetError(
-            "no measured pulse has an amplitude and a drift time; check the peak's selection"
-        )
-    if bins < 1:
-        raise CpunetError(f"{bins} bins of the drift time; give 1 or more")
+        return {"missing": "no measured pulse has an amplitude and a drift time"}
     edges = np.quantile(measured, np.linspace(0, 1, bins + 1))
     methods, left_out = {}, {}
     for method, (ae, time) in known.items():

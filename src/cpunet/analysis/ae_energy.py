@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy.optimize
 from scipy.special import expit, log_ndtr, ndtr
 
+from cpunet.analysis.a_over_e import DEP
 from cpunet.errors import CpunetError
 
 Values = npt.NDArray[np.float64]
@@ -52,20 +53,11 @@ class SiteFit:
     n: int
 
 
-def energy_bands(lines_kev: Mapping[str, Range], dep: str = "DEP") -> list[Range]:
-    """Ranges of 50 keV, and first that of the double-escape peak, if it is among the lines.
-
-    Parameters
-    ----------
-    lines_kev
-        Range of each gamma line.
-    dep
-        Name of the double-escape peak.
-    """
-    bands = [lines_kev[dep]] if dep in lines_kev else []
-    for low in np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist():
-        bands.append((low, low + WIDTH_KEV))
-    return bands
+def energy_bands(lines_kev: Mapping[str, Range]) -> list[Range]:
+    """Ranges of 50 keV, and first that of the double-escape peak, if it is among the lines."""
+    bands = [lines_kev[DEP]] if DEP in lines_kev else []
+    lows = np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist()
+    return bands + [(low, low + WIDTH_KEV) for low in lows]
 
 
 def against_energy(
@@ -99,21 +91,18 @@ def against_energy(
     CpunetError
         If the arrays of a method differ in length.
     """
-    bands = energy_bands(lines_kev)
     lines = list(lines_kev.values())
-    points = {
-        method: _points(values, energy_kev[method], bands, lines)
-        for method, values in amplitude.items()
-    }
-    common = _common(points)
-    multi_site = len(common) < 3
-    if multi_site:
-        bands += [span for span in lines_kev.values() if span not in bands]
+    single_site = energy_bands(lines_kev)
+    all_bands = single_site + [span for span in lines if span not in single_site]
+    for bands in (single_site, all_bands):
         points = {
             method: _points(values, energy_kev[method], bands, lines)
             for method, values in amplitude.items()
         }
-        common = _common(points)
+        ranges = [{(p.low_kev, p.high_kev) for p in found} for found in points.values()]
+        common = set.intersection(*ranges)
+        if len(common) >= 3:
+            break
     if len(common) < 2:
         return {
             "missing": f"A/E can be fitted in {len(common)} ranges of energy only; "
@@ -123,7 +112,7 @@ def against_energy(
         method: _lines([p for p in found if (p.low_kev, p.high_kev) in common])
         for method, found in points.items()
     }
-    return {"multi_site": multi_site, "methods": methods}
+    return {"multi_site": bands is all_bands, "methods": methods}
 
 
 def site_fit(
@@ -193,12 +182,6 @@ def _points(
             centre = float(energy_kev[inside].mean())
             found.append(SiteFit(low, high, centre, *fitted))
     return sorted(found, key=lambda point: point.energy_kev)
-
-
-def _common(points: Mapping[str, Sequence[SiteFit]]) -> set[Range]:
-    """Ranges that every method has."""
-    sets = [{(p.low_kev, p.high_kev) for p in found} for found in points.values()]
-    return set.intersection(*sets) if sets else set()
 
 
 def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:

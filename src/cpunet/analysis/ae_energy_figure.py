@@ -79,14 +79,14 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         f"Width at {REFERENCE_KEV:g} keV [%]",
     ]
     about = (
-        "Place and width of the single-site peak of A/E in ranges of energy: a Gaussian with a "
-        "tail below. The lines are those that “cpunet export --to legend-pars” writes."
+        "Position and width of the single-site peak of A/E in ranges of energy: a Gaussian "
+        "with a tail below it. “cpunet export --to legend-pars” writes these lines."
     )
     if found.get("multi_site"):
         about += (
-            " There are too few events off the lines, so that SEP and FEP take part, although "
-            "most of their events have several sites: slopes can be compared, but are no more "
-            "than a guess of that of single sites. With --ae-range 900,2350 the continuum is "
+            " Since there are too few events between the lines, SEP and FEP are fitted too, "
+            "although most of their events have several sites: slopes can be compared, but "
+            "only approximate that of single sites. With --ae-range 900,2350 the continuum is "
             "read, if the files have it."
         )
     drawn = part("grid", "figures", [figure] if figure else [])

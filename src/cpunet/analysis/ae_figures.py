@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpunet.analysis.style import colours, label, styled
+from cpunet.analysis.style import colours, label, line_look, linear_within, styled
 from cpunet.pulses.parameters import PARAMETERS
 
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
@@ -62,9 +62,7 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     above.set(ylabel=AMPLITUDE)
     below.set(xlabel=DRIFT_TIME, ylabel="Median,\nmethod / data − 1 [%]")
     if max(map(abs, ratios), default=0.0) > FAR * LINEAR:
-        # so that small differences show beside those of an untranslated simulation
-        below.set_yscale("symlog", linthresh=LINEAR)
-        below.yaxis.set_major_formatter("{x:g}")
+        linear_within(below, LINEAR)
         below.set_ylabel(f"{below.get_ylabel()[:-1]},\nlinear within ± {LINEAR:g}]")
     figure.legend(
         *above.get_legend_handles_labels(),
@@ -101,25 +99,14 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
                 continue
             cuts = np.quantile(single, 1 - accepted)
             left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
-            is_data = method == "data"
-            look = {"color": "0.65" if is_data else palette[method]}
-            axes.plot(
-                100 * accepted,
-                100 * left,
-                linewidth=4.0 if is_data else 1.4,
-                label=label(method),
-                **look,
-            )
+            look = line_look(method, palette[method])
+            axes.plot(100 * accepted, 100 * left, label=label(method), **look)
         axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
     panels[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
     panels[0].yaxis.set_major_formatter("{x:g}")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
-
-
-def _finite(values: Values) -> Values:
-    return values[np.isfinite(values)]
 
 
 @styled
@@ -146,9 +133,8 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
         first = panels[0] if panels else None
         panels.append(figure.add_subplot(places[i, j], sharex=first, sharey=first))
         panels[-1].label_outer()
-    grid = np.array(panels, object).reshape(rows, columns)
     top = shares["data"].max()
-    for axes, (method, share) in zip(grid.flat, shares.items(), strict=False):
+    for axes, (method, share) in zip(panels, shares.items(), strict=False):
         drawn = axes.pcolormesh(
             table["time_edges_ns"],
             table["amplitude_edges"],
@@ -165,9 +151,9 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
                 ha="center", va="center",
             )  # fmt: skip
         axes.set_title(f"{label(method)}{_score(table, method)}\n{outside:.1f} % outside")
-    for axes in grid.flat[len(shares) :]:
+    for axes in panels[len(shares) :]:
         axes.set_axis_off()
-    _label_outer(grid.tolist(), len(shares))
+    _label_outer(panels[: len(shares)], columns)
     beside = figure.add_subplot(places[:, columns])
     figure.colorbar(drawn, cax=beside, label="Events per cell [%]", extend="max")
     figure.suptitle(f"{peak}: A/E and drift time", x=0.02, ha="left", fontsize=10)
@@ -197,12 +183,14 @@ def _score(table: Mapping[str, Any], method: str) -> str:
     return f", {kind} {table['iou'][name]:.1f} ± {table['iou_std'][name]:.1f} %"
 
 
-def _label_outer(grid: list[list[Axes]], drawn: int) -> None:
-    columns = len(grid[0])
-    for i in range(drawn):
-        axes = grid[i // columns][i % columns]
+def _finite(values: Values) -> Values:
+    return values[np.isfinite(values)]
+
+
+def _label_outer(panels: list[Axes], columns: int) -> None:
+    for i, axes in enumerate(panels):
         if i % columns == 0:
             axes.set_ylabel(AMPLITUDE)
-        if i + columns >= drawn:
+        if i + columns >= len(panels):
             axes.set_xlabel(DRIFT_TIME)
             axes.tick_params(labelbottom=True)

@@ -127,20 +127,21 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         look = {"color": palette[method], "label": label(method)}
         above.errorbar(frequency, power, error, marker="o", markersize=3, **look)
         if method != "data":
+            # bands without noise in the data have no ratio
+            ratio, spread = (
+                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
+                for values in (power, error)
+            )
             below.errorbar(
-                frequency,
-                power / data,
-                error / data,
-                marker="o",
-                markersize=3,
-                color=palette[method],
+                frequency, ratio, spread, marker="o", markersize=3, color=palette[method]
             )
     below.axhline(1, color="black", linewidth=0.8)
+    silent = not any(np.any(found[method]["power"]) for method in methods)
     above.set(
         title=f"{peak}: noise before the pulse",
         ylabel="Mean square per band\n[pulse height²]",
         xscale="log",
-        yscale="log",
+        yscale="linear" if silent else "log",
     )
     above.legend()
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
@@ -200,24 +201,27 @@ def _summary(power: Values) -> dict[str, Any]:
 
 
 def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:
-    """Deviation of the noise from that of the data; None where neither has an error."""
+    """Deviation of the noise from that of the data; None where it is undefined."""
     error = np.hypot(own["rms_std"], data["rms_std"])
-    difference, errors = (
-        np.asarray(own["power"]) - np.asarray(data["power"]),
-        np.hypot(own["power_std"], data["power_std"]),
-    )
+    difference = np.subtract(own["power"], data["power"])
+    errors = np.hypot(own["power_std"], data["power_std"])
     bands = np.abs(difference[errors > 0] / errors[errors > 0])
-    worst = float(bands.max()) if bands.size else None
     return {
         "rms_ratio": own["rms"] / data["rms"] if data["rms"] else None,
         "sigma": float((own["rms"] - data["rms"]) / error) if error else None,
-        "worst_band_sigma": worst,
-        "spectrum_sigma": None if worst is None else _of_so_many(worst, bands.size),
+        "worst_band_sigma": float(bands.max()) if bands.size else None,
+        "spectrum_sigma": _of_so_many(float(bands.max(initial=0)), bands.size),
     }
 
 
-def _of_so_many(worst: float, n: int) -> float:
-    """One-sided deviation as unlikely as the largest of `n` two-sided ones (Šidák)."""
-    chance = -np.expm1(n * np.log1p(-erfc(worst / np.sqrt(2))))
+def _of_so_many(worst: float, n: int) -> float | None:
+    """One-sided deviation as unlikely as the largest of `n` two-sided ones (Šidák).
+
+    None if the spectra are equal, which no one-sided deviation expresses.
+    """
+    of_one = erfc(worst / np.sqrt(2))
+    if of_one == 1:
+        return None
+    chance = -np.expm1(n * np.log1p(-of_one))
     # beyond 37 standard deviations the probability underflows, and it does not matter
     return float(norm.isf(chance)) if chance > 0 else worst

@@ -15,14 +15,13 @@ from cpunet.analysis.nested_tables import with_std
 from cpunet.calibration.titles import titled
 
 _PROFILES = (
-    "Chi-square along the valley of each parameter, everything else following; grey: the "
-    "parabola of the error quoted; dashed: as simulated."
+    "Profile of chi-square for each parameter, with all others refitted; grey: the parabola of "
+    "the quoted error; dashed: as simulated."
 )
-_PULLS = "Deviation of each function of the pulses from the data; grey: two sigmas."
-_DIRECTIONS = (
-    "Left: what each direction is made of. Right: how well it is known; 1 is no better than "
-    "the prior."
+_PULLS = (
+    "Deviation of each function of the pulses from the data in standard deviations; grey: ± 2."
 )
+_DIRECTIONS = "Left: composition of each direction. Right: its error; 1 is that of the prior."
 
 
 def calibration_page(content: Mapping[str, Any]) -> str:

@@ -91,7 +91,7 @@ def distributions(
 
 def superpulse_views(
     superpulses: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    slices: Mapping[str, Sequence[str]] | Sequence[str],
+    slices: Mapping[str, Sequence[str]],
     dt_ns: float,
     n_before: int = BEFORE,
 ) -> View:
@@ -104,7 +104,7 @@ def superpulse_views(
         and ``mean`` and ``error`` of shape ``(slices, samples)``, in units of the full
         charge.
     slices
-        Names of the slices, by peak or common to all peaks.
+        Names of the slices by peak.
     dt_ns
         Sampling period in ns.
     n_before
@@ -115,9 +115,8 @@ def superpulse_views(
         if not methods:
             peaks[peak] = {"missing": "no pulses to average"}
             continue
-        names = slices.get(peak, ()) if isinstance(slices, Mapping) else slices
         peaks[peak] = {
-            "slices": list(names),
+            "slices": list(slices[peak]),
             "methods": {
                 method: {
                     "n": [int(count) for count in found["n"]],

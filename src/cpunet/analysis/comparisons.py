@@ -90,10 +90,12 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
         bins = int(np.clip(np.ceil((high - low) / width), 1, max_bins))
     else:
         # Half of the values are equal: one bin contains them, the others are outside.
-        margin = 1e-3 * max(abs(lower), 1.0)
-        low, high, bins = lower - margin, upper + margin, 1
-    # the last edge is exclusive, but a maximum inside the fence is not an overflow
-    return hist.axis.Regular(bins, low, np.nextafter(high, np.inf))
+        half_width = 1e-3 * max(abs(lower), 1.0)
+        low, high, bins = lower - half_width, upper + half_width, 1
+    # The last edge is exclusive, but a maximum inside the fence is not an overflow: after
+    # rounding, (maximum - low) / (last edge - low) must be less than 1.
+    margin = 4 * np.spacing(max(abs(low), abs(high)))
+    return hist.axis.Regular(bins, low, high + margin)
 
 
 def histogram(values: Values, axis: hist.axis.Regular) -> Values:
@@ -198,7 +200,7 @@ def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> fl
     axis
         Common binning, see `data_axis`.
     draws
-        Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
+        Bootstraps of both, each of its own size.
     """
     drawn = (d.counts(*_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
     return float(_overlap(*drawn).std())

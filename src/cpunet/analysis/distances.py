@@ -114,7 +114,7 @@ def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
     a, b
         Values of both datasets; non-finite ones are resampled but ignored.
     draws
-        Bootstraps of both, see `cpunet.analysis.resampling.both_resampled`.
+        Bootstraps of both, each of its own size.
 
     Returns
     -------

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.paired import align_half_maximum
+from cpunet.analysis.mean_pulse import known_mean
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
@@ -99,7 +99,7 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     Raises
     ------
     CpunetError
-        If `slices` is less than 1, or no time is finite.
+        If no time is finite.
 
     Examples
     --------
@@ -107,45 +107,25 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     array([  0.,  25.,  50.,  75., 100.])
     """
     finite = rise_time[np.isfinite(rise_time)]
-    if slices < 1:
-        raise CpunetError(f"{slices} slices of the rise time; give 1 or more")
     if not finite.size:
         raise CpunetError("no measured pulse has a rise time; check the peak's selection")
     return np.quantile(finite, np.linspace(0, 1, slices + 1))
 
 
-def superpulses(
-    windows: FloatArray, rise_time: Values, edges: Values, before: int, after: int
-) -> Slices:
-    """Mean pulse of each slice, aligned at half maximum.
+def sliced(aligned: FloatArray, rise_time: Values, edges: Values, before: int) -> Slices:
+    """Mean pulse of each slice.
 
     Parameters
     ----------
-    windows
-        Pulses of shape ``(n, length)`` with the baseline at 0.
+    aligned
+        Pulses aligned by `align_half_maximum`, shape ``(n, samples)``.
     rise_time
         Rise time of each pulse in ns, shape ``(n,)``.
     edges
         Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
-    before, after
-        Number of samples before the crossing of half the maximum, and from it on.
-
-    Raises
-    ------
-    CpunetError
-        If the numbers of times and pulses differ, or the pulses have another shape.
+    before
+        Number of samples before the crossing of half the maximum.
     """
-    if rise_time.shape != (len(windows),):
-        raise CpunetError(
-            f"{len(windows)} pulses beside rise times of shape {rise_time.shape}; "
-            "give one for each"
-        )
-    aligned = align_half_maximum(windows, before, after)
-    return sliced(aligned, rise_time, edges, before)
-
-
-def sliced(aligned: FloatArray, rise_time: Values, edges: Values, before: int) -> Slices:
-    """Same as `superpulses`, for pulses already aligned by `align_half_maximum`."""
     timed = np.isfinite(rise_time)
     inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
     place = np.searchsorted(edges[1:-1], rise_time, side="right")
@@ -239,11 +219,8 @@ def slice_table(
 
 
 def _mean(aligned: FloatArray) -> Superpulse:
-    known = np.isfinite(aligned)
-    count = known.sum(axis=0)
-    values = np.where(known, aligned, 0.0)
-    mean = values.sum(axis=0) / np.maximum(count, 1)
-    squares = np.where(known, (aligned - mean) ** 2, 0.0).sum(axis=0)
+    mean, count = known_mean(aligned)
+    squares = np.nansum((aligned - mean) ** 2, axis=0)
     error = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
     enough = count >= 2
     return Superpulse(

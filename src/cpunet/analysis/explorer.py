@@ -117,7 +117,6 @@ def _content(shown: Exploration) -> dict[str, Any]:
         "reasons": reasons,
         "samples": samples.tolist(),
         "edge": int((samples < EDGE).sum()),
-        "edge_samples": shown.recipe.scores.edge_samples,
         "kernel": _rounded(_smoothing(), 7),
         "names": {name: [label, unit] for name, (label, unit, _) in NUMBERS.items()},
         "methods": _methods(shown),

@@ -84,8 +84,10 @@ def ticks(low: float, high: float) -> list[float]:
     >>> ticks(48.0, 91.0)
     [60.0, 80.0]
     """
-    decade = 10.0 ** math.floor(math.log10((high - low) / 2))
-    step = next(decade * n for n in (5, 2, 1) if decade * n <= (high - low) / 2)
+    largest = (high - low) / 2
+    decade = 10.0 ** math.floor(math.log10(largest))
+    # the logarithm of a number just below a power of ten may round up to the power's
+    step = max((decade * n for n in (1, 2, 5) if decade * n <= largest), default=decade)
     first, last = math.ceil(low / step), math.floor(high / step)
     # rounded, since 3 * 0.1 is not exactly 0.3
     return [float(f"{step * i:.12g}") for i in range(first, last + 1)]

@@ -15,11 +15,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
-from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
-
-Pixels = npt.NDArray[np.float64]
 
 
 class MeasuredLayout(ConstrainedLayoutEngine):
@@ -42,22 +39,30 @@ class MeasuredLayout(ConstrainedLayoutEngine):
             super().execute(fig)
             return
         pads = self.get()
+        w_pad, h_pad = fig.dpi * pads["w_pad"], fig.dpi * pads["h_pad"]
         renderer = RendererAgg(*fig.bbox.size, fig.dpi)  # type: ignore[no-untyped-call]
         rooms = [_room(axes, renderer) for axes in panels]
-        top, bottom = _beyond_panels(fig, renderer, fig.dpi * pads["h_pad"])
-        x = _columns(fig, specs, rooms, fig.dpi * pads["w_pad"])
-        y = _rows(fig, specs, rooms, fig.dpi * pads["h_pad"], top, bottom)
+        grid, width, height = specs[0].get_gridspec(), fig.bbox.width, fig.bbox.height
+        x = _ends(
+            width,
+            grid.get_width_ratios(),
+            [spec.colspan for spec in specs],
+            [(room.left, room.right) for room in rooms],
+            w_pad,
+        )
+        y = _ends(
+            height,
+            grid.get_height_ratios(),
+            [spec.rowspan for spec in specs],
+            [(room.top, room.bottom) for room in rooms],
+            h_pad,
+            _beyond_panels(fig, renderer, h_pad),
+        )
         if x is None or y is None:
             super().execute(fig)  # which warns that there is no room
             return
-        for axes, spec in zip(panels, specs, strict=True):
-            (left, right), (high, low) = (
-                (begins[span.start], ends[span.stop - 1])
-                for (begins, ends), span in ((x, spec.colspan), (y, spec.rowspan))
-            )
-            place = Bbox.from_extents(
-                left, fig.bbox.height - low, right, fig.bbox.height - high
-            )
+        for axes, (left, right), (high, low) in zip(panels, x, y, strict=True):
+            place = Bbox.from_extents(left, height - low, right, height - high)
             axes.set_position(place.transformed(fig.transFigure.inverted()))
             axes.set_in_layout(True)  # to be placed again if its labels change
 
@@ -102,45 +107,31 @@ def _beyond_panels(fig: Figure, renderer: RendererAgg, pad: float) -> tuple[floa
     return top, bottom
 
 
-def _columns(
-    fig: Figure, specs: Sequence[SubplotSpec], rooms: Sequence[_Room], pad: float
-) -> tuple[Pixels, Pixels] | None:
-    grid = specs[0].get_gridspec()
-    before, after = np.full((2, grid.ncols), pad)
-    for spec, room in zip(specs, rooms, strict=True):
-        first, last = spec.colspan.start, spec.colspan.stop - 1
-        before[first] = max(before[first], room.left + pad)
-        after[last] = max(after[last], room.right + pad)
-    return _shared_out(fig.bbox.width, grid.get_width_ratios(), before, after)
-
-
-def _rows(
-    fig: Figure,
-    specs: Sequence[SubplotSpec],
-    rooms: Sequence[_Room],
+def _ends(
+    size: float,
+    ratios: npt.ArrayLike,
+    spans: Sequence[range],
+    rooms: Sequence[tuple[float, float]],
     pad: float,
-    top: float,
-    bottom: float,
-) -> tuple[Pixels, Pixels] | None:
-    grid = specs[0].get_gridspec()
-    before, after = np.full((2, grid.nrows), pad)
-    for spec, room in zip(specs, rooms, strict=True):
-        first, last = spec.rowspan.start, spec.rowspan.stop - 1
-        before[first] = max(before[first], room.top + pad)
-        after[last] = max(after[last], room.bottom + pad)
-    before[0] += top
-    after[-1] += bottom
-    return _shared_out(fig.bbox.height, grid.get_height_ratios(), before, after)
+    beyond: tuple[float, float] = (0.0, 0.0),
+) -> list[tuple[float, float]] | None:
+    """Where each panel begins and ends along one side of the figure; None if nothing is left.
 
-
-def _shared_out(
-    size: float, ratios: npt.ArrayLike, before: Pixels, after: Pixels
-) -> tuple[Pixels, Pixels] | None:
-    """Where panels of given ratios begin and end along a side; None if nothing is left."""
+    The side has `size` pixels and columns or rows of relative `ratios`; each panel spans some
+    of them, and its labels take `rooms` before and after it.  Pixels `beyond` are taken at
+    either end of the side.
+    """
+    shares = np.asarray(ratios, float)
+    before, after = np.full((2, len(shares)), pad)
+    for span, room in zip(spans, rooms, strict=True):
+        before[span.start] = max(before[span.start], room[0] + pad)
+        after[span.stop - 1] = max(after[span.stop - 1], room[1] + pad)
+    before[0] += beyond[0]
+    after[-1] += beyond[1]
     left = size - before.sum() - after.sum()
     if left <= 0:
         return None
-    shares = np.asarray(ratios, float)
     inner = left * shares / shares.sum()
     ends = np.cumsum(before + inner + after) - after
-    return ends - inner, ends
+    begins = ends - inner
+    return [(begins[span.start], ends[span.stop - 1]) for span in spans]

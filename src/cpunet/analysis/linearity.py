@@ -120,14 +120,14 @@ def linearity_residual(
     second = (first + rng.integers(1, len(windows), size=pairs)) % len(windows)
     weight = rng.uniform(*WEIGHTS, size=pairs)[:, np.newaxis]
     sums = (weight * windows[first] + (1 - weight) * windows[second]).astype(np.float32)
-    parts = _translated(translate, windows[np.union1d(first, second)])
-    where = {int(row): i for i, row in enumerate(np.union1d(first, second))}
+    # each pulse is translated once, however many pairs have it
+    used, places = np.unique([first, second], return_inverse=True)
+    parts = _translated(translate, windows[used])
     of_sums = _translated(translate, sums)
 
     fits: list[_Fit] = []
     not_translated = unmatched = 0
-    for total, i, j, w in zip(of_sums, first, second, weight[:, 0], strict=True):
-        one, other = parts[where[int(i)]], parts[where[int(j)]]
+    for total, one, other, w in zip(of_sums, *parts[places], weight[:, 0], strict=True):
         if not all(np.isfinite(pulse).all() for pulse in (total, one, other)):
             not_translated += 1
             continue

@@ -7,7 +7,6 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.paired import align_half_maximum
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -18,18 +17,19 @@ class MeanPulse(NamedTuple):
 
     n: int
     mean: Values
-    before: int = 100
-
-    @classmethod
-    def of(cls, waveforms: FloatArray, before: int = 100, after: int = 150) -> Self:
-        """Average pulses of shape ``(n, length)``."""
-        return cls.of_aligned(align_half_maximum(waveforms, before, after), before)
+    before: int
 
     @classmethod
     def of_aligned(cls, aligned: FloatArray, before: int) -> Self:
-        """Average pulses already aligned by `align_half_maximum`."""
-        known = np.isfinite(aligned)
-        count = known.sum(axis=0)
-        total = np.where(known, aligned, 0).sum(axis=0, dtype=float)
-        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-        return cls(len(aligned), mean, before)
+        """Average pulses aligned by `paired.align_half_maximum`; others are left out."""
+        return cls(int(np.isfinite(aligned).any(axis=1).sum()), known_mean(aligned)[0], before)
+
+
+def known_mean(aligned: FloatArray) -> tuple[Values, npt.NDArray[np.intp]]:
+    """Mean of the known values of each sample, NaN where there are none, and their number.
+
+    It is computed in float64: sums of ten thousand float32 are off by a part of their error.
+    """
+    count = np.isfinite(aligned).sum(axis=0)
+    total = np.nansum(aligned, axis=0, dtype=float)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan), count

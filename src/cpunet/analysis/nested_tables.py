@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -43,10 +42,8 @@ def nested_html(value: Any, level: int = 4) -> Markup:
     level
         Level of the headings, 1 … 6.
     """
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if value and all(isinstance(item, Mapping) for item in value):
-            return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
-        return part("p", _cell(value))
+    if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+        return _matrix({str(i + 1): item for i, item in enumerate(value)}, "")
     if not isinstance(value, Mapping):
         return part("p", _cell(value))
     parts = []
@@ -81,12 +78,14 @@ def with_std(value: Any, error: Any) -> str:
 
     Examples
     --------
-    >>> with_std(0.52094, 0.0171), with_std(1327.2, 41.0), with_std(0.1, None)
-    ('0.521 ± 0.017', '1327 ± 41', '0.1')
+    >>> with_std(0.52094, 0.0171), with_std(0.52094, 0.0996), with_std(0.1, None)
+    ('0.521 ± 0.017', '0.52 ± 0.10', '0.1')
     """
     if value is None or error is None:
         return number(value)
-    digits = max(1 - math.floor(math.log10(error)), 0) if error > 0 else MAX_DIGITS
+    # the exponent of the rounded error: 0.0996 is 0.10
+    exponent = int(f"{error:.1e}".partition("e")[2]) if error > 0 else -MAX_DIGITS
+    digits = max(1 - exponent, 0)
     if digits >= MAX_DIGITS:
         return f"{number(value)} ± {error:.2g}"
     return f"{value:.{digits}f} ± {error:.{digits}f}"
@@ -130,8 +129,9 @@ def _rows_told(names: Sequence[str]) -> str:
     """
     told: list[tuple[str, str]] = []
     for name in names:
-        if told and name.isdecimal() and int(name) - 1 == int(told[-1][1]):
-            told[-1] = (told[-1][0], name)
+        first, last = told[-1] if told else ("", "")
+        if name.isdecimal() and last.isdecimal() and int(name) == int(last) + 1:
+            told[-1] = (first, name)
         else:
             told.append((name, name))
     return ", ".join(words_of(a) if a == b else f"{a}–{b}" for a, b in told)

@@ -16,14 +16,14 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.style import DATA_FILL, colours, label, styled
+from cpunet.analysis.style import DATA_FILL, colours, label, linear_within, styled
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-BIN_KEV = 2.0
+BIN_KEV = 2.0  # or more, if there would be too many bins
 MAX_BINS = 2000
 BEFORE, AFTER = 100, 150  # samples around the crossing that define the nearest pulse
 LINEAR = 1.0  # percent of full charge, up to which the scale of differences is linear
@@ -33,9 +33,7 @@ TARGETS = ("ren", "truth", "raw")  # methods to which the measured pulse is matc
 
 
 @styled
-def spectrum_figure(
-    energy_kev: Mapping[str, Values], peaks: Mapping[str, float], bin_kev: float = BIN_KEV
-) -> Figure:
+def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]) -> Figure:
     """Energy spectra of both sides, each normalised to one, with the gamma lines marked.
 
     Parameters
@@ -45,22 +43,18 @@ def spectrum_figure(
         simulation.
     peaks
         Energy of each line in keV, by name.
-    bin_kev
-        Bin width in keV; wider bins are used if there would be more than 2000.
 
     Raises
     ------
     CpunetError
-        If no energy is finite, or the width is not positive.
+        If no energy is finite.
     """
     finite = {m: values[np.isfinite(values)] for m, values in energy_kev.items()}
     everything = np.concatenate([np.empty(0), *finite.values()])
     if not everything.size:
         raise CpunetError("no pulse has an energy to draw; give a calibration")
-    if not bin_kev > 0:
-        raise CpunetError(f"bins of {bin_kev:g} keV; give more than 0")
-    low, high = np.quantile(everything, [0, 1])
-    width = max(bin_kev, (high - low) / MAX_BINS)
+    low, high = everything.min(), everything.max()
+    width = max(BIN_KEV, (high - low) / MAX_BINS)
     edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
     palette = colours(finite)
     figure = Figure(figsize=(7.5, 4.0))
@@ -283,9 +277,7 @@ def _draw_differences(
             axes.plot(time_ns, difference, color=palette[method], linewidth=1.0)
     for axes in panels:
         axes.axhline(0, color="black", linewidth=0.8)
-    # so that small differences show beside those of an untranslated simulation
-    panels[0].set_yscale("symlog", linthresh=LINEAR)
-    panels[0].yaxis.set_major_formatter("{x:g}")
+    linear_within(panels[0], LINEAR)
 
 
 def _aligned(method: str, window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:

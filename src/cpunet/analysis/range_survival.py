@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.a_over_e import sideband_survival
+from cpunet.analysis.a_over_e import sideband_survival, survival_error
 from cpunet.errors import CpunetError
 
 Values = npt.NDArray[np.float64]
@@ -147,8 +147,6 @@ def _survival(
             "missing": f"the sidebands leave no events of {counts['peak']} "
             f"from {peak[0]:g} to {peak[1]:g} keV"
         }
-    if not scale:
-        # standard deviation of the posterior with a flat prior: not 0 if none or all survive
-        n, p = counts["peak"], (counts["peak_pass"] + 1) / (counts["peak"] + 2)
-        std = float(100 * np.sqrt(p * (1 - p) / (n + 3)))
+    if not scale or not std:
+        std = 100 * survival_error(counts["peak_pass"], counts["peak"])
     return {"survival": survival, "survival_std": std}

@@ -60,11 +60,11 @@ class Slopes:
     @property
     def spreads(self) -> tuple[float, float]:
         """Robust standard deviations after subtraction, and of the empty traces."""
-        after, noise = self.after, self.before[self.empty]
-        return tuple(
-            SIGMA_PER_MAD * float(np.median(np.abs(part - np.median(part))))
-            for part in (after, noise)
-        )  # type: ignore[return-value]
+        return _robust_std(self.after), _robust_std(self.before[self.empty])
+
+
+def _robust_std(values: Values) -> float:
+    return SIGMA_PER_MAD * float(np.median(np.abs(values - np.median(values))))
 
 
 @styled
@@ -116,14 +116,11 @@ def sizes_figure(
     axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
     twice = 2 * float(told["error_kev"])
     axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")
-    axes.set_ylim(max(30 / n, 0.01), 100)
-    axes.set_xlabel("remainder at the first sample (keV)")
-    axes.set_ylabel("traces above (%)")
     axes.set_title(
         f"{told['rate_khz']:.2f} ± {told['rate_error_khz']:.2f} kHz, "
         f"decay {told['decay_us']:.1f} µs"
     )
-    axes.legend()
+    _label_sizes(axes, n)
     return figure
 
 
@@ -133,7 +130,11 @@ def _sizes(axes: Axes, kev: Values, law: RemainsLaw, error_kev: float) -> None:
     axes.loglog(at, shares, color=COLOURS["data"], drawstyle="steps-post", label="measured")
     label = f"law, {law.rate_khz:.2f} kHz, {law.decay_us:.1f} µs"
     axes.loglog(at, 100 * law.share_above(at), color=COLOURS["ren"], label=label)
-    axes.set_ylim(max(30 / len(kev), 0.01), 100)
+    _label_sizes(axes, len(kev))
+
+
+def _label_sizes(axes: Axes, traces: int) -> None:
+    axes.set_ylim(max(30 / traces, 0.01), 100)
     axes.set_xlabel("remainder at the first sample (keV)")
     axes.set_ylabel("traces above (%)")
     axes.legend()
@@ -148,7 +149,7 @@ def _slopes(axes: Axes, slopes: Slopes) -> None:
     axes.plot([], [], " ", label=f"empty baselines: {noise:.2f} keV")
     axes.set_yscale("log")
     axes.set_ylim(0.7, 10 * len(slopes.before) ** 0.7)
-    axes.set_xlabel("remainder that the slope tells (keV)")
+    axes.set_xlabel("remainder according to the slope (keV)")
     axes.set_ylabel("traces")
     axes.legend(loc="upper right")
 

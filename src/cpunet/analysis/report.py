@@ -57,14 +57,14 @@ VIEWS = {
     "distributions": (
         "Parameter distributions",
         "In the bins in which they are scored, with the data's statistical errors; below, the "
-        "pull of each bin: method less data in standard deviations of both. The frame is "
-        "fitted without the raw simulation's points. The IoU beside the data is the ceiling.",
+        "pull of each bin: method minus data, divided by the error of the difference. Pulls of "
+        "the raw simulation do not set the scale. The IoU of the data is the ceiling.",
     ),
     "slices": (
         "Mean pulses by rise time",
         "Pulses aligned at half maximum and averaged within slices of rise time, 1 to 90 %; "
-        "below, the differences from the data's, with the standard error of each mean as a "
-        "band and that of the data in grey about zero. Errors of neighbouring samples are "
+        "below, the differences from the data, with the standard error of each mean as a band "
+        "and that of the data in grey about zero. Errors of neighbouring samples are "
         "correlated.",
     ),
     "pulses": (
@@ -73,9 +73,9 @@ VIEWS = {
     ),
     "scatter": (
         "Current amplitude and drift time",
-        "One point a pulse, data in grey and one method beside them; of larger sets a part, "
-        "drawn at random. The drift time ends at the maximum, which on a flat top is that of "
-        "the noise.",
+        "One point per pulse, the data in grey and one method beside them; of larger sets, a "
+        "random sample. The drift time ends at the maximum, which on a flat top is that of the "
+        "noise.",
     ),
 }
 # parts of the metrics that are shown as nested tables
@@ -105,8 +105,8 @@ def write_report(
         ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by
         method) and, if the truth is known, ``paired`` (result of `paired.paired_scores` by
         method); or ``missing`` with the reason why the peak is not scored.
-        ``verdicts``: ``summary``, a list of sentences, and ``table`` with ``sigma`` and
-        ``words`` by peak, method and quantity.  ``ae_survival``, ``ae_details``,
+        ``verdicts``: ``summary``, a list of sentences, and ``table``, see
+        `verdicts.verdict_table`.  ``ae_survival``, ``ae_details``,
         ``drift_slices``, ``linearity``, ``noise``: nested values, shown as tables.
         ``compared``: names and values of the compared inputs.  ``training``: how the network
         was trained.  ``rejections``: counts by reason, possibly nested.  ``ae_energy``: result
@@ -171,15 +171,16 @@ def write_report(
 def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
     """Figures by their place on the page, see `PLACES`.
 
-    Mean pulses and noise are shown for a few peaks, preferably not that of the training.
+    Mean pulses and noise are shown for a few peaks, preferably not those of the training.
     """
+    trained = tuple(f"{peak} " for peak in [trained_on, *str(trained_on).split(",")])
     names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
     for name in drawn:
         told = name.replace("_", " ")
         end = next((end for end in PLACES if told.endswith(end)), None)
         names[PLACES[end] if end else "others"].append(name)
     for place in ("first", "noise"):
-        held_out = [n for n in names[place] if not n.startswith(f"{trained_on} ")]
+        held_out = [name for name in names[place] if not name.startswith(trained)]
         few = (held_out or names[place])[:FIRST]
         names["others"] += [name for name in names[place] if name not in few]
         names[place] = few

@@ -21,17 +21,13 @@ def verdicts_html(verdicts: Mapping[str, Any] | None) -> Markup:
         return Markup()
     parts = []
     if verdicts.get("summary"):
-        parts.append(part("points", _texts(verdicts["summary"])))
-    if "missing" in verdicts:
-        parts.append(part("gap", verdicts["missing"]))
-    rows = []
-    for peak, methods in verdicts.get("table", {}).items():
-        for method, quantities in methods.items():
-            for quantity, found in quantities.items():
-                sigma = _sigma(found.get("sigma"))
-                rows.append(
-                    [peak, label(method), words_of(quantity), sigma, found.get("words", "")]
-                )
+        parts.append(part("points", verdicts["summary"]))
+    rows = [
+        [peak, label(method), words_of(quantity), _sigma(found["sigma"]), found["words"]]
+        for peak, methods in verdicts.get("table", {}).items()
+        for method, quantities in methods.items()
+        for quantity, found in quantities.items()
+    ]
     if rows:
         head = ["Peak", "Method", "Quantity", "σ", "In words"]
         table = html_table(head, rows, words={0, 1, 2, 4})
@@ -70,8 +66,8 @@ def peak_html(
         parts.append(part("folded", "Scores without noise", without, screen=True))
     if scores.get("not_prepared"):
         counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
-        text = "Simulated pulses left out because they cannot be prepared as data are once "
-        parts.append(part("p", f"{text}they are translated: {'; '.join(counts)}."))
+        text = "Simulated pulses left out because, once translated, they cannot be prepared "
+        parts.append(part("p", f"{text}like data: {'; '.join(counts)}."))
     tables = []
     if scores.get("two_sample"):
         title = "The classifier as a table"
@@ -105,7 +101,7 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
                 ]
             )
             title = ""
-    head = ["Peak", "Method", "Survival [%]", "Less data [points]", "In sigma"]
+    head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
     return html_table(head, rows, words={0, 1})
 
 
@@ -154,7 +150,7 @@ def _parameter_table(
 
 
 def _two_sample_table(tested: Mapping[str, Mapping[str, Any]]) -> Markup:
-    head = ["Told from data by a classifier", "AUC", "Same with shuffled labels"]
+    head = ["Distinguished from data by a classifier", "AUC", "Same with shuffled labels"]
     rows = []
     for method, found in tested.items():
         if "missing" in found:
@@ -176,15 +172,6 @@ def _paired_table(paired: Mapping[str, Mapping[str, float | None]]) -> Markup:
 
 def _thousandths(value: float | None) -> str:
     return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
-
-
-def _texts(value: Any) -> list[str]:
-    """Return all strings in nested lists and mappings, in order."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    return (
-        [t for item in value for t in _texts(item)] if isinstance(value, list) else [str(value)]
-    )
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -81,22 +81,6 @@ class Resampled:
         return np.asarray(summed[:n_bins])
 
 
-def both_resampled(n_a: int, n_b: int, draws: int, seed: int | np.random.Generator) -> Draws:
-    """Bootstraps of two datasets, each at its own size.
-
-    Parameters
-    ----------
-    n_a, n_b
-        Numbers of events of the datasets.
-    draws
-        Number of samples.
-    seed
-        Seed or random generator.
-    """
-    rng = np.random.default_rng(seed)
-    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
-
-
 def resampled_twice(
     events: int, n_sim: int, n_data: int, draws: int, seed: int | np.random.Generator
 ) -> Draws:

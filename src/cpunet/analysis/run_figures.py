@@ -12,20 +12,30 @@ from typing import Any
 import hist
 import numpy as np
 import numpy.typing as npt
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.comparisons import Comparison, histogram
 from cpunet.analysis.mean_pulse import MeanPulse
-from cpunet.analysis.style import COLOURS, DATA_FILL, colours, label, styled
+from cpunet.analysis.style import (
+    COLOURS,
+    DATA_FILL,
+    colours,
+    label,
+    line_look,
+    linear_within,
+    styled,
+)
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
 
 Values = npt.NDArray[np.float64]
 
-# Panels of the loss figure: losses with their label and colour.
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
+AVERAGED = 10  # records in the moving average
+# Panels of the loss figure: losses with their label and colour.
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Cycle and identity": {
         "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
@@ -45,7 +55,7 @@ LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
 
 
 @styled
-def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figure:
+def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Losses during the training: each record faint, the moving average on top.
 
     Parameters
@@ -53,8 +63,6 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
     records
         Records of the training log: ``{"iteration": i, "losses": {name: value, …}}``, in
         order.
-    window
-        Number of records in the moving average.
 
     Raises
     ------
@@ -76,13 +84,14 @@ def loss_curves(records: Sequence[Mapping[str, Any]], window: int = 10) -> Figur
                 continue
             at, series = iteration[there], series[there]
             axes.plot(at, series, color=colour, alpha=0.25, linewidth=0.7)
-            average = _moving_average(series, window)
+            width = min(AVERAGED, len(series))
+            average = np.convolve(series, np.full(width, 1 / width), mode="valid")
             axes.plot(at[len(at) - len(average) :], average, colour, label=text)
         axes.set(title=title, xlabel="Iteration")
         if axes.lines:
             axes.legend()
     panels[0].set(ylabel="Loss", yscale="log")
-    figure.supxlabel(f"Lines: mean of {window} records", fontsize=8, x=0.99, ha="right")
+    figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
     return figure
 
 
@@ -109,9 +118,8 @@ def cycle_figure(
     end: FloatArray,
     titles: tuple[str, str, str],
     dt_ns: float,
-    pulses: int = 10,
 ) -> Figure:
-    """A few pulses through one cycle, in three panels (paper, figures of the cycles).
+    """Pulses through one cycle, in three panels (paper, figures of the cycles).
 
     Parameters
     ----------
@@ -122,15 +130,13 @@ def cycle_figure(
         Titles of the three panels.
     dt_ns
         Sampling period in ns.
-    pulses
-        Number of pulses that are drawn.
     """
     figure = Figure(figsize=(10.5, 3.2))
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     time_us = np.arange(start.shape[1]) * dt_ns * 1e-3
-    shades = _shades(min(pulses, len(start)))
+    shades = colormaps["viridis"](np.linspace(0, 0.9, len(start)))
     for axes, waveforms, title in zip(panels, (start, middle, end), titles, strict=True):
-        for waveform, shade in zip(waveforms, shades, strict=False):
+        for waveform, shade in zip(waveforms, shades, strict=True):
             axes.plot(time_us, waveform, color=shade, linewidth=1.0)
         axes.set(title=title, xlabel="Time [µs]")
     panels[0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
@@ -217,12 +223,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     # the translation last, so that it is on top
     for method in sorted(means, key=lambda name: name == "ren"):
         mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
-        # a broad grey line, so that a method which agrees does not hide the data
-        look = (
-            {"color": "0.65", "linewidth": 4.0}
-            if method == "data"
-            else {"color": palette[method]}
-        )
+        look = line_look(method, palette[method])
         above.plot(time_ns, mean, label=text, **look)
         if method == "raw":
             # its different height would dominate the difference
@@ -238,22 +239,8 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         ylabel="Method − data\n[% of full charge,\nlinear within ± 1]",
         xlim=(time_ns[0], time_ns[-1]),
     )
-    # so that small differences show beside those of an untranslated simulation
-    below.set_yscale("symlog", linthresh=1.0)
-    below.yaxis.set_major_formatter("{x:g}")
+    linear_within(below, 1.0)
     return figure
-
-
-def _moving_average(series: Values, window: int) -> Values:
-    """Moving average over `window` values, or over all if there are fewer."""
-    width = min(window, len(series))
-    return np.convolve(series, np.full(width, 1 / width), mode="valid")
-
-
-def _shades(count: int) -> Sequence[tuple[float, float, float, float]]:
-    from matplotlib import colormaps
-
-    return [colormaps["viridis"](x) for x in np.linspace(0, 0.9, count)]
 
 
 def _edges_with_flow(axis: hist.axis.Regular) -> Values:

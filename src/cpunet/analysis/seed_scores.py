@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from cpunet.analysis.verdicts import number, part
 
 Metrics = Mapping[str, Any]
 Values = npt.NDArray[np.float64]
@@ -59,27 +61,31 @@ def failed_seeds(metrics: Mapping[int, Metrics]) -> dict[int, list[str]]:
     return poor
 
 
-def _compared(
-    metrics: Mapping[int, Metrics],
-) -> Iterator[tuple[str, str, list[Mapping[str, Any]]]]:
-    """The IoU of all seeds, for each peak and parameter that any seed has."""
-    places = dict.fromkeys(
-        (peak, parameter)
-        for of_seed in metrics.values()
-        for peak, scores in of_seed["peaks"].items()
-        for parameter in scores["parameters"]
+def scored(runs: Iterable[Metrics]) -> list[tuple[str, str]]:
+    """Every peak and parameter that any of the runs has scored."""
+    return list(
+        dict.fromkeys(
+            (peak, parameter)
+            for metrics in runs
+            for peak in part(metrics, "peaks")
+            for parameter in part(metrics, "peaks", peak, "parameters")
+        )
     )
-    for peak, parameter in places:
+
+
+def _compared(metrics: Mapping[int, Metrics]) -> Iterator[tuple[str, str, list[Metrics]]]:
+    """The IoU of all seeds, for each peak and parameter that any seed has."""
+    for peak, parameter in scored(metrics.values()):
         path = ("peaks", peak, "parameters", parameter, "iou")
-        yield peak, parameter, [_part(of_seed, path) or {} for of_seed in metrics.values()]
+        yield peak, parameter, [part(of_seed, *path) for of_seed in metrics.values()]
 
 
 def _small_is_good(metrics: Mapping[int, Metrics]) -> Iterator[dict[str, Any]]:
-    parts = {"auc": ("two_sample", "ren", "auc"), "edge_rmse": ("paired", "ren", "edge_rmse")}
+    paths = {"auc": ("two_sample", "ren", "auc"), "edge_rmse": ("paired", "ren", "edge_rmse")}
     peaks = dict.fromkeys(peak for of_seed in metrics.values() for peak in of_seed["peaks"])
     for peak in peaks:
-        for name, path in parts.items():
-            found = [_part(of_seed["peaks"].get(peak), path) for of_seed in metrics.values()]
+        for name, path in paths.items():
+            found = [number(of_seed, "peaks", peak, *path) for of_seed in metrics.values()]
             known = [value for value in found if value is not None]
             if known:
                 yield {
@@ -92,17 +98,11 @@ def _small_is_good(metrics: Mapping[int, Metrics]) -> Iterator[dict[str, Any]]:
                 }
 
 
-def _part(content: Any, path: tuple[str, ...]) -> Any:
-    for key in path:
-        content = content.get(key) if isinstance(content, Mapping) else None
-    return content
+def _values(ious: list[Metrics], method: str) -> Values:
+    return np.array([number(iou, method) for iou in ious], float)  # None becomes NaN
 
 
-def _values(ious: list[Mapping[str, Any]], method: str) -> Values:
-    return np.array([iou.get(method) for iou in ious], float)  # None becomes NaN
-
-
-def _median(ious: list[Mapping[str, Any]], method: str) -> float:
+def _median(ious: list[Metrics], method: str) -> float:
     values = _values(ious, method)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else float("nan")

@@ -138,7 +138,7 @@ def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
     cells = [_edge(part(s, "paired", method)) for s in scores]
     rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
     cells = [_survival(part(metrics, "ae_survival", peak), method) for metrics in runs]
-    rows.append(_row(peak, "A/E survival less data [points]", cells, _off))
+    rows.append(_row(peak, "A/E survival minus data [points]", cells, _off))
     return [row for row in rows if any(cell.value is not None for cell in row.cells)]
 
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.drift_slices import Slices, Values, slice_residuals
-from cpunet.analysis.style import colours, label, styled
+from cpunet.analysis.style import colours, label, line_look, linear_within, styled
 
 LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
 
@@ -45,12 +45,8 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
         low, high = data.edges[i : i + 2]
         axes.set_title(f"{low:.0f} … {high:.0f} ns")
         for method, slices in sets.items():
-            look = (
-                {"color": "0.65", "linewidth": 4.0}
-                if method == "data"
-                else {"color": palette[method]}
-            )
             if slices.pulses[i].n:
+                look = line_look(method, palette[method])
                 axes.plot(time_ns, slices.pulses[i].mean, label=label(method), **look)
         counts = ", ".join(str(slices.pulses[i].n) for slices in sets.values())
         axes.text(0.97, 0.03, f"n = {counts}", ha="right", transform=axes.transAxes, size=8)
@@ -77,9 +73,7 @@ def _label(figure: Figure, first: Axes, below: list[Axes], peak: str) -> None:
     for axes in below:
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set_xlabel("Time from half maximum [ns]")
-    # so that small differences show beside those of an untranslated simulation
-    below[0].set_yscale("symlog", linthresh=LINEAR)
-    below[0].yaxis.set_major_formatter("{x:g}")
+    linear_within(below[0], LINEAR)
     below[0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
     first.set_ylabel("Pulse height")
     handles, names = first.get_legend_handles_labels()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -87,6 +90,20 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
     others = [method for method in methods if method not in COLOURS]
     spare = {m: SPARE_COLOURS[i % len(SPARE_COLOURS)] for i, m in enumerate(others)}
     return {method: COLOURS.get(method) or spare[method] for method in methods}
+
+
+def line_look(method: str, colour: str) -> dict[str, Any]:
+    """Look of a line; that of the data is broad and grey, so that it shows below others."""
+    return {"color": "0.65", "linewidth": 4.0} if method == "data" else {"color": colour}
+
+
+def linear_within(axes: Axes, limit: float) -> None:
+    """Make a y axis logarithmic, but linear up to ± `limit`.
+
+    Small differences then show beside those of an untranslated simulation.
+    """
+    axes.set_yscale("symlog", linthresh=limit)
+    axes.yaxis.set_major_formatter("{x:g}")
 
 
 def label(method: str) -> str:

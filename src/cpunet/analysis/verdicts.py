@@ -325,9 +325,9 @@ def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -
 def judged_scores(metrics: Mapping[str, Any], method: str) -> tuple[int, int]:
     """Number of scores of a method that are off, and number of scores with a verdict."""
     judged = [
-        verdict.agrees
+        found.agrees
         for peak in part(metrics, "peaks")
-        for verdict in method_verdicts(metrics, peak, method).values()
-        if verdict.agrees is not None
+        for found in method_verdicts(metrics, peak, method).values()
+        if found.agrees is not None
     ]
     return judged.count(False), len(judged)

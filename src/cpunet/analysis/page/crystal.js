@@ -51,7 +51,7 @@ class Crystal {
     return below.join("") + beside.join("") + `<text x="${FRAME.left + w / 2}" y="${bottom + 35}" text-anchor="middle">r [mm]</text>` + upright(12, FRAME.top + h / 2, "z [mm]");
   }
 
-  // colours of values, and the bar that tells them
+  // colours of values, and the bar that explains them
   shade() {
     const known = this.values.filter((v) => v !== null), last = DATA.map.length - 1;
     let [low, high] = known.length ? [Math.min(...known), Math.max(...known)] : [0, 1];

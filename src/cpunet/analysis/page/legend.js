@@ -51,12 +51,12 @@ function row(packed, index) {
   return unpack(packed).slice(index * width, (index + 1) * width);
 }
 
-// columns that follow the cursor have nothing to say on paper
+// columns that follow the cursor, which are left out on paper
 const LIVE = ["at", "off"];
 const live = (column) => (LIVE.includes(column) ? " class=\"live\"" : "");
 
 // A table of methods; its first column switches them on and off, others are set by name.
-// look(name): how this plot draws a method, where it is no line
+// look(name): how this plot draws a method, if not as a line
 class Legend {
   constructor(host, look = () => ({})) {
     this.host = host;
@@ -87,7 +87,7 @@ class Legend {
   set(name, column, text) {
     const cell = this.cells.get(`${name}/${column}`);
     if (cell) cell.textContent = text;
-    // without a cursor they say nothing
+    // without a cursor they are empty
     const live = [...this.host.querySelectorAll("td.live")];
     if (LIVE.includes(column)) this.host.querySelector("table").classList.toggle("idle", live.every((td) => !td.textContent));
   }

@@ -159,7 +159,7 @@ class Plot {
     return [panel.zero ? low : low - margin, high + margin];
   }
 
-  // x of the cursor in the axis' unit, or null to take it away
+  // x of the cursor in the axis' unit, or null to remove it
   cursor(x) {
     const known = x !== null && this.spec.snap;
     const at = known ? this.spec.snap(x) : null;

@@ -1,10 +1,11 @@
 // Mean pulses by slice of rise time, and single events; both above their differences.
 const EDGE = [0.01, 0.99]; // of the maximum
 
-// the times at which a pulse begins and ends its rise, with some room
+// the times at which a pulse begins and ends its rise, with some room; null if there is no pulse
 function edgeOf(xs, ys) {
   const top = Math.max(...ys.filter(Number.isFinite));
-  const begin = xs[ys.findIndex((y) => y > EDGE[0] * top)], end = xs[ys.findIndex((y) => y > EDGE[1] * top)];
+  const [begin, end] = EDGE.map((part) => xs[ys.findIndex((y) => y > part * top)]);
+  if (begin === undefined) return null;
   const room = Math.max((end - begin) * 0.15, xs[1] - xs[0]);
   return [begin - room, end + room];
 }
@@ -24,7 +25,7 @@ function nearestTo(xs) {
 const percent = (v) => (Number.isFinite(v) ? `${v < 0 ? "−" : "+"}${Math.abs(v).toPrecision(2)} %` : "–");
 
 function mountSuperpulses(host, data) {
-  const columns = [["n", "Pulses"], ["at", "Height"], ["off", "Less data"]];
+  const columns = [["n", "Pulses"], ["at", "Height"], ["off", "Minus data"]];
   let xs = [], means = {}, residuals = {}, sigma = {};
   const edge = () => xs.length && view.plot.zoomTo(edgeOf(xs, means.data || Object.values(means)[0]));
   const view = new View(host, {
@@ -80,7 +81,7 @@ function mountSuperpulses(host, data) {
       snap: nearestTo(xs),
       panels: [
         { label: "Pulse height", share: 1.3, series: upper },
-        { label: base ? "Less data [% of charge]" : "No data to compare", share: 1, symmetric: true, series: lower },
+        { label: base ? "Minus data [% of charge]" : "No data to compare", share: 1, symmetric: true, series: lower },
       ],
     });
     readout(null);
@@ -99,7 +100,7 @@ function mountSuperpulses(host, data) {
 // whether the differences of the untranslated simulation, tens of percent, set the scale
 function scaleBox(view, update) {
   const label = document.createElement("label");
-  label.innerHTML = "<input type=\"checkbox\"> scale to the raw simulation too";
+  label.innerHTML = "<input type=\"checkbox\"> include the raw simulation in the scale";
   view.controls.append(label);
   const box = label.querySelector("input");
   box.addEventListener("change", update);
@@ -147,7 +148,7 @@ function mountPulses(host, data) {
     xs = times(data, pulses[names[0]].length);
     const upper = [], lower = [];
     const what = reference && methodOf(reference).label.toLowerCase();
-    view.legend.build(names, [["at", "Height"], ["off", reference ? `Less ${what}` : "–"], ["rms", "RMS of that"]]);
+    view.legend.build(names, [["at", "Height"], ["off", reference ? `Minus ${what}` : "–"], ["rms", "Its RMS"]]);
     const wide = names.includes("nearest") && isShown("nearest");
     if (wide) upper.push(line(xs, pulses.nearest, methodOf("nearest")));
     for (const name of onTop(names)) {
@@ -168,7 +169,7 @@ function mountPulses(host, data) {
       snap: nearestTo(xs),
       panels: [
         { label: "Pulse height", share: 1.3, series: upper },
-        ...(reference ? [{ label: reference === "truth" ? "Less truth [%]" : "Less measured [%]", share: 1, symmetric: true, series: lower }] : []),
+        ...(reference ? [{ label: reference === "truth" ? "Minus truth [%]" : "Minus measured [%]", share: 1, symmetric: true, series: lower }] : []),
       ],
     });
     readout(null);

@@ -10,7 +10,6 @@ function mountScatter(host, data) {
     box: true,
     most: 560,
     look: cloud,
-    onCursor: () => {},
   });
   const peak = view.select("Peak", peakChoices(data.peaks), update);
   const beside = view.select("Beside the data", [], update);
@@ -18,7 +17,6 @@ function mountScatter(host, data) {
   view.button("All", () => {
     const all = (axis) => ends(Object.keys(clouds).filter(isShown).flatMap((name) => clouds[name][axis]));
     view.plot.zoomTo(all("x"), all("y"));
-    count();
   }, "Show all pulses");
   const draw = view.plot.draw.bind(view.plot);
   view.plot.draw = () => { draw(); count(); };
