@@ -122,7 +122,7 @@ class SimulationSettings(Config):
             known = value in ("temperature", "siggen") or 0 < float(value) <= 1000
         except (TypeError, ValueError, OverflowError):
             known = False
-        if not known or isinstance(value, bool):
+        if not known:
             raise ValueError(
                 "give a number above 0 (to 1000) in V mm/cm, temperature or siggen"
             )
