@@ -119,7 +119,8 @@ class Detector(Config):
         if (self.bore_length > 0) != (self.bore_radius > 0):
             yield "bore_length and bore_radius must both be given, or both be 0"
         if self.bore_length + 2 * li + self.point_contact_length >= length:
-            yield "bore_length (with li_thickness) reaches the point contact"
+            which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
+            yield f"{which} reaches the point contact (point_contact_length)"
         if self.inner_taper_length > self.bore_length:
             yield "inner_taper_length exceeds bore_length"
         if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
@@ -140,6 +141,8 @@ class Detector(Config):
             yield "ditch_depth needs a wrap_around_radius, the ditch's outer radius"
         if self.wrap_around_radius >= radius - max(li, self.bottom_bullet_radius):
             yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
+        if self.point_contact_radius >= bottom_radius - max(li, self.bottom_bullet_radius):
+            yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
         if self.ditch_depth + self.bore_length + li >= length:
             yield "ditch_depth reaches the bore (bore_length) or the top"
         if self.grid_mm > self.point_contact_radius / 2:
