@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,13 +14,11 @@ from cpunet.pulses.container import Pulses
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import build_library
+from cpunet.simulation.library import Progress, build_library
 from cpunet.simulation.library_lookup import Library, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import cloud_numbers, hit_table, point_signal, time_numbers
 from cpunet.simulation.velocity import FloatArray
-
-Progress = Callable[[int, int], None]
 
 # Events between two calls of `progress`.
 _BLOCK = 2000
@@ -85,7 +82,6 @@ def simulate_events(
     mode: Literal["exact", "library"] = "exact",
     progress: Progress | None = None,
     library: Library | None = None,
-    library_progress: Progress | None = None,
 ) -> EventPulses:
     r"""Simulate the pulse of each event, in parallel over the events.
 
@@ -110,8 +106,6 @@ def simulate_events(
         Called regularly with the numbers of completed events and of all events.
     library
         Pre-computed pulses for the same fields and settings; built if None.
-    library_progress
-        Progress of building them; see `build_library`.
 
     Raises
     ------
@@ -122,7 +116,7 @@ def simulate_events(
     if mode == "exact":
         library = None
     elif library is None:
-        library = build_library(fields, settings, library_progress)
+        library = build_library(fields, settings)
     maps = drift_maps(fields, settings)
     n = hits.n_events
     waveforms = np.zeros((n, settings.n_samples), np.float32)
