@@ -89,7 +89,7 @@ class SimulationSettings(Config):
 
     @property
     def n_steps(self) -> int:
-        """Drift steps per record."""
+        """Time steps per record."""
         return self.n_samples * self.steps_per_sample
 
     @property
@@ -99,7 +99,7 @@ class SimulationSettings(Config):
 
     @property
     def steps_per_sample(self) -> int:
-        """Drift steps per sample."""
+        """Time steps per sample."""
         return round(self.dt_ns / self.step_ns)
 
     @property

@@ -12,10 +12,10 @@ from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.cloud import (
     FWHM_PER_SIGMA,
+    SMALLEST_FWHM_MM,
     diffusion_constant,
     repulsion_constant,
     smear_and_sample,
-    starting_fwhm_mm,
 )
 from cpunet.simulation.drift import drift
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
@@ -164,7 +164,7 @@ def cloud_numbers(
     constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
     growing = settings.diffusion or settings.self_repulsion > 0
     return (
-        starting_fwhm_mm(settings.cloud_fwhm_mm, growing),
+        max(settings.cloud_fwhm_mm, SMALLEST_FWHM_MM if growing else 0.0),
         constant if settings.diffusion else 0.0,
         repulsion_constant(1.0) * settings.self_repulsion,
         siggen,
