@@ -78,9 +78,12 @@ def detectors_of(path: Path) -> list[str]:
 
 def _detector(path: Path, detector: str | None) -> str:
     there = detectors_of(path)
-    names = ", ".join(there)
+    names = ", ".join(there) or "none"
     if detector is None:
-        if len(there) != 1:
+        if not there:
+            columns = ", ".join(("edep", *_AXES))
+            raise CpunetError(f"{path}: no table of stp has {columns}; simulate again")
+        if len(there) > 1:
             raise CpunetError(
                 f"{path}: holds detectors {names}; choose one with detector (--hits-detector)"
             )
@@ -99,11 +102,11 @@ def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
         for i, axis in enumerate(_AXES):
             where = f"detector_origins/{name}/{axis}"
             number = file.get(where)
-            if not isinstance(number, h5py.Dataset) or number.size != 1:
+            if not is_column(number) or number.size != 1:
                 raise CpunetError(f"{path}: {where} is no number; write the file again")
             unit = text_attribute(number, "units")
             # an origin may lack a unit; all lengths of remage are in m
-            origin[i] = float(number[()]) * units.to_mm(path, where, unit or "m")
+            origin[i] = number[()].item() * units.to_mm(path, where, unit or "m")
     return origin
 
 
