@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_dilation
 
 from cpunet.errors import CpunetError
 from cpunet.machine_memory import require_memory
@@ -14,7 +15,6 @@ from cpunet.simulation.geometry import (
     DITCH,
     GERMANIUM,
     LI_CONTACT,
-    POINT_CONTACT,
     Detector,
     FloatArray,
     RegionArray,
@@ -122,18 +122,8 @@ def point_types(grid: Grid) -> RegionArray:
     """
     types = grid.region.copy()
     germanium = grid.region == GERMANIUM
-    types[germanium & _beside(grid.region == DITCH)] = DITCH_EDGE
-    contact = (grid.region == POINT_CONTACT) | (grid.region == LI_CONTACT)
-    types[germanium & _beside(contact)] = CONTACT_EDGE
+    # a dilation adds the four neighbours of each node
+    types[germanium & binary_dilation(grid.region == DITCH)] = DITCH_EDGE
+    types[germanium & binary_dilation(~grid.free)] = CONTACT_EDGE
     types[germanium[:, 0], 0] = PASSIVATED
     return types
-
-
-def _beside(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Nodes with at least one of their four neighbours in `where`."""
-    beside = np.zeros_like(where)
-    beside[:-1] |= where[1:]
-    beside[1:] |= where[:-1]
-    beside[:, :-1] |= where[:, 1:]
-    beside[:, 1:] |= where[:, :-1]
-    return beside

@@ -17,8 +17,6 @@ from cpunet.pulses.reading.lh5_rows import read_rows
 from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _AXES = ("xloc", "yloc", "zloc")
-
-
 ROWS = 5_000  # rows per part: of the order of 10 MB of steps
 
 
