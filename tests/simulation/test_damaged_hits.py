@@ -118,6 +118,34 @@ def test_remage_tables_shorter_than_their_events(tmp_path, name, values) -> None
         read_hits(path)
 
 
+@pytest.mark.parametrize("origin", [0.01, np.array([0.01])])
+def test_an_origin_is_a_number_or_an_array_of_one(tmp_path: Path, origin: object) -> None:
+    path = remage(tmp_path / "stp.lh5")
+    with h5py.File(path, "r+") as file:
+        file["detector_origins/det1/xloc"] = origin  # in m
+        file["detector_origins/det1/yloc"] = file["detector_origins/det1/zloc"] = 0.0
+    assert read_hits(path).hits.x_mm.tolist() == [-9, -8, -7]
+
+
+@pytest.mark.parametrize("origin", [[1j], [b"far"], [0.0, 0.0]])
+def test_an_origin_that_is_no_number(tmp_path: Path, origin: object) -> None:
+    path = remage(tmp_path / "stp.lh5")
+    with h5py.File(path, "r+") as file:
+        file["detector_origins/det1/xloc"] = origin
+    with pytest.raises(CpunetError, match="detector_origins/det1/xloc is no number"):
+        read_hits(path)
+
+
+def test_a_file_of_remage_without_steps(tmp_path: Path) -> None:
+    path = remage(tmp_path / "stp.lh5")
+    with h5py.File(path, "r+") as file:
+        del file["stp/det1/edep"]
+    with pytest.raises(CpunetError, match="no table of stp has edep, xloc, yloc, zloc"):
+        read_hits(path)
+    with pytest.raises(CpunetError, match="no detector det1; it holds none"):
+        read_hits(path, detector="det1")
+
+
 def kept(path: Path, numbers: object, pulses: object) -> Path:
     n = len(np.atleast_1d(numbers))
     with h5py.File(path, "w") as file:

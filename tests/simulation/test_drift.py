@@ -32,6 +32,18 @@ def test_nothing_drifts_from_a_contact_or_from_outside(planar: Maps) -> None:
     assert np.isnan(paths.electrons).all()
 
 
+@pytest.mark.parametrize("far", [np.nan, np.inf, -np.inf, 1e300])
+def test_nothing_drifts_from_where_nothing_can_be(planar: Maps, far: float) -> None:
+    paths = drift_paths(planar, [far, 0.0], 0.0, [8.0, far], STEPS)
+    assert np.isnan(paths.holes).all()
+
+
+def test_a_single_place_is_one_path(planar: Maps) -> None:
+    paths = drift_paths(planar, 5.0, 3.0, 8.0, STEPS)
+    assert paths.holes.shape == (1, STEPS.n_steps, 3)
+    np.testing.assert_array_equal(paths.holes, drift_paths(planar, [5], [3], [8], STEPS).holes)
+
+
 def test_reference_paths(reference_data: Path, reference_maps: Maps) -> None:
     with np.load(reference_data / "siggen" / "drift_paths_A_grid0.1.npz") as data:
         start, expected = data["positions"], data["paths"][:, : STEPS.n_steps]

@@ -167,6 +167,23 @@ def test_any_bias_and_impurity_from_one_solution(more: list[str]) -> None:
     assert not steps
 
 
+def test_the_scale_decides_whether_a_bias_depletes() -> None:
+    plain = read_detector("ppc", COARSE)
+    many = {"impurity_z0_1e10_per_cm3": -32.0, "impurity_gradient_1e10_per_cm4": 3.2}
+    # 40 times the impurities, which no bias depletes, and a scale that undoes it
+    same_sum = plain.model_copy(update=many | {"impurity_scale": 1 / 40})
+    expected = compute_fields(plain).depletion_V
+    assert compute_fields(same_sum).depletion_V == pytest.approx(expected, abs=1)
+    with pytest.raises(CpunetError, match="give at least the depletion voltage, 18"):
+        compute_fields(same_sum.model_copy(update={"bias_V": 500.0}))
+    with pytest.raises(CpunetError, match="no bias up to 20000 V depletes it"):
+        compute_fields(plain.model_copy(update={"impurity_scale": 40.0}))
+    # the solution is kept although no bias depletes its impurities as given
+    steps: list[str] = []
+    assert solve(same_sum, progress=steps.append).unit_depletion_V == np.inf
+    assert not steps
+
+
 def test_undepleted_parts_are_not_superposed() -> None:
     solution = solve(read_detector("ppc", COARSE))
     depletion = solution.depletion_V(1.3)

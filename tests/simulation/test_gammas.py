@@ -251,5 +251,6 @@ def test_tapers_bore_and_ditch_are_cut_out() -> None:
 def test_resolution_has_the_width_asked_for() -> None:
     energy = with_resolution(np.full(40_000, 2614.5), noise_kev2=1.0, fano_kev=0.002, seed=1)
     assert energy.std() * 2.3548 == pytest.approx(np.sqrt(1 + 0.002 * 2614.5), rel=0.02)
-    with pytest.raises(CpunetError, match="numbers from 0 up"):
-        with_resolution([1.0], noise_kev2=-1, fano_kev=0, seed=1)
+    for noise, fano in ((-1, 0), (0, -1), (np.nan, 0), (0, np.inf)):
+        with pytest.raises(CpunetError, match="numbers from 0 up"):
+            with_resolution([1.0], noise_kev2=noise, fano_kev=fano, seed=1)

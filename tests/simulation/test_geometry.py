@@ -103,7 +103,17 @@ def test_impurities_follow_their_terms() -> None:
 @pytest.mark.parametrize(
     ("values", "key"),
     [
-        ({"bore_length": 94.0}, "bore_length"),
+        ({"bore_length": 94.0}, "bore_length .* reaches the point contact"),
+        (
+            {"bore_length": 0, "bore_radius": 0, "bore_bullet_radius": 0}
+            | {"point_contact_length": 94.5},
+            r"error, li_thickness reaches the point contact \(point_contact_length\)",
+        ),
+        (
+            {"wrap_around_radius": 0, "ditch_depth": 0, "ditch_thickness": 0}
+            | {"point_contact_radius": 39.6},
+            "point_contact_radius reaches the lithium",
+        ),
         ({"bore_radius": 0}, "bore_radius"),
         ({"bore_bullet_radius": 6}, "bore_bullet_radius"),
         ({"point_contact_radius": 11.5}, "point_contact_radius"),

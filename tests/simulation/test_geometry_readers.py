@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -220,6 +221,8 @@ def test_the_public_metadata(reference_data: Path) -> None:
     ("place", "value", "said"),
     [
         ("impurity_curve.model", "spline_boule", "impurity_curve.model 'spline_boule'"),
+        ("impurity_curve.model", ["spline_boule"], "impurity_curve.model ['spline_boule']"),
+        ("slices.A.detector_offset_in_mm", 1e200, "detector_offset_in_mm = 1e+200 is too"),
         ("impurity_curve.parameters.b", None, "no impurity_curve.parameters.b"),
         ("impurity_curve.parameters.b", "much", "parameters.b = 'much' is no number"),
         ("impurity_curve.parameters.m", 0, "impurity_curve.parameters.m = 0"),
@@ -265,13 +268,34 @@ def test_what_the_metadata_lack_is_named(
     assert capfd.readouterr() == ("", "")
 
 
-def test_points_of_a_line_at_one_distance(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("distances", [[0, 0.0], [0, 1e-320], [0, math.inf], [math.nan, 1]])
+def test_points_of_a_line_at_no_different_distances(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], distances: list[float]
 ) -> None:
-    array = {"value_in_1e9e/cm3": [8.0, 9.0], "dist_from_contact_in_mm": [0, 0.0]}
+    array = {"value_in_1e9e/cm3": [8.0, 9.0], "dist_from_contact_in_mm": distances}
     path = metadata(tmp_path, None, {**DIODE, "production": {"impcc": {"array": array}}})
     assert "at different distances; correct it" in refused(path, "temperature_K=90")
     assert capfd.readouterr() == ("", "")
+
+
+def test_an_exponential_that_ends_before_the_detector(tmp_path: Path) -> None:
+    crystal = copy.deepcopy(CRYSTAL)
+    crystal["impurity_curve"]["parameters"] |= {"l": 200.0, "m": 0.1}
+    detector = read_detector(metadata(tmp_path, crystal, DIODE), ["temperature_K=90"])
+    assert detector.impurity_exponential_1e10_per_cm3 == 0
+
+
+def test_diodes_with_a_name_or_height_that_none_has(tmp_path: Path) -> None:
+    given = ["temperature_K=90", "impurity_z0_1e10_per_cm3=-1"]
+    path = metadata(tmp_path, CRYSTAL, without_impcc(name="V" * 400))
+    assert "there is no" in refused(path, given[0])
+    assert read_detector(path, given).name == "V" * 400
+    nameless = {key: value for key, value in DIODE.items() if key != "name"}
+    path.write_text(yaml.safe_dump(nameless))
+    assert read_detector(path, given).name == "B99000A"
+    tall = {**DIODE, "geometry": {**DIODE["geometry"], "height_in_mm": 1e200}}
+    path.write_text(yaml.safe_dump(tall))
+    assert "crystal_length = 1e+200" in refused(path, *given)
 
 
 def test_a_crystal_belongs_to_a_diode(tmp_path: Path) -> None:

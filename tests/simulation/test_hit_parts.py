@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import lh5
 import numpy as np
 import pytest
@@ -60,6 +61,26 @@ def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
         found = list(parts())
         assert len(found) > 1 or size >= 52
         require_same(Hits.concatenate(found), read_hits(file).hits)
+
+
+def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path, monkeypatch):
+    small = read_hits(write(tmp_path / "small.lh5", np.arange(N))).hits
+    file = write(tmp_path / "stp.lh5", 2**53 + np.arange(N))
+    read = read_hits(file).hits
+    np.testing.assert_array_equal(read.event_number, 2**53 + small.event_number)
+    np.testing.assert_array_equal(read.offsets, small.offsets)
+    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    require_same(Hits.concatenate(list(hit_parts(file)())), read)
+
+
+def test_event_numbers_that_are_text(tmp_path):
+    file = write(tmp_path / "stp.lh5", np.arange(N))
+    with h5py.File(file, "r+") as content:
+        del content["stp/V01/evtid"]
+        content["stp/V01/evtid"] = [b"a"] * N
+        content["stp/V01/evtid"].attrs["datatype"] = "array<1>{real}"
+    with pytest.raises(CpunetError, match=r"stp\.lh5: [^\n]+$"):
+        list(hit_parts(file)())
 
 
 def test_rows_of_an_event_that_lie_apart_are_read_at_once(tmp_path, monkeypatch):

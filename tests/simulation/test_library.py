@@ -169,14 +169,7 @@ def test_exact_mode_does_without_a_library(
 
 def test_building_tells_how_far_it_is(planar: Maps) -> None:
     seen: list[tuple[int, int]] = []
-    hits = random_events((14, 14), 6)
-    simulate_events(
-        planar,
-        hits,
-        SETTINGS,
-        mode="library",
-        library_progress=lambda done, n: seen.append((done, n)),
-    )
+    build_library(planar, SETTINGS, lambda done, n: seen.append((done, n)))
     done, total = np.transpose(seen)
     assert np.all(np.diff(done) > 0)
     assert np.all(np.diff(total) >= 0)

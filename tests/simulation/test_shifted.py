@@ -65,6 +65,8 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
         ("temperature_K=.nan", "finite"),
         ("impurity_factor=0", "greater than 0"),
         ("diffusion_constant=cold", "diffusion_constant"),
+        ("diffusion_constant=true", "diffusion_constant: Input should be a number"),
+        ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
         ("nowhere.yaml", "nowhere.yaml: cannot be read; give KEY=VALUE or a YAML file"),
         ("a={", "no plain value"),
     ],

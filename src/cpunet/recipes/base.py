@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -29,7 +29,15 @@ class Config(BaseModel):
         """Refuse true and false where a number is expected; they would count as 1 and 0."""
         for name, value in values.items() if isinstance(values, Mapping) else ():
             if isinstance(value, bool) and name in cls.model_fields.keys() - {*cls.switches}:
-                kind = cls.model_fields[name].annotation
-                if kind in (int, float) or kind in (int | None, float | None):
+                kinds = _kinds(cls.model_fields[name].annotation)
+                if kinds & {int, float} and bool not in kinds:
                     raise ValueError(f"{name}: Input should be a number, not true or false")
         return values
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """Types that an annotation such as ``Annotated[float, ...] | None`` allows."""
+    parts = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        parts = parts[:1]
+    return set().union(*map(_kinds, parts)) if parts else {annotation}

@@ -21,7 +21,8 @@ _SIGGEN_FWHM_PER_SIGMA = 2.355
 # 2.355**2 times 0.12 V mm/cm, as rounded in siggen
 _SIGGEN_DIFFUSION = 0.67
 _BOLTZMANN_V_PER_K = 8.617333e-5
-_SMALLEST_FWHM_MM = 0.01
+SMALLEST_FWHM_MM = 0.01
+"""Initial FWHM of a cloud that grows, at least."""
 _MAX_REPULSION = 0.05
 _CUT_FWHM = 2.0
 
@@ -82,11 +83,6 @@ def repulsion_constant(energy_kev: float) -> float:
     """
     charge = energy_kev / 0.003 / 6.241e18
     return charge * 0.67**3 * 9e13 / 16 * _SIGGEN_FWHM_PER_SIGMA**3
-
-
-def starting_fwhm_mm(fwhm_mm: float, diffusion: bool) -> float:
-    """Initial FWHM of the cloud in mm; above zero if it grows."""
-    return max(fwhm_mm, _SMALLEST_FWHM_MM) if diffusion else fwhm_mm
 
 
 @kernel(inline="always")

@@ -176,9 +176,10 @@ def drift_paths(
         Positions (n, steps, 3) in mm of both carriers.
     """
     start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
+    start = start.reshape(-1, 3)
     maps = drift_maps(fields, settings)
     paths = np.full((2, len(start), settings.n_steps, 3), np.nan)
-    _fill_paths(maps, start.reshape(-1, 3), settings.step_ns, paths)
+    _fill_paths(maps, start, settings.step_ns, paths)
     return DriftPaths(electrons=paths[ELECTRON], holes=paths[HOLE])
 
 

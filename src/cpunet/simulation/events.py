@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,13 +14,11 @@ from cpunet.pulses.container import Pulses
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import build_library
+from cpunet.simulation.library import Progress, build_library
 from cpunet.simulation.library_lookup import Library, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import cloud_numbers, hit_table, point_signal, time_numbers
+from cpunet.simulation.signals import Task, drift_task, hit_table, point_signal
 from cpunet.simulation.velocity import FloatArray
-
-Progress = Callable[[int, int], None]
 
 # Events between two calls of `progress`.
 _BLOCK = 2000
@@ -85,7 +82,6 @@ def simulate_events(
     mode: Literal["exact", "library"] = "exact",
     progress: Progress | None = None,
     library: Library | None = None,
-    library_progress: Progress | None = None,
 ) -> EventPulses:
     r"""Simulate the pulse of each event, in parallel over the events.
 
@@ -110,8 +106,6 @@ def simulate_events(
         Called regularly with the numbers of completed events and of all events.
     library
         Pre-computed pulses for the same fields and settings; built if None.
-    library_progress
-        Progress of building them; see `build_library`.
 
     Raises
     ------
@@ -122,22 +116,22 @@ def simulate_events(
     if mode == "exact":
         library = None
     elif library is None:
-        library = build_library(fields, settings, library_progress)
+        library = build_library(fields, settings)
     maps = drift_maps(fields, settings)
     n = hits.n_events
     waveforms = np.zeros((n, settings.n_samples), np.float32)
     lost_kev, trapped_kev = np.zeros(n), np.zeros(n)
     outcome = np.zeros(len(table), np.int8)
-    cloud, times = cloud_numbers(fields, settings), time_numbers(settings)
+    task = drift_task(fields, settings)
     for begin in range(0, n, _BLOCK):
         end = min(begin + _BLOCK, n)
         part = slice(begin, end)
         offsets = hits.offsets[begin : end + 1]
         sums = (waveforms[part], lost_kev[part], trapped_kev[part], outcome)
         if library is None:
-            _sum_exact(maps, table, offsets, cloud, times, *sums)
+            _sum_exact(maps, table, offsets, task, *sums)
         else:
-            _sum_library(maps, library, table, offsets, cloud, times, *sums)
+            _sum_library(maps, library, table, offsets, task, *sums)
         if progress:
             progress(end, n)
     energy = hits.energy_kev
@@ -164,16 +158,15 @@ def _sum_exact(
     maps: DriftMaps,
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
-    cloud: tuple[float, float, float, bool],
-    times: tuple[float, int, int],
+    task: Task,
     waveforms: npt.NDArray[np.float32],
     lost_kev: FloatArray,
     trapped_kev: FloatArray,
     outcome: npt.NDArray[np.int8],
 ) -> None:
     for event in prange(len(offsets) - 1):
-        out = np.zeros(waveforms.shape[1])
-        signal = np.empty(waveforms.shape[1] * times[1])
+        out = np.zeros(task.n_samples)
+        signal = np.empty(task.n_samples * task.per_sample)
         lost = collected = trapped = 0.0
         for i in range(offsets[event], offsets[event + 1]):
             hit = hits[i]
@@ -182,7 +175,7 @@ def _sum_exact(
                 lost += hit[3]
                 continue
             collected += hit[3]
-            outcome[i], share = _add_drifted(maps, hit, cloud, times, signal, out)
+            outcome[i], share = _add_drifted(maps, hit, task, signal, out)
             trapped += hit[3] * share
         lost_kev[event], trapped_kev[event] = lost, trapped
         if collected > trapped:
@@ -196,8 +189,7 @@ def _sum_library(
     library: Library,
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
-    cloud: tuple[float, float, float, bool],
-    times: tuple[float, int, int],
+    task: Task,
     waveforms: npt.NDArray[np.float32],
     lost_kev: FloatArray,
     trapped_kev: FloatArray,
@@ -209,7 +201,7 @@ def _sum_library(
         out = np.empty(n_samples)
         quick = np.empty(n_samples, np.float32)
         steps = np.empty(n_samples + 1)
-        signal = np.empty(n_samples * times[1])
+        signal = np.empty(n_samples * task.per_sample)
         for event in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n_events)):
             out[:] = 0.0
             quick[:] = 0.0
@@ -226,7 +218,7 @@ def _sum_library(
                     outcome[i] = _INTERPOLATED
                     trapped += add_pulse(library, hit, hit[3], 0, quick, steps)
                 else:
-                    outcome[i], part = _add_drifted(maps, hit, cloud, times, signal, out)
+                    outcome[i], part = _add_drifted(maps, hit, task, signal, out)
                     trapped += hit[3] * part
             lost_kev[event], trapped_kev[event] = lost, trapped
             if collected > trapped:
@@ -240,12 +232,11 @@ def _sum_library(
 def _add_drifted(
     maps: DriftMaps,
     hit: FloatArray,
-    cloud: tuple[float, float, float, bool],
-    times: tuple[float, int, int],
+    task: Task,
     signal: FloatArray,
     out: FloatArray,
 ) -> tuple[int, float]:
     """Add the pulse of one drifted hit to `out`; return its outcome and trapped fraction."""
-    last, arrived, fwhm, trapped = point_signal(maps, hit, cloud, times[0], times[2], signal)
-    smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, hit[3], out)
+    last, arrived, fwhm, trapped = point_signal(maps, hit, task, signal)
+    smear_and_sample(signal, task.per_sample, fwhm / FWHM_PER_SIGMA, last, hit[3], out)
     return _COLLECTED if arrived else _NOT_COLLECTED, trapped

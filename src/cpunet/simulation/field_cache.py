@@ -40,7 +40,9 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
         axes = {name: kept[name] for name in _OF_GRID}
         nodes = {name: kept[name] for name in _OF_NODES}
         capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
-        if not (_belong_together(axes, nodes) and np.isfinite([capacitance, depletion]).all()):
+        # a detector that no bias depletes has an infinite depletion voltage
+        known = np.isfinite(capacitance) and depletion >= 0
+        if not (known and _belong_together(axes, nodes)):
             return None
     except npz_files.DAMAGED:
         return None  # solved again and overwritten

@@ -198,13 +198,13 @@ def _shifted(array: npt.NDArray[Any], by: int, axis: int) -> npt.NDArray[Any]:
 def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, float, bool]:
     """Field in r and z (V/cm), weighting potential, potential (V); False outside."""
     p, q = r * maps.per_mm, z * maps.per_mm
+    nr, nz = maps.usable.shape
+    # before the conversion to an index, which overflows for what is far away or no number
+    if not (0.0 <= p < nr and 0.0 <= q < nz):
+        return 0.0, 0.0, 0.0, 0.0, False
     i, j = int(p), int(q)
-    if not (p >= 0.0 and q >= 0.0) or i >= maps.usable.shape[0] or j >= maps.usable.shape[1]:
-        return 0.0, 0.0, 0.0, 0.0, False
-    if not maps.usable[i, j]:
-        return 0.0, 0.0, 0.0, 0.0, False
     u, v = p - i, q - j
-    if maps.ditch[int(p + 0.5), int(q + 0.5)]:
+    if not maps.usable[i, j] or maps.ditch[int(p + 0.5), int(q + 0.5)]:
         return 0.0, 0.0, 0.0, 0.0, False
     w00, w10, w01, w11 = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
     m00, m10 = maps.values[i, j], maps.values[i + 1, j]

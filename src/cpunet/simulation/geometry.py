@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable
+from itertools import chain
 from typing import Annotated
 
 import numpy as np
@@ -98,11 +99,11 @@ class Detector(Config):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Detector:
-        for problem in self._problems():
+        for problem in chain(self._problems_of_shape(), self._problems_of_impurities()):
             raise ValueError(problem)
         return self
 
-    def _problems(self) -> Iterable[str]:
+    def _problems_of_shape(self) -> Iterable[str]:
         length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
         top_radius = radius - self.outer_taper_length * math.tan(self.taper_angles_rad[0])
         bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(
@@ -119,7 +120,8 @@ class Detector(Config):
         if (self.bore_length > 0) != (self.bore_radius > 0):
             yield "bore_length and bore_radius must both be given, or both be 0"
         if self.bore_length + 2 * li + self.point_contact_length >= length:
-            yield "bore_length (with li_thickness) reaches the point contact"
+            which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
+            yield f"{which} reaches the point contact (point_contact_length)"
         if self.inner_taper_length > self.bore_length:
             yield "inner_taper_length exceeds bore_length"
         if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
@@ -140,19 +142,23 @@ class Detector(Config):
             yield "ditch_depth needs a wrap_around_radius, the ditch's outer radius"
         if self.wrap_around_radius >= radius - max(li, self.bottom_bullet_radius):
             yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
+        if self.point_contact_radius >= bottom_radius - max(li, self.bottom_bullet_radius):
+            yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
         if self.ditch_depth + self.bore_length + li >= length:
             yield "ditch_depth reaches the bore (bore_length) or the top"
         if self.grid_mm > self.point_contact_radius / 2:
             yield "grid_mm does not resolve point_contact_radius; at most half of it"
+
+    def _problems_of_impurities(self) -> Iterable[str]:
         exponential = self.impurity_exponential_1e10_per_cm3
         if (exponential != 0) != (self.impurity_exponential_length_mm != 0):
             yield (
                 "impurity_exponential_1e10_per_cm3 and impurity_exponential_length_mm must "
                 "both be given, or both be 0"
             )
-        z = np.linspace(0, length, 101)
+        z = np.linspace(0, self.crystal_length, 101)
         with np.errstate(over="ignore", invalid="ignore"):
-            impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [radius]]), z)
+            impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [self.crystal_radius]]), z)
         if not np.isfinite(impurity).all():
             yield "impurity_… is not finite; correct impurity_exponential_length_mm"
         if impurity.max() > 0:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.legend_crystal import impurity_values
+from cpunet.simulation.legend_crystal import LONGEST_MM, impurity_values
 from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
@@ -115,7 +115,7 @@ def _legend(
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
-    found = Path(crystal) if crystal else next((p for p in places if p.is_file()), None)
+    found = Path(crystal) if crystal else next(filter(_is_file, places), None)
     hints = {field: why for field in Detector.model_fields if (why := why_missing(field))}
     hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
     if found is None:
@@ -129,11 +129,19 @@ def _legend(
     if content.get("impurity_curve") is None and crystal is None:
         return values, hints
     length = values["crystal_length"]
-    if not isinstance(length, int | float):
+    if not isinstance(length, int | float) or length > LONGEST_MM:
         return values, hints  # refused together with the rest of the geometry
     # the curve describes the whole crystal and replaces a line through a few points
     values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
     return values | impurity_values(content, f"crystal {found}", slice_name, length), hints
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; False for names that no file can have."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def _mapping(text: str, source: str) -> dict[str, Any]:

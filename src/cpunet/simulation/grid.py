@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_dilation
 
 from cpunet.errors import CpunetError
 from cpunet.machine_memory import require_memory
@@ -14,7 +15,6 @@ from cpunet.simulation.geometry import (
     DITCH,
     GERMANIUM,
     LI_CONTACT,
-    POINT_CONTACT,
     Detector,
     FloatArray,
     RegionArray,
@@ -95,19 +95,14 @@ def _steps(
     low, high = _ends(region, axis)
     steps = np.ones(low.shape)
     crossing = (low <= LI_CONTACT) != (high <= LI_CONTACT)
-    (r0, r1), (z0, z1) = (_ends(x, axis) for x in (rr, zz))
-    r0, r1, z0, z1 = (x[crossing] for x in (r0, r1, z0, z1))
-    swap = low[crossing] <= LI_CONTACT  # start at the node outside the contact
-    r0, r1, z0, z1 = (
-        np.where(swap, r1, r0),
-        np.where(swap, r0, r1),
-        np.where(swap, z1, z0),
-        np.where(swap, z0, z1),
-    )
-    outside, inside = np.zeros(len(r0)), np.ones(len(r0))
+    # ends (low and high), coordinates (r and z), steps that cross a surface
+    nodes = np.stack([_ends(rr, axis), _ends(zz, axis)], axis=1)[..., crossing]
+    # start at the node outside the contact
+    start, end = np.where(low[crossing] <= LI_CONTACT, nodes[::-1], nodes)
+    outside, inside = np.zeros(crossing.sum()), np.ones(crossing.sum())
     for _ in range(_BISECTIONS):
         middle = (outside + inside) / 2
-        hit = detector.region(r0 + middle * (r1 - r0), z0 + middle * (z1 - z0)) <= LI_CONTACT
+        hit = detector.region(*(start + middle * (end - start))) <= LI_CONTACT
         inside = np.where(hit, middle, inside)
         outside = np.where(hit, outside, middle)
     # a surface on the node itself counts as a full step: exact where grid and contact meet
@@ -127,18 +122,8 @@ def point_types(grid: Grid) -> RegionArray:
     """
     types = grid.region.copy()
     germanium = grid.region == GERMANIUM
-    types[germanium & _beside(grid.region == DITCH)] = DITCH_EDGE
-    contact = (grid.region == POINT_CONTACT) | (grid.region == LI_CONTACT)
-    types[germanium & _beside(contact)] = CONTACT_EDGE
+    # a dilation adds the four neighbours of each node
+    types[germanium & binary_dilation(grid.region == DITCH)] = DITCH_EDGE
+    types[germanium & binary_dilation(~grid.free)] = CONTACT_EDGE
     types[germanium[:, 0], 0] = PASSIVATED
     return types
-
-
-def _beside(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Nodes with at least one of their four neighbours in `where`."""
-    beside = np.zeros_like(where)
-    beside[:-1] |= where[1:]
-    beside[1:] |= where[:-1]
-    beside[:, :-1] |= where[:, 1:]
-    beside[:, 1:] |= where[:, :-1]
-    return beside

@@ -182,13 +182,10 @@ class Hits:
         """Concatenate several sets, keeping the order of events."""
         if not sets:
             raise CpunetError("no sets of hits to join")
-        starts = np.cumsum([0, *(len(s.edep_kev) for s in sets)])
-        ends = [s.offsets[1:] + start for s, start in zip(sets, starts, strict=False)]
-        return cls(
-            np.concatenate([s.x_mm for s in sets]),
-            np.concatenate([s.y_mm for s in sets]),
-            np.concatenate([s.z_mm for s in sets]),
+        counts = [np.diff(s.offsets) for s in sets]
+        return cls.of(
+            np.concatenate([s.position_mm for s in sets]),
             np.concatenate([s.edep_kev for s in sets]),
-            np.concatenate([np.zeros(1, np.int64), *ends]).astype(np.int64),
+            np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
             np.concatenate([s.event_number for s in sets]),
         )

@@ -30,6 +30,7 @@ MODELS = {
 }
 _ANOTHER = "correct it, or give another file with --crystal"
 _LARGEST_EXPONENT = 300
+LONGEST_MM = 1e6  # of any boule; squares of larger numbers may overflow
 
 
 def impurity_values(
@@ -68,7 +69,7 @@ def impurity_values(
     if not isinstance(curve, Mapping):
         raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
     model = curve.get("model")
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         raise CpunetError(
             f"{source}: impurity_curve.model {model!r} is not known; there are "
             f"{', '.join(MODELS)}; {_ANOTHER}"
@@ -79,7 +80,10 @@ def impurity_values(
     }
     a = numbers.get("value", numbers.get("a", 0.0))
     b, c, n = (numbers.get(key, 0.0) for key in "bcn")
-    contact = _number(crystal, f"slices.{slice_name}.detector_offset_in_mm", source)
+    place = f"slices.{slice_name}.detector_offset_in_mm"
+    contact = _number(crystal, place, source)
+    if abs(contact) > LONGEST_MM:
+        raise CpunetError(f"{source}: {place} = {contact:g} is too large; {_ANOTHER}")
     scale = _number(crystal, "impurity_curve.corrections.scale", source, 1.0)
     offset = _number(crystal, "impurity_curve.corrections.offset", source, 0.0)
     # z of the boule is that of the contact minus the detector's z; 1e9 acceptors are -0.1 of
@@ -99,8 +103,9 @@ def impurity_values(
                 f"{source}: impurity_curve.parameters.m = {decay:g} gives no finite "
                 f"exp((z - l) / m); {_ANOTHER}"
             )
-        values["impurity_exponential_1e10_per_cm3"] = unit * n * math.exp(exponents[0])
-        values["impurity_exponential_length_mm"] = decay
+        if amplitude := unit * n * math.exp(exponents[0]):  # 0 if it underflows
+            values["impurity_exponential_1e10_per_cm3"] = amplitude
+            values["impurity_exponential_length_mm"] = decay
     return values
 
 

@@ -56,6 +56,8 @@ _MEASURED = {
 }
 _NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
 _SIMULATED = ("icpc", "bege", "ppc")
+# closer points determine no slope
+_NEAREST_CM = 1e-6
 _IMPCC = (
     "production.impcc.array needs equally long value_in_1e9e/cm3 and "
     "dist_from_contact_in_mm at different distances; correct it, or remove it and give the "
@@ -95,7 +97,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     for key in _REQUIRED:
         if key not in geometry:
             raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
-    values: dict[str, Any] = {"name": str(diode.get("name", name))}
+    values: dict[str, Any] = {"name": str(diode["name"])} if "name" in diode else {}
     for key, value in geometry.items():
         if key not in _GEOMETRY:
             raise CpunetError(
@@ -133,11 +135,10 @@ def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
     if not np.any(value):
         return {}  # placeholders: recent files have the impurities in the crystal's file
     alike = value.ndim == 1 and value.shape == z_cm.shape
-    if not alike or len(np.unique(z_cm)) < len(z_cm):
+    finite = alike and np.isfinite([value, z_cm]).all()
+    if not finite or np.any(np.diff(np.sort(z_cm)) < _NEAREST_CM):
         raise CpunetError(f"detector {name}: {_IMPCC}")
     slope, offset = np.polyfit(z_cm, value, 1) if len(z_cm) > 1 else (0.0, value[0])
-    if not np.isfinite([slope, offset]).all():
-        raise CpunetError(f"detector {name}: {_IMPCC}")
     return {
         "impurity_z0_1e10_per_cm3": float(offset),
         "impurity_gradient_1e10_per_cm4": float(slope),

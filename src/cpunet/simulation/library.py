@@ -16,14 +16,13 @@ from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps
 from cpunet.simulation.library_drift import (
     MARGIN_NS,
     IntArray,
-    Task,
     bend,
     compare,
     drift_nodes,
 )
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, Library
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import cloud_numbers
+from cpunet.simulation.signals import EXACT, WHOLE_ON_AVERAGE, Task, drift_task
 from cpunet.simulation.velocity import FloatArray
 
 Progress = Callable[[int, int], None]
@@ -91,16 +90,10 @@ def build_library(
 
 
 def _task(fields: Maps, settings: SimulationSettings) -> Task:
-    start, diffusion, repulsion, siggen = cloud_numbers(fields, settings)
-    return Task(
-        cloud_fwhm_mm=start,
-        diffusion=diffusion,
-        repulsion=repulsion,
-        rounding=1.0 if siggen else 0.0,
-        step_ns=settings.step_ns,
-        per_sample=settings.steps_per_sample,
-        n_samples=settings.n_samples,
-    )
+    """Single steps, and no jumps from place to place, which could not be interpolated."""
+    task = drift_task(fields, settings)
+    rounding = EXACT if task.rounding == EXACT else WHOLE_ON_AVERAGE
+    return task._replace(stride=1, rounding=rounding)
 
 
 def _empty(fields: Maps, settings: SimulationSettings) -> Library:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,32 +12,14 @@ from cpunet.kernels import kernel
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, in_active_volume
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, Float32Array, Library, add_pulse
-from cpunet.simulation.signals import point_signal
+from cpunet.simulation.signals import Task, point_signal
 from cpunet.simulation.velocity import FloatArray
 
 IntArray = npt.NDArray[np.int64]
 
 MARGIN_NS = 64.0
-"""Time by which pulses are stored before the charge is released.  Neighbours whose half-maximum
+"""Time by which pulses are stored before the charge is released. Neighbours whose half-maximum
 times differ by more are of different kinds (another path or another carrier)."""
-
-
-class Task(NamedTuple):
-    """Parameters of the compiled loops, besides the maps, for drifting and smearing.
-
-    `rounding`: siggen rounds the duration of the cloud to whole steps, up by one on average.
-    `stride` is that of `cpunet.simulation.drift.drift`. As a constant there it would cause the
-    drift to be compiled again.
-    """
-
-    cloud_fwhm_mm: float
-    diffusion: float
-    repulsion: float
-    rounding: float
-    step_ns: float
-    per_sample: int
-    n_samples: int
-    stride: int = 1
 
 
 @kernel
@@ -132,11 +113,7 @@ def _fine_pulse(
     collected, and the trapped fraction.
     """
     before = library.margin * task.per_sample
-    cloud = (task.cloud_fwhm_mm, task.diffusion, task.repulsion, False)
-    last, arrived, fwhm, trapped = point_signal(
-        maps, hit, cloud, task.step_ns, task.stride, signal[before:]
-    )
-    fwhm += task.rounding if fwhm > 0.0 else 0.0
+    last, arrived, fwhm, trapped = point_signal(maps, hit, task, signal[before:])
     group = task.per_sample // library.phases
     sample = np.empty(rows.shape[1])
     for p in range(library.phases):

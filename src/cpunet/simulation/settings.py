@@ -89,7 +89,7 @@ class SimulationSettings(Config):
 
     @property
     def n_steps(self) -> int:
-        """Drift steps per record."""
+        """Time steps per record."""
         return self.n_samples * self.steps_per_sample
 
     @property
@@ -99,7 +99,7 @@ class SimulationSettings(Config):
 
     @property
     def steps_per_sample(self) -> int:
-        """Drift steps per sample."""
+        """Time steps per sample."""
         return round(self.dt_ns / self.step_ns)
 
     @property
@@ -122,7 +122,7 @@ class SimulationSettings(Config):
             known = value in ("temperature", "siggen") or 0 < float(value) <= 1000
         except (TypeError, ValueError, OverflowError):
             known = False
-        if not known or isinstance(value, bool):
+        if not known:
             raise ValueError(
                 "give a number above 0 (to 1000) in V mm/cm, temperature or siggen"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,16 +13,39 @@ from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.cloud import (
     FWHM_PER_SIGMA,
+    SMALLEST_FWHM_MM,
     diffusion_constant,
     repulsion_constant,
     smear_and_sample,
-    starting_fwhm_mm,
 )
 from cpunet.simulation.drift import drift
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import FARTHEST_MM
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
+
+# Duration of the cloud: as it is, in whole steps as in siggen, or longer by one step, the mean
+# of siggen's rounding.
+EXACT, WHOLE, WHOLE_ON_AVERAGE = range(3)
+
+
+class Task(NamedTuple):
+    """Parameters of the compiled loops, besides the maps, for drifting and smearing.
+
+    The cloud starts with a FWHM of `cloud_fwhm_mm`; see `cpunet.simulation.cloud` for
+    `diffusion` and `repulsion_per_kev`. `rounding` of its duration is `EXACT`, `WHOLE` or
+    `WHOLE_ON_AVERAGE`. `stride` and `per_sample` are the numbers of time steps per step of the
+    drift and per sample.
+    """
+
+    cloud_fwhm_mm: float
+    diffusion: float
+    repulsion_per_kev: float
+    rounding: int
+    step_ns: float
+    stride: int
+    per_sample: int
+    n_samples: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +143,8 @@ def hit_signals(
     n = len(hits)
     waveforms = np.zeros((n, settings.n_samples), np.float32)
     facts = np.full((n, 4), np.nan)
-    maps = drift_maps(fields, settings)
     _all_signals(
-        maps, hits, cloud_numbers(fields, settings), time_numbers(settings), waveforms, facts
+        drift_maps(fields, settings), hits, drift_task(fields, settings), waveforms, facts
     )
     valid = np.isfinite(facts[:, 0])
     return Signals(
@@ -151,54 +174,46 @@ def hit_table(
     return table
 
 
-def time_numbers(settings: SimulationSettings) -> tuple[float, int, int]:
-    """Step in ns, steps per sample and stride, in the form the compiled loops take."""
-    return settings.step_ns, settings.steps_per_sample, settings.stride
-
-
-def cloud_numbers(
-    fields: Maps, settings: SimulationSettings
-) -> tuple[float, float, float, bool]:
-    """Initial FWHM (mm), diffusion constant, repulsion per keV, and siggen's rounding."""
-    siggen = settings.diffusion_constant == "siggen"
+def drift_task(fields: Maps, settings: SimulationSettings) -> Task:
+    """Parameters of the compiled loops for some settings."""
     constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
     growing = settings.diffusion or settings.self_repulsion > 0
-    return (
-        starting_fwhm_mm(settings.cloud_fwhm_mm, growing),
-        constant if settings.diffusion else 0.0,
-        repulsion_constant(1.0) * settings.self_repulsion,
-        siggen,
+    return Task(
+        cloud_fwhm_mm=max(settings.cloud_fwhm_mm, SMALLEST_FWHM_MM if growing else 0.0),
+        diffusion=constant if settings.diffusion else 0.0,
+        repulsion_per_kev=repulsion_constant(1.0) * settings.self_repulsion,
+        rounding=WHOLE if settings.diffusion_constant == "siggen" else EXACT,
+        step_ns=settings.step_ns,
+        stride=settings.stride,
+        per_sample=settings.steps_per_sample,
+        n_samples=settings.n_samples,
     )
 
 
 @kernel
 def point_signal(
-    maps: DriftMaps,
-    hit: FloatArray,
-    cloud: tuple[float, float, float, bool],
-    step_ns: float,
-    stride: int,
-    signal: FloatArray,
+    maps: DriftMaps, hit: FloatArray, task: Task, signal: FloatArray
 ) -> tuple[int, bool, float, float]:
     """Fill `signal` with the pulse of a point charge.
 
     Returns the last step, whether all charge is collected, the FWHM in steps of the smearing
     by the cloud, and the fraction trapped.
     """
+    stride = task.stride
     record = signal if stride == 1 else np.empty(len(signal) // stride + 2)
     record[:] = 0.0
-    long_ns = stride * step_ns
+    long_ns = stride * task.step_ns
     start = (hit[0], hit[1], hit[2])
     nowhere = np.empty((0, 3))
     point = (0.0, 0.0, 0.0)
-    growing = (cloud[0], cloud[1], cloud[2] * hit[3])
+    growing = (task.cloud_fwhm_mm, task.diffusion, task.repulsion_per_kev * hit[3])
     steps_e, arrived_e, _, _, trapped_e = drift(
         maps, ELECTRON, start, long_ns, stride, point, record, nowhere
     )
     steps_h, arrived_h, size, speed, trapped_h = drift(
         maps, HOLE, start, long_ns, stride, growing, record, nowhere
     )
-    fwhm = cloud_steps(size, speed, step_ns, cloud[3])
+    fwhm = cloud_steps(size, speed, task)
     if stride > 1:
         for i in range(len(signal)):
             k = i // stride
@@ -209,36 +224,32 @@ def point_signal(
 
 
 @kernel
-def cloud_steps(size: float, speed: float, step_ns: float, whole: bool) -> float:
-    """FWHM in steps of the cloud entering the contact. `whole` rounds it as siggen does."""
-    if speed <= 0.0:
+def cloud_steps(size: float, speed: float, task: Task) -> float:
+    """FWHM in steps of the cloud entering the contact."""
+    if size <= 0.0 or speed <= 0.0:
         return 0.0
-    fwhm = size / (speed * step_ns)
-    if whole:
+    fwhm = size / (speed * task.step_ns)
+    if task.rounding == WHOLE:
         rounded = int(1.5 + fwhm)
         return float(rounded) if rounded > 1 else 0.0
-    return fwhm
+    return fwhm + 1.0 if task.rounding == WHOLE_ON_AVERAGE else fwhm
 
 
 @kernel(parallel=True)
 def _all_signals(
     maps: DriftMaps,
     hits: FloatArray,
-    cloud: tuple[float, float, float, bool],
-    times: tuple[float, int, int],
+    task: Task,
     waveforms: npt.NDArray[np.float32],
     facts: FloatArray,
 ) -> None:
-    n_steps = waveforms.shape[1] * times[1]
     for i in prange(len(hits)):
         if not in_active_volume(maps, hits[i, 0], hits[i, 1], hits[i, 2]):
             continue
-        signal = np.empty(n_steps)
-        out = np.zeros(waveforms.shape[1])
-        last, arrived, fwhm, trapped = point_signal(
-            maps, hits[i], cloud, times[0], times[2], signal
-        )
-        smear_and_sample(signal, times[1], fwhm / FWHM_PER_SIGMA, last, 1.0, out)
+        signal = np.empty(task.n_samples * task.per_sample)
+        out = np.zeros(task.n_samples)
+        last, arrived, fwhm, trapped = point_signal(maps, hits[i], task, signal)
+        smear_and_sample(signal, task.per_sample, fwhm / FWHM_PER_SIGMA, last, 1.0, out)
         for j in range(len(out)):
             waveforms[i, j] = out[j]
         facts[i, 0], facts[i, 1] = last, 1.0 if arrived else 0.0

@@ -54,7 +54,7 @@ class Superposition:
     grid, potentials
         Nodes, and the parts of the potential at them.
     unit_depletion_V
-        Depletion voltage in V for an ``impurity_scale`` of 1.
+        Depletion voltage in V for an ``impurity_scale`` of 1; infinite above 20 kV.
     """
 
     detector: Detector
@@ -82,10 +82,12 @@ class Superposition:
         return potential
 
     def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
-        """Smallest bias in V that depletes the detector; infinite if there is none."""
-        if not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0:
+        """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
+        alone = not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0
+        if alone and math.isfinite(self.unit_depletion_V):
             # without another charge, all of V scales together
-            return impurity_scale * self.unit_depletion_V
+            depletion = impurity_scale * self.unit_depletion_V
+            return depletion if depletion <= HIGHEST_BIAS_V else math.inf
         return depletion_voltage(
             self.potentials.bias,
             self._sum(0.0, impurity_scale, impurity_tilt),
@@ -131,7 +133,7 @@ class Superposition:
     def _refuse(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> None:
         depletion = self.depletion_V(impurity_scale, impurity_tilt)
         name = self.detector.name
-        if depletion == float("inf"):
+        if depletion == math.inf:
             raise CpunetError(
                 f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
                 "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"

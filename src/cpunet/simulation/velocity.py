@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.integrate import cumulative_trapezoid
 
 from cpunet.kernels import kernel
 
@@ -178,8 +179,7 @@ def _speed_model(carrier: int, field: FloatArray, temperature_K: float) -> Float
 
 def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
     """Mean of `values` over fields from 0 to each field, by the trapezoidal rule."""
-    areas = np.diff(field) * (values[1:] + values[:-1]) / 2
-    integral = np.concatenate([[0.0], np.cumsum(areas)])
+    integral = cumulative_trapezoid(values, field, initial=0)
     mean: FloatArray = np.divide(integral, field, out=values.copy(), where=field > 0)
     return mean
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, ElectronTable
+from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, Array, ElectronTable
 from cpunet.simulation.gammas.processes import (
     Direction,
     annihilation_energy,
@@ -18,8 +17,6 @@ from cpunet.simulation.gammas.processes import (
     turned,
 )
 from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
-
-Array = npt.NDArray[np.float64]
 
 
 @kernel(error_model="numpy")

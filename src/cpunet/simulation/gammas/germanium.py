@@ -111,7 +111,7 @@ def electron_table() -> ElectronTable:
     step = energy * _LOSS_PER_STEP / stopping
     # the range below the last row is a few micrometres
     to_go = np.cumsum(step[::-1])[::-1] + energy[-1] * ratio / stopping[-1]
-    hard = np.array([_hard_photons(t) for t in middle])
+    hard, quantiles = zip(*map(_hard_photons, middle), strict=True)
     turned = 1 - np.exp(-step * _transport_per_mm(middle))
     scale = np.array([_scale_of(mean) for mean in turned])
     return ElectronTable(
@@ -122,9 +122,9 @@ def electron_table() -> ElectronTable:
         range=to_go,
         scattering=scale,
         scattering_cut=1 - np.exp(-2 / scale),
-        brems=1 - np.exp(-step * hard),
+        brems=1 - np.exp(-step * np.array(hard)),
         annihilation=1 - np.exp(-step * _annihilation_per_mm(middle)),
-        photon_share=np.stack([_photon_quantiles(t) for t in middle]),
+        photon_share=np.stack(quantiles),
     )
 
 
@@ -178,23 +178,16 @@ def _soft_radiation(kinetic: float) -> float:
     return float(_radiation(kinetic, photon).mean() * top)
 
 
-def _hard_photons(kinetic: float) -> float:
-    """Number of photons above the cut per mm."""
+def _hard_photons(kinetic: float) -> tuple[float, Array]:
+    """Photons above the cut: number per mm, and quantiles of their energy fraction k/T."""
     if kinetic <= PHOTON_CUT:
-        return 0.0
-    log = np.linspace(np.log(PHOTON_CUT), np.log(kinetic), 256)
-    return float(np.trapezoid(_radiation(kinetic, np.exp(log)), log))
-
-
-def _photon_quantiles(kinetic: float) -> Array:
-    """Energy fractions k/T of hard photons at equidistant probabilities."""
-    if kinetic <= PHOTON_CUT:
-        return np.ones(_BREMS_NODES)
+        return 0.0, np.ones(_BREMS_NODES)
     log = np.linspace(np.log(PHOTON_CUT), np.log(kinetic), 256)
     density = _radiation(kinetic, np.exp(log))
     cumulative = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
     wanted = np.linspace(0, cumulative[-1], _BREMS_NODES)
-    return np.asarray(np.exp(np.interp(wanted, cumulative, log)) / kinetic)
+    quantiles = np.exp(np.interp(wanted, cumulative, log)) / kinetic
+    return float(np.trapezoid(density, log)), quantiles
 
 
 def _annihilation_per_mm(kinetic: Array) -> Array:

@@ -186,7 +186,7 @@ def with_resolution(
     Raises
     ------
     CpunetError
-        If a coefficient is negative.
+        If a coefficient is negative or not finite.
 
     Examples
     --------
@@ -194,7 +194,7 @@ def with_resolution(
     >>> bool(abs(energies.std() * 2.3548 - 2.0) < 0.1)
     True
     """
-    if noise_kev2 < 0 or fano_kev < 0:
+    if not (noise_kev2 >= 0 and fano_kev >= 0 and math.isfinite(noise_kev2 + fano_kev)):
         raise CpunetError(f"FWHM² = {noise_kev2} + {fano_kev} E; give numbers from 0 up")
     energy = np.asarray(energy_kev, float)
     fwhm = np.sqrt(noise_kev2 + fano_kev * energy)

@@ -14,6 +14,7 @@ from cpunet.simulation.gammas.germanium import (
     ELECTRON_MASS,
     K_BINDING,
     PHOTON_CUT,
+    Array,
     ElectronTable,
     PhotonTable,
 )
@@ -27,7 +28,6 @@ from cpunet.simulation.gammas.processes import (
 )
 from cpunet.simulation.gammas.shape import CrystalShape, in_germanium, way_to_cylinder
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 STACK_HEIGHT = 256

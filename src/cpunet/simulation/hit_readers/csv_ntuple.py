@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,30 +30,26 @@ def read_csv(path: Path, detector: str | None, units: Units) -> Steps:
     by their title) are in MeV and mm. For all other files the unit must be given.
     """
     title, columns = _header(path)
-    place = {kind: _find(columns, names) for kind, names in _NAMES.items()}
-    missing = [kind for kind, at in place.items() if at is None and kind != "detector"]
-    if missing:
+    found = ((kind, _find(columns, names)) for kind, names in _NAMES.items())
+    place = {kind: at for kind, at in found if at is not None}
+    if missing := [kind for kind in _NAMES if kind not in place and kind != "detector"]:
         held = ", ".join(columns)
         raise CpunetError(f"{path}: no column for {missing[0]}; the file holds {held}")
     data = _numbers(path, len(columns))
     if title == _G4SIMPLE_TITLE:
         units = Units(units.length or "mm", units.energy or "MeV")
-    get = {kind: at for kind, at in place.items() if at is not None}
 
-    def unit(kind: str) -> str | None:
-        return _split(columns[get[kind]])[1]
+    def converted(kind: str, factor: Callable[..., float]) -> npt.NDArray[np.float64]:
+        name = columns[place[kind]]
+        return np.asarray(data[:, place[kind]] * factor(path, name, _split(name)[1]))
 
-    axes = [
-        data[:, get[axis]] * units.to_mm(path, columns[get[axis]], unit(axis)) for axis in "xyz"
-    ]
-    edep = data[:, get["edep"]] * units.to_kev(path, columns[get["edep"]], unit("edep"))
     steps = Steps(
-        whole_numbers(path, columns[get["event"]], data[:, get["event"]]),
-        np.stack(axes, axis=1),
-        edep,
+        whole_numbers(path, columns[place["event"]], data[:, place["event"]]),
+        np.stack([converted(axis, units.to_mm) for axis in "xyz"], axis=1),
+        converted("edep", units.to_kev),
     )
-    if "detector" in get:
-        return of_detector(path, steps, data[:, get["detector"]], detector)
+    if "detector" in place:
+        return of_detector(path, steps, data[:, place["detector"]], detector)
     if detector is not None:
         raise CpunetError(f"{path}: no column to pick detector {detector} by")
     return steps

@@ -40,7 +40,7 @@ def of_detector(
     # a volume without deposits is not a detector but, for example, the world or a holder
     volumes = whole_numbers(path, "the detector's number", number)
     there = sorted({int(n) for n in np.unique(volumes[steps.edep_kev > 0])})
-    names = ", ".join(map(str, there))
+    names = ", ".join(map(str, there)) or "none"
     if detector is None:
         if len(there) > 1:
             raise CpunetError(

@@ -67,10 +67,12 @@ def read_hits(
         If the file cannot be read, has an unknown format, lacks a column, a unit or the
         detector, or contains no energy deposit.
     """
-    file = Path(path)
-    units = Units(length_unit, energy_unit)
-    found = to_hits(file, _steps(file, detector, units), transform)
-    require_some(file, found.hits.n_events)
+    return _whole(Path(path), detector, Units(length_unit, energy_unit), transform)
+
+
+def _whole(path: Path, detector: str | None, units: Units, transform: Transform) -> ReadHits:
+    found = to_hits(path, _steps(path, detector, units), transform)
+    require_some(path, found.hits.n_events)
     return found
 
 
@@ -96,13 +98,7 @@ def hit_parts(
     units = Units(length_unit, energy_unit)
     parts = parts_of(file, detector) if _is_remage(file) else None
     if parts is None or len(parts) < 2:
-        whole = read_hits(
-            file,
-            detector=detector,
-            transform=transform,
-            length_unit=length_unit,
-            energy_unit=energy_unit,
-        ).hits
+        whole = _whole(file, detector, units, transform).hits
         return lambda: iter([whole])
 
     def read() -> Iterator[Hits]:
@@ -118,11 +114,7 @@ def holds_hits(path: Path | str) -> bool:
     Files of simulated pulses that also contain their hits count as files of pulses.
     """
     file = Path(path)
-    try:
-        with require_file(file).open("rb") as stream:
-            start = stream.read(len(_CSV_MAGIC))
-    except OSError:
-        return False  # the reader reports the error
+    start = _start(file)
     if start.startswith(_HDF5_MAGIC):
         with opened(file) as content:
             return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
@@ -139,13 +131,18 @@ def hit_detectors(path: Path | str) -> list[str]:
     return detectors_of(Path(path)) if _is_remage(Path(path)) else []
 
 
-def _is_remage(path: Path) -> bool:
+def _start(path: Path) -> bytes:
+    """First bytes of a file; none if it cannot be read, which its reader reports."""
     try:
         with require_file(path).open("rb") as stream:
-            if not stream.read(8).startswith(_HDF5_MAGIC):
-                return False
+            return stream.read(len(_CSV_MAGIC))
     except OSError:
-        return False  # the reader reports the error
+        return b""
+
+
+def _is_remage(path: Path) -> bool:
+    if not _start(path).startswith(_HDF5_MAGIC):
+        return False
     with opened(path) as file:
         return isinstance(file.get("stp"), h5py.Group) and not isinstance(
             file.get(NTUPLE), h5py.Group
@@ -155,7 +152,7 @@ def _is_remage(path: Path) -> bool:
 def _steps(path: Path, detector: str | None, units: Units) -> Steps:
     try:
         with require_file(path).open("rb") as stream:
-            start = stream.read(512)
+            start = stream.read(len(_CSV_MAGIC))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
     if start.startswith(_HDF5_MAGIC):

@@ -12,13 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened, require_all_stored, text_attribute
+from cpunet.hdf5_files import is_column, opened, require_all_stored, text_attribute
 from cpunet.pulses.reading.lh5_rows import read_rows
 from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _AXES = ("xloc", "yloc", "zloc")
-
-
 ROWS = 5_000  # rows per part: of the order of 10 MB of steps
 
 
@@ -52,11 +50,11 @@ def parts_of(path: Path, detector: str | None, size: int = ROWS) -> list[slice] 
     name = _detector(path, detector)
     with opened(path) as file:
         item = file.get(f"stp/{name}/evtid")
-        if not isinstance(item, h5py.Dataset) or item.ndim != 1:
+        if not is_column(item) or item.ndim != 1:
             return None  # the reader reports the error
         require_all_stored(path, item)
         numbers = np.asarray(item[()])
-    starts = np.flatnonzero(np.diff(numbers, prepend=np.nan if len(numbers) else 0) != 0)
+    starts = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
     if len(np.unique(numbers)) != len(starts):
         return None
     cuts = [0]
@@ -78,9 +76,12 @@ def detectors_of(path: Path) -> list[str]:
 
 def _detector(path: Path, detector: str | None) -> str:
     there = detectors_of(path)
-    names = ", ".join(there)
+    names = ", ".join(there) or "none"
     if detector is None:
-        if len(there) != 1:
+        if not there:
+            columns = ", ".join(("edep", *_AXES))
+            raise CpunetError(f"{path}: no table of stp has {columns}; simulate again")
+        if len(there) > 1:
             raise CpunetError(
                 f"{path}: holds detectors {names}; choose one with detector (--hits-detector)"
             )
@@ -99,11 +100,11 @@ def _origin(path: Path, name: str, units: Units) -> npt.NDArray[np.float64]:
         for i, axis in enumerate(_AXES):
             where = f"detector_origins/{name}/{axis}"
             number = file.get(where)
-            if not isinstance(number, h5py.Dataset) or number.size != 1:
+            if not is_column(number) or number.size != 1:
                 raise CpunetError(f"{path}: {where} is no number; write the file again")
             unit = text_attribute(number, "units")
             # an origin may lack a unit; all lengths of remage are in m
-            origin[i] = float(number[()]) * units.to_mm(path, where, unit or "m")
+            origin[i] = number[()].item() * units.to_mm(path, where, unit or "m")
     return origin
 
 
@@ -136,14 +137,15 @@ def _flat(
     counts = np.diff(ends, prepend=0)
     if len(ends) != len(table["evtid"]) or np.any(counts < 0) or ends[-1:].sum() != len(values):
         raise CpunetError(f"{path}: column {column} does not divide into events; truncated?")
-    return values, counts
+    return values.astype(float), counts
 
 
-def _real(path: Path, column: str, values: Any) -> npt.NDArray[np.float64]:
+def _real(path: Path, column: str, values: Any) -> npt.NDArray[Any]:
+    """Values of a column, in the type of the file: large event numbers are no floats."""
     numbers = np.asarray(getattr(values, "nda", None))
     if numbers.ndim != 1 or numbers.dtype.kind not in "iuf":
         raise CpunetError(f"{path}: column {column} is of {numbers.dtype}; give numbers")
-    return numbers.astype(float)
+    return numbers
 
 
 def _unit(table: Any, column: str) -> str | None:
