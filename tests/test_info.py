@@ -15,6 +15,7 @@ import pytest
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
+from cpunet.jobs.inspection import chain_description
 from cpunet.jobs.inspection.info import describe
 from cpunet.jobs.inspection.info_words import in_words
 from cpunet.jobs.inspection.trace_properties import _last_below, trace_properties
@@ -359,3 +360,13 @@ def test_a_page_replaces_nothing_unasked(tmp_path):
     assert "Cs-137" in first
     with pytest.raises(CpunetError, match="exists already"):
         describe(path, dt_ns=16, out=page)
+
+
+def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
+    """In keV of a full charge, not of the level that prepared tails have."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "run.json").write_text(json.dumps({"fit": {"noise": {"rms": 1.6, "baselines": 9}}}))
+    assert dict(in_words(describe(run)))["noise"] == "of 9 baselines"
+    monkeypatch.setattr(chain_description, "noise_kev", lambda _: (1.95, 0.05))
+    assert dict(in_words(describe(run)))["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"

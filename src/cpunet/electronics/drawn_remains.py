@@ -99,11 +99,11 @@ class DrawnRemains:
 
     def factors(
         self, energy_kev: npt.NDArray[np.float64], rng: np.random.Generator
-    ) -> tuple[FloatArray, Values]:
-        """Draw remainders for pulses of given energies, in prepared units and in keV."""
+    ) -> FloatArray:
+        """Draw remainders for pulses of given energies, in prepared units."""
         require_energies(energy_kev)
         kev = self.draw_kev(len(energy_kev), rng)
-        return np.asarray(kev * self.height / energy_kev, np.float32), kev
+        return np.asarray(kev * self.height / energy_kev, np.float32)
 
     def describe(self) -> dict[str, Any]:
         """Serialise to a mapping that `of` reads."""
@@ -155,7 +155,7 @@ class TraceNoise:
         """Draw noise as `BaselineNoise.draw`, with tails of earlier pulses added."""
         drawn = self.noise.draw(energy_kev, length, rng)
         if self.remains is not None:
-            factors, _ = self.remains.factors(energy_kev, rng)
+            factors = self.remains.factors(energy_kev, rng)
             drawn += factors[:, np.newaxis] * self.remains.decay(length).astype(np.float32)
         return drawn
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
@@ -46,6 +46,13 @@ class ResponseConfig(Config):
     ringing_mhz: Positive | None
     ringing_ns: Positive
     drift_terms: DriftTerms
+
+    @field_validator("slow_ns", "fast_decays_us")
+    @classmethod
+    def _times_differ(cls, times: tuple[float, ...]) -> tuple[float, ...]:
+        if len({*times}) < len(times):
+            raise ValueError("times must differ")
+        return times
 
 
 class ResidualConfig(Config):

@@ -99,7 +99,7 @@ class Noise:
         )
         if remains is None:
             return drawn
-        left = np.stack([remains.factors(energy_kev, rng)[0] for _ in range(draws)])
+        left = np.stack([remains.factors(energy_kev, rng) for _ in range(draws)])
         return replace(drawn, left=left, decay=np.asarray(remains.decay(length), np.float32))
 
     def of(self, rows: Rows | slice) -> Noise:

@@ -33,14 +33,17 @@ def currents_about_peak(charge: FloatArray) -> tuple[npt.NDArray[np.float32], Va
     -------
     currents
         Currents in units of the charge per ns, shape ``(n, LENGTH)``; 0 outside the record,
-        rows of NaN for templates that contain NaN or have no maximum above 0.
+        rows of NaN for templates that contain NaN, have no maximum above 0, or have fewer
+        than 3 samples.
     times_ns
         Times of the maxima after the first sample, shape ``(n,)``, including the delay of the
         backward averages, which is the same for all templates; NaN for rows of NaN.
     """
     n = len(charge)
-    currents = np.empty((n, LENGTH), np.float32)
-    times = np.empty(n)
+    currents = np.full((n, LENGTH), np.nan, np.float32)
+    times = np.full(n, np.nan)
+    if charge.shape[1] < 3:  # no sample has two neighbours
+        return currents, times
     _about_peak(np.ascontiguousarray(charge, np.float32), currents, times)
     return currents, times
 
@@ -76,6 +79,7 @@ def most_frequent(amplitudes: Values) -> float:
 def _about_peak(
     charge: npt.NDArray[np.float32], currents: npt.NDArray[np.float32], times: Values
 ) -> None:
+    # arrays of NaN, filled where a template has a maximum
     n, n_samples = charge.shape
     for i in prange(n):
         current = _averaged(charge[i])
@@ -86,8 +90,6 @@ def _about_peak(
         bend = current[peak - 1] - 2 * current[peak] + current[peak + 1]
         # the running sums remain NaN after a NaN
         if np.isnan(current[-1]) or not (current[peak] > 0 and bend < 0):
-            currents[i] = np.nan
-            times[i] = np.nan
             continue
         time = peak + 0.5 * (current[peak - 1] - current[peak + 1]) / bend
         times[i] = time

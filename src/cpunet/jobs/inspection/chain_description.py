@@ -157,6 +157,20 @@ def chain_of(run: Path) -> Chain:
     return _read_run(run).chain
 
 
+def noise_kev(run: Path) -> tuple[float, float | None]:
+    """RMS of the noise that a training measured, and its error if known, in keV.
+
+    Raises
+    ------
+    CpunetError
+        If the run has no response in closed form, or no noise.
+    """
+    told = _told(_read_run(run))
+    if "noise_rms_kev" not in told["values"]:
+        raise CpunetError(f"{run}: holds no noise; train on raw traces")
+    return told["values"]["noise_rms_kev"], told["errors"].get("noise_rms_kev")
+
+
 def stand_electronics(stand: Path) -> Electronics:
     """The true electronics of a virtual test stand, from its ``stand.json``.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,8 @@ def describe(
     Returns
     -------
     dict
-        For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``.
+        For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``; with a
+        readout chain also ``noise_kev``, the RMS of its noise, and ``noise_kev_error``.
         For a file of hits, the result of `describe_hits`.
         For a file with several tables, none of them chosen, ``kind`` (``"tables"``),
         ``path`` and ``tables``: the result of `PulseSource.describe` by name, or the reason
@@ -323,4 +325,9 @@ def _run(folder: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict):
         raise CpunetError(f"{file}: holds no run; train it again")
+    # loads torch, which files do not need
+    from cpunet.jobs.inspection.chain_description import noise_kev
+
+    with suppress(CpunetError, LookupError, TypeError, ValueError):  # no chain, or damaged
+        content["noise_kev"], content["noise_kev_error"] = noise_kev(folder)
     return content

@@ -151,14 +151,8 @@ def _run(told: Mapping[str, Any]) -> Lines:
         *(("cause", str(cause)) for cause in _texts(fit.get("causes"))),
         ("response", _parameters(_mapping(fit, "parameters"))),
     ]
-    noise = _mapping(fit, "noise")
-    if "rms" in noise:
-        of = f" (RMS, {noise.get('baselines')} baselines)"
-        # loads matplotlib, which the help of a command does not need
-        from cpunet.analysis.nested_tables import with_std
-
-        value = with_std(noise["rms"], noise.get("rms_error"))
-        lines.append(("noise", f"{value} keV{of}"))
+    if "baselines" in (noise := _mapping(fit, "noise")):
+        lines.append(("noise", f"{_noise(told)}of {noise['baselines']} baselines"))
     if "rate_khz" in (remains := _mapping(fit, "remains")):
         with suppress(LookupError, TypeError, ValueError):  # run.json is damaged
             lines += _remains(remains)
@@ -168,6 +162,15 @@ def _run(told: Mapping[str, Any]) -> Lines:
         ("next", f"cpunet response {told['path']}; cpunet validate {told['path']} …"),
     ]
     return [(n, t) for n, t in lines if t]
+
+
+def _noise(told: Mapping[str, Any]) -> str:
+    if "noise_kev" not in told:
+        return ""
+    # loads matplotlib, which the help of a command does not need
+    from cpunet.analysis.nested_tables import with_std
+
+    return f"{with_std(told['noise_kev'], told.get('noise_kev_error'))} keV (RMS), "
 
 
 def _mapping(told: Mapping[str, Any], name: str) -> Mapping[str, Any]:
