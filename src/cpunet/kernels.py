@@ -40,7 +40,7 @@ Loop = TypeVar("Loop", bound=Callable[..., Any])
 # Maximum wait for code that another process compiles, in case that process hangs.
 MAX_WAIT_S = 60.0
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
+_IMPORT = re.compile(r"^(?:from ([\w.]+) )?import (\([^)]*|.*)", re.MULTILINE)
 
 
 @overload
@@ -110,8 +110,11 @@ def sources(module: str) -> frozenset[Path]:
     while ahead:
         file = Path(str(sys.modules[ahead.pop()].__file__))
         found.add(file)
-        names = set(_IMPORT.findall(file.read_text(encoding="utf-8"))) - seen
-        ours = [n for n in names if n.partition(".")[0] == package and n in sys.modules]
+        names = set[str]()
+        for origin, items in _IMPORT.findall(file.read_text(encoding="utf-8")):
+            words = re.findall(r"[\w.]+", items)
+            names |= {origin, *words, *(f"{origin}.{word}" for word in words)}
+        ours = [n for n in names - seen if n.partition(".")[0] == package and n in sys.modules]
         seen.update(ours)
         ahead += ours
     return frozenset(found)
