@@ -35,7 +35,6 @@ class MemorySource:
     """Pulses in memory, given out in blocks."""
 
     path = Path("run7.lh5")
-    dt_ns = 16.0
 
     def __init__(self, pulses: Pulses) -> None:
         self.pulses = pulses

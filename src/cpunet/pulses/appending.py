@@ -16,10 +16,10 @@ from lgdo import LGDO, Array
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.hdf5_files import text_attribute
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table, write_errors
-from cpunet.pulses.reading.hdf5 import text_attribute
 from cpunet.pulses.writing import Columns
 
 

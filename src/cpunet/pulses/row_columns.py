@@ -12,8 +12,8 @@ import lh5
 import numpy as np
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
-from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.lh5_rows import read_rows
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself

@@ -50,10 +50,6 @@ class Source(Protocol):
     def path(self) -> Path:
         """Path of the file, for messages."""
 
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period in ns."""
-
     def blocks(self, size: int, /) -> Iterator[Pulses]:
         """The file's pulses in order, at most `size` at a time."""
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import text_attribute
 from cpunet.pulses.reading.columns import shortened
-from cpunet.pulses.reading.hdf5 import text_attribute
 
 # preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
