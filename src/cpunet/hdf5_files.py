@@ -95,7 +95,7 @@ def require_stored(path: Path, dataset: h5py.Dataset) -> None:
     n_bytes = math.prod(dataset.shape) * dataset.dtype.itemsize
     if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MAX_CHUNK_BYTES:
         raise CpunetError(
-            f"{path}: {dataset.name} is in chunks of {dataset.chunks}, which nobody can hold; "
+            f"{path}: {dataset.name} is in chunks of {dataset.chunks}, too large to read; "
             "copy or write it again"
         )
     if n_bytes == 0 or dataset.is_virtual or dataset.external:

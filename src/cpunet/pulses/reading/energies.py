@@ -74,7 +74,7 @@ def resolve_energies(
     kev_per_adc: float | None,
     n_pulses: int | None,
 ) -> Energies:
-    """Choose the source of a file's energies.
+    """Choose where the energies of a file's pulses come from.
 
     Without `energy`, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
     is in energy units or `kev_per_adc` is given.  Otherwise the energy is the amplitude
