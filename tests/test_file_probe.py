@@ -68,6 +68,18 @@ def test_killed_by_the_system_says_nothing_about_a_file(
         assert not list(file)
 
 
+def test_where_ended_processes_leave_no_status_nothing_is_learned(tmp_path: Path) -> None:
+    """A program inherits it from its parent that SIGCHLD is ignored."""
+    path = tmp_path / "whole.lh5"
+    h5py.File(path, "w").close()
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        with opened(path) as file:
+            assert not list(file)
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
 def test_a_file_is_looked_through_again_if_it_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,6 +81,21 @@ def test_a_file_has_the_permissions_of_any_other(tmp_path):
     assert modes[2] == modes[3]
 
 
+def test_a_folder_in_a_group_s_folder_belongs_to_the_group(tmp_path):
+    """Of a folder with the set-group-ID bit, folders inherit the group and the bit."""
+    tmp_path.chmod(0o2775)
+    with folder_written_aside(tmp_path / "run"):
+        pass
+    assert (tmp_path / "run").stat().st_mode & stat.S_ISGID
+
+
+def test_the_permissions_of_other_threads_files_never_change(tmp_path, monkeypatch):
+    """The umask is the whole process's: what a thread opens meanwhile would be open to all."""
+    monkeypatch.setattr("os.umask", lambda _mask: pytest.fail("changed"))
+    with written_aside(tmp_path / "file"), folder_written_aside(tmp_path / "folder"):
+        pass
+
+
 @pytest.mark.parametrize("writer", [written_aside, folder_written_aside])
 def test_a_place_that_cannot_be_written_to(tmp_path, writer):
     (tmp_path / "file").touch()

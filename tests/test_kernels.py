@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from cpunet.kernels import KernelFiles, code_folder, kernel
+from cpunet.kernels import KernelFiles, code_folder, kernel, sources
 from cpunet.trusted_folders import trusted
 
 CALLED = """
@@ -54,6 +55,34 @@ def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
         )
         told.append(done.stdout.strip())
     assert told == ["20 0", "20 1", "30 0"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import loops.called",
+        "from loops.called import called",
+        "from loops import called as other",
+        "from loops import (  # several\n    numbers,\n    called,\n)",
+    ],
+)
+def test_code_depends_on_all_modules_that_are_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    package = tmp_path / "loops"
+    package.mkdir()
+    for name, text in {"__init__": "", "numbers": "", "called": "called = 1"}.items():
+        (package / f"{name}.py").write_text(text)
+    (package / "calling.py").write_text(line)
+    monkeypatch.syspath_prepend(tmp_path)
+    sources.cache_clear()
+    try:
+        import_module("loops.calling")
+        assert package / "called.py" in sources("loops.calling")
+    finally:
+        sources.cache_clear()
+        for name in [name for name in sys.modules if name.partition(".")[0] == "loops"]:
+            del sys.modules[name]
 
 
 @pytest.mark.thorough

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,24 +24,72 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(machine_memory, "_INFO", info)
 
 
-def test_the_smallest_of_machine_container_and_process(tmp_path, monkeypatch, small) -> None:
-    monkeypatch.setattr(machine_memory, "_GROUPS", ())
+@pytest.fixture
+def grouped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], Path]:
+    """Put the process into a control group; its files are in the returned folder."""
+    monkeypatch.setattr(machine_memory, "_OWN_GROUPS", tmp_path / "own")
+    monkeypatch.setattr(machine_memory, "_GROUPS", tmp_path / "groups")
+
+    def put(line: str) -> Path:
+        (tmp_path / "own").write_text(f"3:cpuset:/\n{line}\n")
+        version_1 = "memory" if "memory" in line else ""
+        folder = tmp_path / "groups" / version_1 / line.rpartition(":")[2].strip("/")
+        folder.mkdir(parents=True)
+        return folder
+
+    return put
+
+
+def test_the_smallest_of_machine_container_and_process(monkeypatch, small, grouped) -> None:
+    folder = grouped("0::/")
     assert available_bytes() == 1_024_000
-    limit, used = tmp_path / "max", tmp_path / "current"
-    monkeypatch.setattr(machine_memory, "_GROUPS", ((limit, used),))
     for told, there in (("max", 1_024_000), ("700000", 200_000), ("400000", 0)):
-        limit.write_text(told)
-        used.write_text("500000")
+        (folder / "memory.max").write_text(told)
+        (folder / "memory.current").write_text("500000")
         assert available_bytes() == there
-    limit.write_text("max")
+    (folder / "memory.max").write_text("max")
     monkeypatch.setattr(resource, "getrlimit", lambda _which: (1000, 1000))
     assert available_bytes() == 0
 
 
+@pytest.mark.parametrize(
+    ("line", "limit", "used"),
+    [
+        ("0::/job_7/step_0/task_0", "memory.max", "memory.current"),
+        ("4:cpu,memory:/job_7/task_0", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ],
+)
+def test_the_limit_of_a_batch_job_is_that_of_a_group_further_out(
+    small, grouped, line, limit, used
+) -> None:
+    folder = grouped(line)
+    while folder.name != "job_7":
+        folder = folder.parent
+    (folder / limit).write_text("700000")
+    (folder / used).write_text("500000")
+    assert available_bytes() == 200_000
+
+
+@pytest.mark.parametrize(
+    "details",
+    [
+        "anon 100000\nactive_file 150000\ninactive_file 250000\n",
+        "active_file 1\ntotal_active_file 150000\ntotal_inactive_file 250000\n",
+    ],
+)
+def test_files_that_were_read_do_not_take_memory_away(small, grouped, details) -> None:
+    """The system keeps their contents as long as nobody needs the memory."""
+    folder = grouped("0::/")
+    (folder / "memory.max").write_text("500000")
+    (folder / "memory.current").write_text("500000")
+    assert available_bytes() == 0
+    (folder / "memory.stat").write_text(details)
+    assert available_bytes() == 400_000
+
+
 def test_a_system_that_does_not_tell_is_trusted(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(machine_memory, "_INFO", tmp_path / "none")
-    monkeypatch.setattr(machine_memory, "_GROUPS", ())
-    monkeypatch.setattr(machine_memory, "_STATUS", tmp_path / "none")
+    for name in ("_INFO", "_OWN_GROUPS", "_STATUS"):
+        monkeypatch.setattr(machine_memory, name, tmp_path / "none")
     assert available_bytes() is None
     require_memory(1e30, "anything", "nothing")
 

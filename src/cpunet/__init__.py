@@ -1,8 +1,8 @@
 """cpunet: make simulated germanium-detector pulses look measured.
 
-Data flow in one direction through its subpackages:
-``pulses`` (containers, files, preparation) → ``networks`` → ``training`` →
-``translation`` → ``analysis`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
+Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
+``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
+``analysis`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
 """
 
 from __future__ import annotations

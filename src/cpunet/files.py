@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import glob
-import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,16 +36,12 @@ def written_aside(target: Path) -> Iterator[Path]:
     target = Path(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.stem}-", suffix=f".partial{target.suffix}", dir=target.parent
-        )
+        aside = target.parent / f"{_hidden(target.stem)}.partial{target.suffix}"
+        aside.touch(exist_ok=False)
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror})") from error
-    os.close(handle)
-    aside = Path(name)
     try:
         yield aside
-        aside.chmod(0o666 & ~_umask())
         aside.replace(target)
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
@@ -97,12 +92,12 @@ def folder_written_aside(
     place = target.resolve() if target.is_symlink() else target
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+        aside = place.parent / _hidden(place.name)
+        aside.mkdir()
     except OSError as error:
         raise CpunetError(f"{target}: cannot be written ({error.strerror})") from error
     try:
         yield aside
-        aside.chmod(0o777 & ~_umask())
         mark(aside, kind)
         kept = keep_others(place, aside, kind) if place.exists() else []
         _take_the_place(aside, place, kind)
@@ -138,7 +133,6 @@ def _take_the_place(aside: Path, target: Path, kind: FolderKind) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _hidden(name: str) -> str:
+    """A name that no other process uses; its random part has no hyphen."""
+    return f".{name}-{secrets.token_hex(4)}"

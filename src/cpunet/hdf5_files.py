@@ -65,29 +65,37 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
 
 def is_column(item: object) -> bool:
     """Whether an object of a file is a one-dimensional array of numbers, or one number."""
-    return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+    if not isinstance(item, h5py.Dataset) or item.shape is None:  # a dataset without values
+        return False
+    return item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
 def require_all_stored(path: Path, item: h5py.Group | h5py.Dataset) -> None:
     """Like `require_stored`, for all datasets of a group."""
-    if isinstance(item, h5py.Dataset):
-        require_stored(path, item)
-        return
-    for name in item:
-        inner = item.get(name)
-        if inner is not None and inner != item.parent:
-            require_all_stored(path, inner)
+    ahead, seen = [item], set[tuple[int, int]]()
+    while ahead:
+        inner = ahead.pop()
+        info = h5py.h5o.get_info(inner.id)
+        if (info.fileno, info.addr) in seen:  # links can form circles
+            continue
+        seen.add((info.fileno, info.addr))
+        if isinstance(inner, h5py.Dataset):
+            require_stored(path, inner)
+        elif isinstance(inner, h5py.Group):
+            ahead += [found for name in inner if (found := inner.get(name)) is not None]
 
 
 def require_stored(path: Path, dataset: h5py.Dataset) -> None:
-    """Raise a `CpunetError` if the values of a dataset's rows are not stored in the file.
+    """Raise a `CpunetError` if the values of a dataset are not stored in the file.
 
     A file of a few bytes could otherwise be read as any number of zeros.
     """
-    n_bytes = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
+    if dataset.shape is None:  # without values
+        return
+    n_bytes = math.prod(dataset.shape) * dataset.dtype.itemsize
     if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > MAX_CHUNK_BYTES:
         raise CpunetError(
-            f"{path}: {dataset.name} is in chunks of {dataset.chunks}, which nobody can hold; "
+            f"{path}: {dataset.name} is in chunks of {dataset.chunks}, too large to read; "
             "copy or write it again"
         )
     if n_bytes == 0 or dataset.is_virtual or dataset.external:
@@ -99,7 +107,7 @@ def require_stored(path: Path, dataset: h5py.Dataset) -> None:
         missing = dataset.id.get_num_chunks() < expected
     if missing:
         raise CpunetError(
-            f"{path}: {dataset.name} says it has {dataset.shape[0]} rows, but not all of them "
+            f"{path}: {dataset.name} says it has {dataset.size} values, but not all of them "
             "are in the file; copy or write it again"
         )
 

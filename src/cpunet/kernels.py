@@ -40,7 +40,7 @@ Loop = TypeVar("Loop", bound=Callable[..., Any])
 # Maximum wait for code that another process compiles, in case that process hangs.
 MAX_WAIT_S = 60.0
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_IMPORT = re.compile(r"^(?:from|import) ([\w.]+)", re.MULTILINE)
+_IMPORT = re.compile(r"^(?:from ([\w.]+) )?import (\([^)]*|.*)", re.MULTILINE)
 
 
 @overload
@@ -71,8 +71,8 @@ def start_threads() -> None:
     """Start numba's threads; OpenMP, which torch uses as well, keeps its number of threads.
 
     numba starts them with the first parallel loop and then sets OpenMP's number for the whole
-    process: torch would from then on use other threads than it was told, and the last bits of
-    a network depend on their number.
+    process.  From then on torch would use another number of threads than it was told, and the
+    last bits of a network's output depend on that number.
     """
     with suppress(ImportError):  # another threading layer
         importlib.import_module("numba.np.ufunc.omppool")  # loads OpenMP: it has a number now
@@ -81,7 +81,7 @@ def start_threads() -> None:
 
 
 def use_threads(count: int) -> None:
-    """Have torch use so many threads, and parallel loops no more than that."""
+    """Set the number of threads of torch, and let parallel loops use no more than these."""
     import torch  # seconds, which compiled loops alone do not need
 
     torch.set_num_threads(count)
@@ -91,7 +91,7 @@ def use_threads(count: int) -> None:
 
 @contextmanager
 def at_most_threads(count: int) -> Iterator[None]:
-    """Let parallel loops that this thread calls use no more than so many threads."""
+    """Let parallel loops that this thread calls use at most `count` threads."""
     start_threads()
     before = numba.get_num_threads()
     numba.set_num_threads(min(before, count))
@@ -110,8 +110,11 @@ def sources(module: str) -> frozenset[Path]:
     while ahead:
         file = Path(str(sys.modules[ahead.pop()].__file__))
         found.add(file)
-        names = set(_IMPORT.findall(file.read_text(encoding="utf-8"))) - seen
-        ours = [n for n in names if n.partition(".")[0] == package and n in sys.modules]
+        names = set[str]()
+        for origin, items in _IMPORT.findall(file.read_text(encoding="utf-8")):
+            words = re.findall(r"[\w.]+", items)
+            names |= {origin, *words, *(f"{origin}.{word}" for word in words)}
+        ours = [n for n in names - seen if n.partition(".")[0] == package and n in sys.modules]
         seen.update(ours)
         ahead += ours
     return frozenset(found)

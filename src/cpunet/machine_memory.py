@@ -7,20 +7,19 @@ memory therefore checks first.
 from __future__ import annotations
 
 import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 from cpunet.errors import CpunetError
 
 _INFO = Path("/proc/meminfo")
 _STATUS = Path("/proc/self/statm")
-# Limit and use of a container or a batch job, for both versions of cgroups.
-_GROUPS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
-    (
-        Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ),
-)
+# Containers and batch jobs limit the memory of a control group; the names of the files of its
+# limit and its use differ in the two versions of such groups.
+_OWN_GROUPS = Path("/proc/self/cgroup")
+_GROUPS = Path("/sys/fs/cgroup")
+_NAMES_2 = ("memory.max", "memory.current")
+_NAMES_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes")
 
 
 def available_bytes() -> int | None:
@@ -31,7 +30,7 @@ def available_bytes() -> int | None:
     int or None
         The smallest of the limits; None if the system reports none, as on macOS.
     """
-    known = [_of_machine(), *(_of_group(*files) for files in _GROUPS), _of_process()]
+    known = [_of_machine(), *(_of_group(*files) for files in _groups()), _of_process()]
     return min((n for n in known if n is not None), default=None)
 
 
@@ -67,11 +66,46 @@ def _of_machine() -> int | None:
     return None
 
 
+def _groups() -> Iterator[tuple[Path, Path]]:
+    """Files of limit and use of the groups that this process may be in."""
+    try:
+        lines = _OWN_GROUPS.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, inner = line.split(":", 2)
+        if not controllers:
+            root, names = _GROUPS, _NAMES_2
+        elif "memory" in controllers.split(","):
+            root, names = _GROUPS / "memory", _NAMES_1
+        else:
+            continue
+        # a batch job's limit is that of a group further out; in a container only the outermost
+        # group is visible
+        for place in (Path(inner), *Path(inner).parents):
+            folder = root / place.relative_to("/")
+            yield folder / names[0], folder / names[1]
+
+
 def _of_group(limit: Path, used: Path) -> int | None:
     try:
-        return max(int(limit.read_text()) - int(used.read_text()), 0)
+        left = int(limit.read_text()) - int(used.read_text())
     except (OSError, ValueError):  # no group, or "max": no limit but that of the machine
         return None
+    return max(left + _cached_files(used.with_name("memory.stat")), 0)
+
+
+def _cached_files(stat: Path) -> int:
+    """Memory of a group that holds contents of files; the system frees it when it is needed."""
+    try:
+        counts = dict(line.split() for line in stat.read_text().splitlines())
+        # in version 1, only the totals include the groups within the group
+        return sum(
+            int(counts.get(f"total_{name}", counts.get(name, 0)))
+            for name in ("active_file", "inactive_file")
+        )
+    except (OSError, ValueError):
+        return 0
 
 
 def _of_process() -> int | None:

@@ -65,8 +65,11 @@ class Header:
 
 def keys(path: Path) -> list[str]:
     """Names of the arrays of an archive; ``[""]`` for a file with one array."""
-    if not zipfile.is_zipfile(path):
-        return [""]
+    prefix = np.lib.format.MAGIC_PREFIX
+    with path.open("rb") as file:
+        # the values of an array can look like the end of an archive
+        if file.read(len(prefix)) == prefix or not zipfile.is_zipfile(path):
+            return [""]
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
     return [name.removesuffix(".npy") for name in names if name.endswith(".npy")]

@@ -140,9 +140,9 @@ FAULTS = {
     "EIO as it is moved into place": ("pathlib.Path.replace", refusing(errno.EIO)),
     "ESTALE as it is moved into place": ("pathlib.Path.replace", refusing(errno.ESTALE)),
     "SIGTERM as it is moved into place": ("pathlib.Path.replace", ended_by(signal.SIGTERM)),
-    "read-only": ("tempfile._mkstemp_inner", refusing(errno.EROFS)),
+    "read-only": ("pathlib.Path.touch", refusing(errno.EROFS)),
 }
-FOLDER_FAULTS = {"read-only": ("tempfile.mkdtemp", refusing(errno.EROFS))}
+FOLDER_FAULTS = {"read-only": ("pathlib.Path.mkdir", refusing(errno.EROFS))}
 
 
 def require_failed(outcome, before: dict[str, bytes], folder: Path, status: int) -> None:

@@ -18,6 +18,7 @@ from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, Wavefor
 from lh5.compression import RadwareSigcompress, ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import require_all_stored
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.source import BLOCK_BYTES, MAX_SAMPLES
 
@@ -158,6 +159,24 @@ def test_lh5_that_contradicts_itself(tmp_path, defect):
         tracemalloc.stop()
     assert most < 50e6
     assert time.monotonic() - begun < 20
+
+
+def test_one_number_that_is_not_stored(tmp_path):
+    change = claimed(f"{VALUES}/decoded_size", (), "i8", None)
+    path = changed(write(tmp_path / "bad.lh5", **VARLEN), change)
+    with pytest.raises(CpunetError, match="says it has 1 values, but not all of them are in"):
+        open_pulses(path)
+
+
+def test_links_in_a_circle_are_followed_once(tmp_path):
+    path = tmp_path / "circle.h5"
+    with h5py.File(path, "w") as file:
+        file["a/b/up"] = file["/"]
+        file["a/values"] = np.zeros(3)
+        require_all_stored(path, file)
+        file.create_dataset("a/b/missing", 3, "f4")
+        with pytest.raises(CpunetError, match="/a/b/missing says it has 3 values"):
+            require_all_stored(path, file)
 
 
 @pytest.mark.parametrize("codec", [None, *VARLEN.values(), *RADWARE.values()])

@@ -315,6 +315,15 @@ class TestSets:
         assert chosen.rejections == {"nan": 1}
 
 
+@pytest.mark.parametrize("kind", ["simulated", "measured"])
+@pytest.mark.parametrize("top", [398, 399, 400, 401])
+def test_pulses_can_be_aligned_at_their_maximum(kind: str, top: int) -> None:
+    t = np.arange(1000)
+    pulse = np.where(t <= top, np.clip((t - 300) / (top - 300), 0, 1), np.exp((top - t) / 3000))
+    prepared = prepared_of(1000 * pulse[np.newaxis], kind, align_fraction=1.0)
+    assert prepared.align_sample.tolist() == [top]
+
+
 def test_closure_data_prepare_twice_alike(reference_data) -> None:  # type: ignore[no-untyped-def]
     with h5py.File(reference_data / "closure" / "data.lh5") as file:
         raw = file["geds/raw/waveform/values"][:600]

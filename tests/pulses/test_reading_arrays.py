@@ -91,6 +91,36 @@ def test_a_choice_between_arrays(tmp_path):
         open_pulses(path, table="wf2", dt_ns=16)
 
 
+def test_of_plain_datasets_the_one_called_waveform_is_taken(tmp_path):
+    path = write_hdf5(tmp_path / "pulses.h5", waveform=VALUES, values=VALUES[:, :3], dt_ns=16.0)
+    np.testing.assert_array_equal(open_pulses(path).read().waveforms, VALUES)
+
+
+@pytest.mark.parametrize("name", ["energy_kev", "event_number", "dt_ns"])
+def test_a_dataset_without_values_is_no_column(tmp_path, name):
+    arrays = {"waveform": VALUES, "dt_ns": 16.0, name: h5py.Empty("f8")}
+    path = write_hdf5(tmp_path / "pulses.h5", **arrays)
+    source = open_pulses(path, dt_ns=16)
+    assert name not in source.columns
+    assert len(source.read()) == 11
+
+
+def test_an_array_whose_end_looks_like_that_of_an_archive(tmp_path):
+    values = np.zeros((11, 30), np.uint16)
+    values.view(np.uint8).ravel()[-22:-18] = list(b"PK\5\6")
+    np.save(tmp_path / "pulses.npy", values)
+    read = open_pulses(tmp_path / "pulses.npy", dt_ns=16).read()
+    np.testing.assert_array_equal(read.waveforms, values)
+
+
+def test_the_amplitude_of_a_trace_of_infinities_is_unknown(tmp_path):
+    values = VALUES.copy()
+    values[0, :2] = np.inf, -np.inf
+    path = write_npz(tmp_path / "pulses.npz", waveform=values, dt_ns=16.0)
+    energies = open_pulses(path, kev_per_adc=1).read().energy_kev
+    assert np.isnan(energies).tolist() == [True] + [False] * 10
+
+
 def test_a_choice_between_groups(tmp_path):
     path = tmp_path / "pulses.h5"
     with h5py.File(path, "w") as h5:

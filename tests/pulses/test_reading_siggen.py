@@ -101,6 +101,10 @@ def test_what_siggen_prints_is_one_pulse(tmp_path):
         ("# nothing\n\n", "holds no numbers"),
         ("1 2 3 4 5\n" * 4, "5 numbers are no pulse"),
         (" ".join("1" * 20) + "\n1 2\n", r"line 2: 2 numbers, before it 20"),
+        (
+            ("signal:\n" + " ".join("1" * 20) + "\n") * 2,
+            r"line 3: another pulse; give each a file",
+        ),
     ],
 )
 def test_other_text_is_refused(tmp_path, text, message):

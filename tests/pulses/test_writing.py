@@ -214,6 +214,49 @@ def test_other_columns_are_read_by_rows(tmp_path):
     assert [list(row) for row in twice.y] == [[1], [1], [2, 3], [2, 3]]
 
 
+def test_no_column_replaces_another(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    names = ("rejection", "rejection_source", "scale")
+    write_pulses(path, some(), columns={name: (np.full(6, len(name)), "") for name in names})
+    own = {"waveform", "energy", "event_number", "rejection"}
+    in_file = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
+    beside = RowColumns.of_columns(path, open_pulses(path).columns, own)
+    for others in (in_file, beside):
+        values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
+        assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
+
+
+def test_a_column_without_values_is_left_out(tmp_path):
+    path = tmp_path / "pulses.h5"
+    with h5py.File(path, "w") as file:
+        file["waveform"] = some().waveforms
+        file["note"] = h5py.Empty("f8")
+    others = RowColumns.of_hdf5(path, "waveform", 6, {"waveform"})
+    assert (others.names, others.left_out) == ({}, {"note": "without values"})
+
+
+def test_no_values_are_appended_to_a_column_that_exists(tmp_path):
+    source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
+    write_pulses(source, some(6), columns={"more_scale": (np.arange(6.0), "")})
+    with (
+        pytest.raises(CpunetError, match="has a column more_scale already; choose another"),
+        ColumnAppender(out, source, table="geds/sim", name="more") as writer,
+    ):
+        writer.append(some(6), {"scale": (np.zeros(6), "")})
+    assert not out.exists()
+
+
+def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_given):
+        raise CpunetError("no space left")
+
+    monkeypatch.setattr("cpunet.pulses.writing.FileInTheMaking", full)
+    writer = PulseWriter(tmp_path / "a.lh5")
+    with pytest.raises(CpunetError, match="no space left"), writer:
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_column_of_other_length_is_not_appended(tmp_path):
     source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
     write_pulses(source, some(6))

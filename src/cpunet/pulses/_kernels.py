@@ -96,7 +96,7 @@ def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: i
     threshold = base + fraction * (top - base)
     slack = _ROUNDING * (top - base)
     first = crossing(trace, top_sample, threshold - slack)
-    last = crossing(trace, top_sample, threshold + slack)
+    last = crossing(trace, top_sample, min(threshold + slack, top))
     if first <= preferred <= last:
         return preferred
     return crossing(trace, top_sample, threshold)

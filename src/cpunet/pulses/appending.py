@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -16,10 +16,10 @@ from lgdo import LGDO, Array
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.hdf5_files import text_attribute
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table, write_errors
-from cpunet.pulses.reading.hdf5 import text_attribute
 from cpunet.pulses.writing import Columns
 
 
@@ -130,9 +130,11 @@ class ColumnAppender:
         for name, (values, units) in (columns or {}).items():
             array = Array(np.asarray(values), attrs={"units": units} if units else {})
             content[f"{self._name}_{name}"] = array
+        if not self._new:
+            self._require_new(self._file.h5[self._table], content)
+            self._new = list(content)
         for name, column in content.items():
             self._file.write(column, name, self._table)
-        self._new = list(content)
         self.n_pulses += len(pulses)
 
     def stamp(self, name: str, text: str) -> None:
@@ -147,8 +149,11 @@ class ColumnAppender:
                 f"{self._source}: {self._table} is no table of LH5, so no column can be "
                 "appended; leave out --append-column"
             )
-        for name in (self._name, f"{self._name}_rejection"):
-            if name in file[self._table]:
+        self._require_new(file[self._table], [self._name])
+
+    def _require_new(self, table: h5py.Group, names: Iterable[str]) -> None:
+        for name in names:
+            if name in table:
                 raise CpunetError(
                     f"{self._source}: {self._table} has a column {name} already; "
                     "choose another name"

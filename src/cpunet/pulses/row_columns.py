@@ -12,8 +12,8 @@ import lh5
 import numpy as np
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
-from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.lh5_rows import read_rows
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
@@ -63,7 +63,7 @@ class RowColumns:
             is omitted if it has the same meaning (event number, energy in energy units).
         """
         table, _, chosen = waveforms.rpartition("/")
-        names, left_out = {}, {}
+        names, left_out = list[str](), dict[str, str]()
         with opened(path) as file:
             group = file[table or "/"]
             for name in group:
@@ -73,20 +73,20 @@ class RowColumns:
                 if reason:
                     left_out[name] = reason
                 else:
-                    names[name] = name + SUFFIX if name in own else name
-        return cls(path, table or "/", names, left_out)
+                    names.append(name)
+        return cls(path, table or "/", _renamed(names, own), left_out)
 
     @classmethod
     def of_columns(
         cls, path: Path, columns: Mapping[str, Column], own: Collection[str]
     ) -> RowColumns:
         """Use the columns that the reader of another format found; names as above."""
-        names = {
-            name: name + SUFFIX if name in own else name
+        names = [
+            name
             for name, column in columns.items()
             if not (name == "event_number" or _in_kev(name, column.units)) or name not in own
-        }
-        return cls(path, names=names, columns=columns)
+        ]
+        return cls(path, names=_renamed(names, own), columns=columns)
 
     def read(self, start: int, n: int, repeats: int = 1) -> dict[str, LGDO]:
         """The `n` rows from `start` on, each repeated `repeats` times."""
@@ -139,6 +139,18 @@ def _from_column(column: Column, start: int, n: int) -> Array:
     return Array(values, attrs=attrs)
 
 
+def _renamed(names: Collection[str], own: Collection[str]) -> dict[str, str]:
+    """Name in the output for each column: its own, or one with `SUFFIX` that is still free."""
+    renamed = {name: name for name in names}
+    taken = {*names, *own}
+    for name in names:
+        if name in own:
+            while renamed[name] in taken:
+                renamed[name] += SUFFIX
+            taken.add(renamed[name])
+    return renamed
+
+
 def _is_same(name: str, item: object, own: Collection[str]) -> bool:
     """Whether a column has the same meaning as the output's column of that name."""
     if name not in own or not isinstance(item, h5py.Dataset):
@@ -157,6 +169,8 @@ def _unreadable(item: h5py.Group | h5py.Dataset | None, n_pulses: int) -> str:
     if not text_attribute(item, "datatype"):
         if not isinstance(item, h5py.Dataset):
             return "a group that is no column"
+        if item.shape is None:
+            return "without values"
         if item.dtype.kind not in _NUMBERS and not h5py.check_string_dtype(item.dtype):
             return f"of type {item.dtype}"
         rows = n_pulses if item.ndim == 0 else item.shape[0]

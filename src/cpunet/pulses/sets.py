@@ -50,10 +50,6 @@ class Source(Protocol):
     def path(self) -> Path:
         """Path of the file, for messages."""
 
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period in ns."""
-
     def blocks(self, size: int, /) -> Iterator[Pulses]:
         """The file's pulses in order, at most `size` at a time."""
 
@@ -65,7 +61,6 @@ def load_prepared(
     *,
     select: Select | None = None,
     peaks: PeakNames | None = None,
-    limit: int | None = None,
     most: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Prepared:
@@ -82,8 +77,6 @@ def load_prepared(
         are wanted, even those of unknown energy.
     peaks
         Function that returns the name of the peak of each energy in keV.
-    limit
-        Number of accepted pulses after which reading stops.
     most
         Maximum number of accepted pulses to keep.  If there are more, a random sample of them
         is kept, always the same for the same file.  This bounds the memory.
@@ -106,8 +99,6 @@ def load_prepared(
     for block in source.blocks(BLOCK_SIZE):
         part = _prepare_selected(block, config, kind, select, peaks, n_read)
         n_read += len(block)
-        if limit is not None and n_kept + len(part) >= limit:
-            part = _shortened(part, limit - n_kept)
         n_kept += len(part)
         require_memory(
             block.waveforms.nbytes,
@@ -120,8 +111,6 @@ def load_prepared(
             n_kept = _thin(sets, drawn, most)
         if progress is not None:
             progress(len(block))
-        if limit is not None and n_kept >= limit:
-            break
     if not n_kept:
         raise CpunetError(_nothing_left(source, sets))
     if most is not None and n_kept > most:
@@ -184,12 +173,6 @@ def _prepare_selected(
     return replace(
         part, index=first_index + rows[part.index], codes=codes, first_index=first_index
     )
-
-
-def _shortened(part: Prepared, n: int) -> Prepared:
-    """The first `n` pulses, as if reading had stopped there."""
-    n_read = int(part.index[n - 1]) + 1 - part.first_index
-    return replace(part[:n], codes=part.codes[:n_read])
 
 
 def _nothing_left(source: Source, sets: list[Prepared]) -> str:

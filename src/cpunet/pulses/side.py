@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.preparation import Kind
-from cpunet.pulses.reading.hdf5 import opened, text_attribute
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.yaml_files import plain_json
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -88,8 +88,10 @@ class PulseWriter:
         refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
-        aside = self._stack.enter_context(written_aside(self.path))
-        self._file = self._stack.enter_context(FileInTheMaking(aside, self.path))
+        with ExitStack() as stack:
+            aside = stack.enter_context(written_aside(self.path))
+            self._file = stack.enter_context(FileInTheMaking(aside, self.path))
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -240,7 +242,7 @@ def write_pulses(
         force=force,
     )
     with writer:
-        for block in _in_turn(blocks):
+        for block in [blocks] if isinstance(blocks, Pulses) else blocks:
             rows = slice(writer.n_pulses, writer.n_pulses + len(block))
             writer.append(block, {name: (v[rows], u) for name, (v, u) in extra.items()})
         for name, (values, _) in extra.items():
@@ -250,13 +252,6 @@ def write_pulses(
                     f"{writer.n_pulses} pulses; give one value per pulse"
                 )
     return writer.n_pulses
-
-
-def _in_turn(blocks: Pulses | Iterable[Pulses]) -> Iterator[Pulses]:
-    if isinstance(blocks, Pulses):
-        yield blocks
-    else:
-        yield from blocks
 
 
 def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:

@@ -60,9 +60,9 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     array([5.])
     """
     n_baseline = max(_BASELINE_SAMPLES, round(_BASELINE_FRACTION * waveforms.shape[1]))
-    baseline = waveforms[:, :n_baseline].mean(axis=1, dtype=np.float64)
     # A trace of infinities has no amplitude; the preparation rejects and counts it.
     with np.errstate(invalid="ignore"):
+        baseline = waveforms[:, :n_baseline].mean(axis=1, dtype=np.float64)
         return np.asarray(waveforms.max(axis=1) - baseline)
 
 
@@ -74,7 +74,7 @@ def resolve_energies(
     kev_per_adc: float | None,
     n_pulses: int | None,
 ) -> Energies:
-    """Choose the source of a file's energies.
+    """Choose where the energies of a file's pulses come from.
 
     Without `energy`, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
     is in energy units or `kev_per_adc` is given.  Otherwise the energy is the amplitude

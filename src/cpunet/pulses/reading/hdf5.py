@@ -1,4 +1,4 @@
-"""Open HDF5 files, and read columns with one value per event from them."""
+"""Read columns with one value per event from HDF5 files."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.pulses.reading.columns import shortened
-
-__all__ = ["Hdf5Column", "column_of", "columns_of", "opened", "text_attribute"]
 
 
 @dataclass(frozen=True)

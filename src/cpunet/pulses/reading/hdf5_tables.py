@@ -9,12 +9,12 @@ from pathlib import Path
 import h5py
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import text_attribute
 from cpunet.pulses.reading.columns import shortened
-from cpunet.pulses.reading.hdf5 import text_attribute
 
 # preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
-_PLAIN = ("waveform", "waveforms", "values")
+_PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,8 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
     columns = [_as_column(group.get(name), group, name) for name in group]
     found = [column for column in columns if column is not None]
     lh5_found = [column for column in found if column.is_lh5]
-    yield from lh5_found or [c for c in found if c.name in _PLAIN][:1]
+    plain = [column for name in _PLAIN for column in found if column.name == name]
+    yield from lh5_found or plain[:1]
     # other columns of a table can be groups of many datasets, but contain no waveforms
     if text_attribute(group, "datatype").startswith("table"):
         return

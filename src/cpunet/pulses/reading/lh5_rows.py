@@ -90,7 +90,7 @@ def _check_encoded(path: Path, name: str, start: int, raw: Any) -> None:
     lengths = np.broadcast_to(lengths, ends.shape).astype(np.int64)
     codec = str(raw.attrs.get("codec", ""))
     if codec not in (_RADWARE, _VARLEN):
-        raise CpunetError(f"{path}: {name} is encoded by {codec or 'nothing known'}; decode it")
+        raise CpunetError(f"{path}: {name} has an unknown encoding {codec!r}; decode it")
     bad = (lengths < 1) | (lengths > MAX_SAMPLES)
     if bad.any():
         row = int(bad.argmax())

@@ -94,7 +94,7 @@ class MajoranaSource(PulseSource):
 
 def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
     """Rows of the chosen detector, in order."""
-    numbers = np.asarray(file[DETECTOR][()])
+    numbers = np.atleast_1d(file[DETECTOR][()])
     if len(numbers) != n:
         raise CpunetError(
             f"{options.path}: {len(numbers)} detectors beside {n} waveforms; download it again"

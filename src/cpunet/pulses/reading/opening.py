@@ -113,7 +113,7 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
 
 
 def _hdf5_tables(path: Path) -> list[str]:
-    from cpunet.pulses.reading.hdf5 import opened
+    from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5_tables import waveform_tables
     from cpunet.pulses.reading.majorana import detectors, is_majorana
 

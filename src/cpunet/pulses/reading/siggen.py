@@ -109,10 +109,15 @@ def _even_lines(path: Path, expected: int) -> Iterator[list[float]]:
 
 def _lines(path: Path) -> Iterator[_Line]:
     """Yield the numbers of each line that has any."""
+    any_line = False
     with path.open(encoding="ascii", errors="replace") as file:
         for number, line in enumerate(file, 1):
             words = line.partition("#")[0].replace(",", " ").split()
             if words == [_PRINTED]:
+                if any_line:
+                    raise CpunetError(
+                        f"{path}: line {number}: another pulse; give each a file of its own"
+                    )
                 continue
             try:
                 values = [float(word) for word in words]
@@ -122,6 +127,7 @@ def _lines(path: Path) -> Iterator[_Line]:
                     "give a file of pulses, or start comments with #"
                 ) from None
             if values:
+                any_line = True
                 yield _Line(number, values)
 
 
