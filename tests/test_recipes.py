@@ -187,7 +187,7 @@ def test_wrong_settings_are_named(override, part):
         ("training.steps=0", "training.steps: "),
         ("training.start_factors=[]", "training.start_factors: "),
         ("training.segments=[0.5, 1]", "training.segments.0: "),
-        ("generator.slow_ns=[100, 100.0]", "generator.slow_ns: times must differ"),
+        ("generator.slow_ns=[100, 100.0]", "times must differ"),
         ("training.segments=[]", "training.segments: Tuple should have at least 2 items"),
         ("training.segments=[3, 1]", "segments must be in rising order"),
         ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),

@@ -137,7 +137,7 @@ def test_parts_of_the_same_time_add_up(tmp_path):
         ).undecayed.step(time_ns)
         for name, slow_ns, weights in (
             ("a", [400], {0: 0.06}),
-            ("b", [400, 400], {0: 0.04, 1: 0.02}),
+            ("b", [400, 400.001], {0: 0.04, 1: 0.02}),
         )
     ]
     np.testing.assert_allclose(found[1], found[0], atol=1e-4)
