@@ -23,7 +23,9 @@ from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.jobs.studies.tune import tune_recipe
 from cpunet.jobs.studies.tuning_study import (
     _is_gone,
+    counted,
     found,
+    lose,
     open_study,
     queue_first,
     suggested,
@@ -172,6 +174,17 @@ def test_whole_numbers_can_be_choices_of_a_real_setting(tmp_path):
     told = found(study, recipe, search_space(recipe))
     assert told["first"] == 1.5
     assert told["importances"] == {}  # one trial says nothing of them
+
+
+def test_a_trial_that_was_lost_before_its_first_value_is_queued_again(tmp_path):
+    recipe = tiny()
+    study = open_study(tmp_path, recipe)
+    queue_first(study, recipe, search_space(recipe))
+    lose(study, study.ask())
+    again = study.ask()
+    for key, config in search_space(recipe).items():
+        assert suggested(again, key, recipe, config) == value_of(recipe, key)
+    assert len(counted(study)) == 1
 
 
 @pytest.mark.parametrize("name", ["fast", "small", "paper"])

@@ -99,8 +99,10 @@ def lose(study: Study, trial: FrozenTrial | Trial) -> None:
 
     study.set_user_attr(f"{LOST} {trial.number}", True)
     study.tell(trial.number, state=TrialState.FAIL)
-    if trial.params:
-        study.enqueue_trial(trial.params)
+    # a trial that was queued has all values before it has suggested any
+    queued = study.trials[trial.number].system_attrs.get("fixed_params", {})
+    if params := {**queued, **trial.params}:
+        study.enqueue_trial(params)
 
 
 def _is_gone(worker: str) -> bool:
