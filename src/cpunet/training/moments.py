@@ -43,6 +43,10 @@ MAX_CUT = 0.2
 DRAWN, BLOCK = 8192, 512
 
 
+class TooFewPulsesError(CpunetError):
+    """There are too few measured pulses to define the functions."""
+
+
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Quantities read from each pulse, from which the functions are computed.
@@ -114,7 +118,7 @@ class Moments:
 
         Raises
         ------
-        CpunetError
+        TooFewPulsesError
             If there are too few pulses.
         """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
@@ -126,7 +130,7 @@ class Moments:
         if usable.any():
             usable &= log_amplitude > _least(log_amplitude[usable])
         if usable.sum() < MIN_N:
-            raise CpunetError(
+            raise TooFewPulsesError(
                 f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
                 "needed: select more energies (--peak) or give more files"
             )
