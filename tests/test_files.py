@@ -14,6 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside as aside_of_kind
 from cpunet.files import written_aside
 from cpunet.outputs import MARKER, FolderKind, mark
+from cpunet.training.unfinished import unfinished_folder
 
 KIND = FolderKind("thing", "cpunet make", known_by="old", own="old|new")
 
@@ -104,6 +105,26 @@ def test_a_place_that_cannot_be_written_to(tmp_path, writer):
         pass
     assert str(error.value).startswith(f"{target}: cannot be written (")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("writer", [written_aside, folder_written_aside, unfinished_folder])
+def test_another_file_that_failed_is_named(tmp_path, writer):
+    missing, target = tmp_path / "sim.lh5", tmp_path / "out"
+    with pytest.raises(CpunetError) as error, writer(target):
+        missing.read_bytes()
+    said = str(error.value)
+    assert said.startswith(f"{missing}: cannot be used (No such file or directory); {target}")
+    assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize("writer", [folder_written_aside, unfinished_folder])
+def test_a_file_inside_the_output_is_the_output(tmp_path, monkeypatch, writer):
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(CpunetError, match=r"^out.*: cannot be written \(No such"),
+        writer(Path("out")) as folder,
+    ):
+        (folder.absolute() / "nowhere" / "file").write_text("")
 
 
 def test_a_full_disk_is_one_line(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -44,9 +45,31 @@ def written_aside(target: Path) -> Iterator[Path]:
         yield aside
         aside.replace(target)
     except OSError as error:
-        raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
+        raise not_written(error, target, aside) from error
     finally:
         aside.unlink(missing_ok=True)
+
+
+def not_written(error: OSError, target: Path, *places: Path) -> CpunetError:
+    """Describe why `target` was not written; another file that failed is named instead.
+
+    Parameters
+    ----------
+    error
+        Error of the system. It names a file that cannot be opened, but not one that cannot be
+        read or written.
+    target
+        File or folder to be written.
+    places
+        Further paths at which it is being written.
+    """
+    reason = error.strerror or error
+    if isinstance(error.filename, str | bytes):
+        failed = Path(os.fsdecode(error.filename)).absolute()
+        own = {path.absolute() for path in (target, *places)}
+        if own.isdisjoint((failed, *failed.parents)):
+            return CpunetError(f"{failed}: cannot be used ({reason}); {target} is not written")
+    return CpunetError(f"{target}: cannot be written ({reason})")
 
 
 def remove_partial(target: Path) -> None:
@@ -103,7 +126,7 @@ def folder_written_aside(
         _take_the_place(aside, place, kind)
         told_kept(target, kept, note)
     except OSError as error:
-        raise CpunetError(f"{target}: cannot be written ({error.strerror or error})") from error
+        raise not_written(error, target, place, aside) from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

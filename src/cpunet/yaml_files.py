@@ -67,6 +67,35 @@ def parsed(text: str) -> Any:
         raise
 
 
+def key_and_value(word: str, source: str) -> tuple[str, Any] | None:
+    """Key and parsed value of a ``KEY=VALUE``; None if there is no ``=``.
+
+    Parameters
+    ----------
+    word
+        As given by the user.
+    source
+        Start of error messages, such as ``"detector V01"``.
+
+    Raises
+    ------
+    CpunetError
+        If the value cannot be parsed.
+
+    Examples
+    --------
+    >>> key_and_value("bias_V = 4000", "detector V01"), key_and_value("V01.yaml", "shift")
+    (('bias_V', 4000), None)
+    """
+    key, equals, value = word.partition("=")
+    if not equals:
+        return None
+    try:
+        return key.strip(), parsed(value)
+    except yaml.YAMLError as error:
+        raise CpunetError(f"{source}: {shown(word)} has no plain value") from error
+
+
 def plain_json(text: str | bytes) -> Any:
     """Parse a JSON text.
 

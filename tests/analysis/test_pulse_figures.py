@@ -14,6 +14,7 @@ from cpunet.analysis.pulse_figures import (
     spectrum_figure,
 )
 from cpunet.analysis.seed_figure import seed_distributions, seed_figure
+from cpunet.analysis.sides_figure import sides_figure
 from cpunet.errors import CpunetError
 from synthetic import require_drawn
 
@@ -111,6 +112,21 @@ def test_spectra_of_any_width_are_drawn_in_so_many_bins():
     require_drawn(figure := spectrum_figure({"data": np.array([1.0, 1e6])}, {}))
     assert len(figure.axes[0].patches[0].get_data().values) < 2100
     require_drawn(spectrum_figure({"data": np.full(3, 2614.5)}, {}))
+
+
+def test_a_single_outlier_does_not_widen_all_bins():
+    kev = np.append(np.random.default_rng(1).normal(2614.5, 2, 500), 1e6)
+    data = spectrum_figure({"data": kev}, {"FEP": 2614.5}).axes[0].patches[0].get_data()
+    assert np.diff(data.edges) == pytest.approx(2)
+    assert (data.values * np.diff(data.edges)).sum() == pytest.approx(1, abs=0.01)
+
+
+def test_the_counts_of_pulses_are_those_of_the_files():
+    some = {"data": edges([20.0] * 15), "raw": edges([10.0] * 5)}
+    values = {axis: {side: np.arange(15.0) for side in some} for axis in ("time", "current")}
+    figure = sides_figure(some, values, DT, {"data": 9000, "raw": 5})
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [text.partition(", ")[2] for text in told] == ["12 of 9000", "5 of 5"]
 
 
 def test_spectra_without_energies_are_refused():

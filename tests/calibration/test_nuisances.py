@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration.nuisances import NUISANCES, Physics, named, priors
+from cpunet.calibration.nuisances import NUISANCES, Physics, known_before, named, priors
 from cpunet.calibration.titles import TITLES
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import read_detector
@@ -51,6 +51,15 @@ def test_each_coordinate_reaches_what_it_names():
         after = {**detector.model_dump(), **settings.model_dump()}
         assert after[nuisance.field] > before[nuisance.field]
         assert {name for name in after if after[name] != before[name]} == {nuisance.field}
+
+
+@given(st.sampled_from(NUISANCES), st.floats(0.5, 2.0), st.floats(0.01, 1.0))
+def test_a_given_prior_is_told_as_it_was_given(nuisance, factor, error):
+    value = factor * (PHYSICS.nominal(nuisance) or 1.0)
+    value = min(max(value, nuisance.lowest), nuisance.highest)
+    one = PHYSICS.of([nuisance])
+    told = known_before(one, {nuisance.name: (value, error)})[nuisance.name]
+    assert told == pytest.approx((value, error))
 
 
 def test_priors_are_the_defaults_or_those_given():

@@ -293,7 +293,7 @@ WRONG = {
     ),
     "damaged report": (
         lambda home, _: cpunet.Report.load(damaged(home)),
-        "metrics.json: holds no scores; make the report again",
+        "metrics.json: holds no scores by peak; give a report of cpunet validate",
     ),
     "strange setting": (
         lambda home, _: cpunet.train(

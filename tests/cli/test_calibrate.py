@@ -142,11 +142,14 @@ def test_it_is_a_run_like_any_other(calibrated, stand, command, tmp_path):
 def test_a_plan_is_told_before_any_fit(stand, command, free, tmp_path):
     out = tmp_path / "plan"
     words = ("--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--plan", "--out", out)
-    done = command("calibrate", *words, "--free", free)
+    prior = ("--prior", "hole_velocity_low=1.2±0.06")
+    done = command("calibrate", *words, "--free", free, *prior)
     assert done.code == 0, done.err
     assert "temperature [K]" in done.out
     assert "in units of the prior" in done.out
     told = json.loads((out / "plan.json").read_text())
+    # as given, not in units of the simulated value
+    assert told["errors"]["hole_velocity_low_factor"]["prior"] == pytest.approx(0.06)
     of_temperature = told["errors"]["temperature_K"]
     assert of_temperature["alone"]["40000"] < of_temperature["alone"]["1000"]
     assert of_temperature["alone"]["1000"] < of_temperature["all_free"]["1000"]

@@ -43,6 +43,20 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert 'href="ch2/report.html"' in index
     assert "ch3" in index
 
+    # a report of before is not shown for a channel that fails now
+    with h5py.File(raw, "a") as file:
+        file["ch2/raw/energy"][...] = 100.0
+    again = command("validate", tmp_path / "runs", *words)
+    assert "ch1: exists already" in again.out.replace(str(tmp_path / "reports") + "/", "")
+    again = command("validate", tmp_path / "runs", *words, "--force")
+    assert again.out.count("failed: ") == 2
+    index = (tmp_path / "reports" / "index.html").read_text("utf-8")
+    assert 'href="ch1/report.html"' in index
+    assert 'href="ch2/report.html"' not in index
+    assert (tmp_path / "reports" / "ch2" / "report.html").is_file()
+    with h5py.File(raw, "a") as file, h5py.File(stand.data) as source:
+        file["ch2/raw/energy"][...] = source["geds/raw/energy"][...]
+
     out = tmp_path / "translated"
     words = ["--table", "all", "--inverse", "--out", out]
     translated = command("translate", tmp_path / "runs", raw, *words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -291,6 +292,20 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
         monitor=monitor,
     )
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
+
+
+def test_too_few_pulses_for_a_residual_leave_the_chain(files: Files, tmp_path: Path) -> None:
+    few = written(tmp_path / "data.lh5", digitised(230, seed=2))
+    recipe = load_recipe("best", [*ONE_START, *SHORT, "training.drift_terms=0"])
+    monitor, how = Listening(), TrainOptions(device="cpu")
+    info = train_run(files.sim, few, tmp_path / "run", recipe, how, monitor=monitor)
+    said = [note for note in monitor.notes if note.startswith("the residual is left out")]
+    assert len(said) == 1
+    assert re.search(r"without the 20 % for its test, \d+ measured pulses can be u", said[0])
+    assert not info["fit"]["residual"]["kept"]
+    assert info["fit"]["residual"]["held_out_before"] is None
+    ren = REN.load(tmp_path / "run")
+    assert np.isfinite(ren.translate(sampled(charge(20, 1), FINE), noise=False)).all()
 
 
 @pytest.mark.thorough

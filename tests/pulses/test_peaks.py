@@ -102,7 +102,9 @@ def test_lines_in_ranges_are_those_not_chosen_by_name() -> None:
 
 def test_parts_of_a_selection_make_it_up() -> None:
     selection = parse_selection("FEP,1000-1580,2700-", load_recipe("fast").peaks)
-    assert [part.name for part in selection.parts] == ["FEP", "1000-1580", "2700-inf"]
+    assert [part.name for part in selection.parts] == ["FEP", "1000-1580", "2700-"]
+    twice = parse_selection("FEP,300-2614.511,FEP,300-2614.511", selection.peaks)
+    assert [part.name for part in twice.parts] == ["FEP", "300-2614.511"]
     energies = [2614.5, 1200.0, 1600.0, 3000.0]
     together = np.any([part.select(energies) for part in selection.parts], axis=0)
     np.testing.assert_array_equal(together, selection.select(energies))

@@ -112,3 +112,18 @@ def test_other_text_is_refused(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(CpunetError, match=message):
         open_pulses(path, dt_ns=1).read()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_comments_may_have_any_signs(tmp_path, encoding):
+    path = tmp_path / "pulses.txt"
+    rows = "\n".join(" ".join(f"{v:g}" for v in PULSE) for _ in range(2))
+    path.write_text(f"# steps of 1 µs, ±2 %\n{rows}\n", encoding=encoding)
+    source = open_pulses(path, dt_ns=1)
+    np.testing.assert_allclose(source.read().waveforms, [PULSE, PULSE], rtol=1e-5)
+    path.write_text(f"µ\n{rows}\n", encoding=encoding)
+    with pytest.raises(CpunetError, match="of no known format"):
+        open_pulses(path, dt_ns=1)
+    path.write_bytes(b"#\x00\x01\n" + rows.encode())
+    with pytest.raises(CpunetError, match="of no known format"):
+        open_pulses(path, dt_ns=1)

@@ -7,11 +7,18 @@ import numpy.typing as npt
 import pytest
 from scipy.constants import elementary_charge, epsilon_0
 
+from cpunet.errors import CpunetError
 from cpunet.simulation.depletion import depletion_voltage
 from cpunet.simulation.fields import electric_field
-from cpunet.simulation.geometry import Detector, RegionArray
+from cpunet.simulation.geometry import GERMANIUM, Detector, RegionArray
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.grid import make_grid
-from cpunet.simulation.poisson import EPSILON_GERMANIUM, solve_potentials
+from cpunet.simulation.poisson import (
+    EPSILON_GERMANIUM,
+    VOLT_PER_MM2,
+    solve_potentials,
+    surface_charges,
+)
 
 # no multiples of the grid, so that contacts lie between nodes
 INNER, OUTER = 2.04, 8.53
@@ -124,6 +131,37 @@ def test_surface_charge_bends_the_potential_down() -> None:
     without, with_it = (potentials.impurities + potentials.surface for potentials in found)
     assert (with_it <= without + 1e-9).all()
     assert with_it[25, 0] < without[25, 0] - 1
+
+
+SQUARE_MM = 10 * VOLT_PER_MM2 / (2 * np.pi)  # of the unit 1e10 / cm2, per rad
+
+
+def test_the_opening_of_the_ditch_carries_no_surface_charge() -> None:
+    more = ["grid_mm=0.25", "surface_charge_1e10_per_cm2=1"]
+    siggen, bege = read_detector("icpc", more), read_detector("bege", more)
+    grid = make_grid(siggen)
+    charge = surface_charges(siggen, grid)
+    # germanium nodes on z = 0 lie between 2.5 and 10.75 mm
+    assert not charge[:, 1:].any()
+    assert not charge[grid.region[:, 0] != GERMANIUM].any()
+    assert charge.sum() == pytest.approx(SQUARE_MM * np.pi * (10.875**2 - 2.375**2))
+    with pytest.raises(CpunetError, match=r"no germanium on z = 0 .* siggen_conventions=false"):
+        surface_charges(bege, make_grid(bege))
+
+
+def test_the_walls_of_an_exact_ditch_are_passivated_as_well() -> None:
+    more = ["grid_mm=0.25", "surface_charge_1e10_per_cm2=1", "siggen_conventions=false"]
+    for name, inner, outer, depth in (("icpc", 11, 14, 2), ("bege", 7.5, 10.5, 2)):
+        detector = read_detector(name, more)
+        charge = surface_charges(detector, grid := make_grid(detector))
+        r, z = grid.r_mm[:, np.newaxis], grid.z_mm
+        in_vacuum = (r > inner + 0.01) & (r < outer - 0.01) & (z < depth - 0.01)
+        assert not charge[in_vacuum].any()
+        of_ditch = np.pi * (outer**2 - inner**2 + 2 * depth * (inner + outer))
+        walls = (r > inner - 0.01) & (r < outer + 0.01) & (z > 0) & (z < depth + 0.01)
+        # the lower half step of the walls lies on the nodes of z = 0
+        of_ditch -= 2 * np.pi * 0.125 * (inner + outer)
+        assert charge[walls].sum() == pytest.approx(SQUARE_MM * of_ditch)
 
 
 @pytest.mark.parametrize("grid_mm", [0.1, 0.2])

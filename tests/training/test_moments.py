@@ -48,7 +48,7 @@ def as_records(windows: FloatArray) -> FloatArray:
 def functions_of(
     moments: Moments, records: FloatArray, clip: float | None = None
 ) -> np.ndarray:
-    readings = moments.read(records.copy(), LAST, cut=clip is None)
+    readings, _ = moments.read(records.copy(), LAST)
     return moments.functions(readings, clip)
 
 

@@ -412,6 +412,36 @@ def test_threads_do_not_change_a_bit(asked: ResponseProblem, monkeypatch) -> Non
     np.testing.assert_array_equal(asked.pulls(vector), alone)
 
 
+@pytest.mark.parametrize(("beyond", "share"), [(0.19, 0.81), (0.21, 1.0)])
+def test_blocks_do_not_decide_which_tails_are_excluded(
+    asked: ResponseProblem, beyond: float, share: float
+) -> None:
+    sim, slopes = asked.bands[0].sim, list[float]()
+    sim.sums(
+        asked.response,
+        lambda r: (slopes.extend(r.linear[:, -1]), (np.zeros(1),))[1],
+        cut=False,
+        draws=1,
+    )
+    moments = sim.moments
+    low = np.quantile(slopes, beyond) * moments.spreads[-1] + moments.centres[-1]
+    moments = dataclasses.replace(moments, slope_range=(low, np.inf))
+    some = dataclasses.replace(sim, moments=moments)
+
+    def of(readings: Readings) -> tuple[np.ndarray]:
+        return (readings.weights @ readings.linear,)
+
+    found = [
+        some.sums_of_blocks(asked.response, of, size=size, draws=1) for size in (7, 64, 512)
+    ]
+    totals = [sum(total for (total,), _ in blocks) for blocks in found]
+    used = [sum(n for _, n in blocks) for blocks in found]
+    assert used == [used[0]] * 3
+    assert used[0] / len(sim) == pytest.approx(share, abs=0.005)
+    for total in totals[1:]:
+        np.testing.assert_allclose(total, totals[0], rtol=1e-4, atol=1e-4 * used[0])
+
+
 def test_records_are_those_of_the_response(asked: ResponseProblem) -> None:
     """What is read of translated pulses, against the layer and the alignment in torch."""
     band, response = asked.bands[0], asked.response

@@ -72,64 +72,31 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
     return aligned
 
 
-def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) -> PairedScores:
-    r"""Root-mean-square difference of translated pulses from their true shapes.
-
-    .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{p, k} (x_{pk} - y_{pk})^2}
-
-    over pulses :math:`p` and samples :math:`k`, after alignment of both at half maximum:
-    once over all samples that both records of a pair have, and once over the
-    ``2 * edge_samples + 1`` samples around the crossing.
+def pair_squares(
+    methods: Mapping[str, FloatArray], truth: FloatArray, edge_samples: int
+) -> dict[str, Values]:
+    """Squared differences from the true shapes, pulse by pulse, aligned at half maximum.
 
     Parameters
     ----------
-    translated, truth
-        Pulses of shape ``(n, length)``; each row is the same event in both.
+    methods
+        Translated pulses by method, shape ``(n, length)``.
+    truth
+        True shapes of the same events.
     edge_samples
         Half-width of the edge window in samples.
 
     Returns
     -------
     dict
-        ``rmse`` and ``edge_rmse`` in units of the full charge (NaN if no pair is left), and
-        ``unaligned``, the number of pairs left out because one of the two does not cross
-        half of its maximum.
+        Arrays of shape ``(n, 4)`` by method: sum of squares and number of samples, over all
+        samples that both records of a pair have, and over the ``2 * edge_samples + 1`` samples
+        around the crossing; all 0 where a pulse cannot be aligned.
 
     Raises
     ------
     CpunetError
         If the numbers of pulses differ, or the arrays do not have the shape of pulses.
-
-    Examples
-    --------
-    A time shift is no difference of shape:
-
-    >>> import numpy as np
-    >>> time = np.arange(100)
-    >>> early, late = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40, 50)])
-    >>> round(paired_scores(late[None], early[None], edge_samples=10)["rmse"], 6)
-    0.0
-    """
-    return scores_of_squares(pair_squares({"": translated}, truth, edge_samples)[""])
-
-
-def pair_squares(
-    methods: Mapping[str, FloatArray], truth: FloatArray, edge_samples: int
-) -> dict[str, Values]:
-    """Squared differences from the truth, pulse by pulse: the summands of `paired_scores`.
-
-    Parameters
-    ----------
-    methods
-        Translated pulses by method, see `paired_scores`.
-    truth, edge_samples
-        See `paired_scores`.
-
-    Returns
-    -------
-    dict
-        Arrays of shape ``(n, 4)`` by method: sum of squares and number of samples, over the
-        whole record and over the edge window; all 0 where a pulse cannot be aligned.
     """
     _check_shape(truth)
     for translated in methods.values():
@@ -156,7 +123,30 @@ def pair_squares(
 
 
 def scores_of_squares(squares: Values) -> PairedScores:
-    """The result of `paired_scores` from that of `pair_squares`."""
+    r"""Root-mean-square differences from the truth, from the result of `pair_squares`.
+
+    .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{p, k} (x_{pk} - y_{pk})^2}
+
+    over pulses :math:`p` and samples :math:`k`.
+
+    Returns
+    -------
+    dict
+        ``rmse`` and ``edge_rmse`` in units of the full charge (NaN if no pair is left), and
+        ``unaligned``, the number of pairs left out because one of the two does not cross
+        half of its maximum.
+
+    Examples
+    --------
+    A time shift is no difference of shape:
+
+    >>> import numpy as np
+    >>> time = np.arange(100)
+    >>> early, late = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40, 50)])
+    >>> squares = pair_squares({"ren": late[None]}, early[None], edge_samples=10)
+    >>> round(scores_of_squares(squares["ren"])["rmse"], 6)
+    0.0
+    """
     total = squares.sum(axis=0)
     return {
         "rmse": _root_mean(total[:2]),

@@ -25,6 +25,7 @@ Values = npt.NDArray[np.float64]
 
 BIN_KEV = 2.0  # or more, if there would be too many bins
 MAX_BINS = 2000
+HIGHEST = 0.999  # quantile; an axis that would be too long ends a little above it
 BEFORE, AFTER = 100, 150  # samples around the crossing that define the nearest pulse
 LINEAR = 1.0  # percent of full charge, up to which the scale of differences is linear
 ZOOM_NS = (-600.0, 800.0)
@@ -53,7 +54,7 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
     everything = np.concatenate([np.empty(0), *finite.values()])
     if not everything.size:
         raise CpunetError("no pulse has an energy to draw; give a calibration")
-    low, high = everything.min(), everything.max()
+    low, high = _drawn_range(everything)
     width = max(BIN_KEV, (high - low) / MAX_BINS)
     edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
     palette = colours(finite)
@@ -77,6 +78,19 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
     _mark_peaks(axes, peaks, (float(edges[0]), float(edges[-1])))
     figure.legend(loc="outside upper left", ncols=len(finite))
     return figure
+
+
+def _drawn_range(energy_kev: Values) -> tuple[float, float]:
+    """Ends of the axis: those of the energies, unless a few outliers would widen all bins."""
+    ends = float(energy_kev.min()), float(energy_kev.max())
+    if ends[1] - ends[0] <= MAX_BINS * BIN_KEV:
+        return ends
+    low = float(np.quantile(energy_kev, 1 - HIGHEST, method="higher"))
+    high = float(np.quantile(energy_kev, HIGHEST, method="lower"))
+    if high <= low:
+        return ends
+    margin = 0.05 * (high - low)
+    return max(ends[0], low - margin), min(ends[1], high + margin)
 
 
 def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:

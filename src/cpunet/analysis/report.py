@@ -103,7 +103,7 @@ def write_report(
     metrics
         ``peaks``: by peak, ``n_sim``, ``n_data``, ``not_prepared`` (counts by method),
         ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by
-        method) and, if the truth is known, ``paired`` (result of `paired.paired_scores` by
+        method) and, if the truth is known, ``paired`` (result of `paired.scores_of_squares` by
         method); or ``missing`` with the reason why the peak is not scored.
         ``verdicts``: ``summary``, a list of sentences, and ``table``, see
         `verdicts.verdict_table`.  ``ae_survival``, ``ae_details``,

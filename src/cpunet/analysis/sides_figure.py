@@ -24,6 +24,7 @@ def sides_figure(
     waveforms: Mapping[str, Values],
     parameters: Mapping[str, Mapping[str, Values]],
     dt_ns: float,
+    counts: Mapping[str, int],
 ) -> Figure:
     """Pulses aligned at half maximum with their edges (top), histograms (bottom).
 
@@ -36,6 +37,8 @@ def sides_figure(
         Values of two quantities by axis label and side.
     dt_ns
         Sampling period in ns.
+    counts
+        Number of pulses that each side has in all.
     """
     figure = Figure(figsize=(9.0, 6.0))
     (whole, edge), below = figure.subplots(2, 2)
@@ -51,7 +54,7 @@ def sides_figure(
             lines = axes.plot(
                 scale * time_ns, aligned.T, color=colour, linewidth=0.7, alpha=0.8
             )
-            lines[0].set_label(f"{label(side)}, {shown} of {len(pulses)}")
+            lines[0].set_label(f"{label(side)}, {shown} of {counts[side]}")
     whole.set_title("Pulses, aligned at half of their maximum")
     edge.set_title("Their edges")
     edge.set_xlim(*EDGE_NS)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,10 @@ class Direction:
         shown = [(n, c) for n, c in parts if abs(c) >= SHOWN]
         text = " ".join(f"{'+' if c > 0 else '−'} {abs(c):.2f} {n}" for n, c in shown)
         return text.removeprefix("+ ")
+
+    def describe(self) -> dict[str, Any]:
+        """Serialise to a mapping."""
+        return {"components": self.components, "error": self.error, "words": self.words}
 
 
 @dataclass(frozen=True, eq=False)

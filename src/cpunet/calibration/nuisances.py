@@ -279,3 +279,23 @@ def priors(physics: Physics, given: Mapping[str, tuple[float, float]]) -> list[P
         width = error / nuisance.slope(nominal, value)
         found.append(Prior(nuisance.coordinate(nominal, value), width))
     return found
+
+
+def known_before(
+    physics: Physics, given: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Value and error of each free nuisance before any data, in its own unit, by name.
+
+    Examples
+    --------
+    >>> physics = Physics(Detector.model_construct(temperature_K=90.0),
+    ...     SimulationSettings(cloud_fwhm_mm=0.1), (named("cloud"), named("temperature")))
+    >>> known_before(physics, {"cloud_fwhm_mm": (0.5, 0.05)})
+    {'cloud_fwhm_mm': (0.5, 0.05), 'temperature_K': (90.0, 3.0)}
+    """
+    found = {}
+    for nuisance, prior in zip(physics.nuisances, priors(physics, given), strict=True):
+        nominal = physics.nominal(nuisance)
+        value = nuisance.value(nominal, prior.centre)
+        found[nuisance.name] = value, nuisance.slope(nominal, value) * prior.width
+    return found

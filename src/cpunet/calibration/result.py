@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.calibration.identifiability import Direction
 from cpunet.calibration.joint_problem import JointProblem
-from cpunet.calibration.nuisances import Nuisance, Values, priors
+from cpunet.calibration.nuisances import Nuisance, Values, known_before
 from cpunet.calibration.other_chains import BEYOND_CHANCE
 from cpunet.calibration.search import Calibrated
 
@@ -58,7 +57,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
             "by_chance": {"mean": mean, "standard_deviation": spread},
             "errors_scaled_by": calibrated.scale,
         },
-        "directions": [_direction(direction) for direction in calibrated.directions],
+        "directions": [direction.describe() for direction in calibrated.directions],
         "covariance": {
             "names": list(problem.parameters.names),
             "values": vector.tolist(),
@@ -128,15 +127,13 @@ def _parameters(calibrated: Calibrated) -> dict[str, Any]:
     problem = calibrated.problem
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
     values = physics.values(parameters.coordinates)
-    known = dict(
-        zip((n.name for n in physics.nuisances), priors(physics, parameters.given), strict=True)
-    )
+    before = known_before(physics, parameters.given)
     free = {}
     for i, error in zip(parameters.free, calibrated.errors, strict=True):
         nuisance = physics.nuisances[i]
         nominal, value = physics.nominal(nuisance), values[nuisance.name]
-        slope, prior = nuisance.slope(nominal, value), known[nuisance.name]
-        centre = nuisance.value(nominal, prior.centre)
+        slope = nuisance.slope(nominal, value)
+        centre, width = before[nuisance.name]
         free[nuisance.name] = {
             "value": value,
             "error": float(slope * error),
@@ -144,19 +141,11 @@ def _parameters(calibrated: Calibrated) -> dict[str, Any]:
             "simulated": nominal,
             "prior": {
                 "value": centre,
-                "error": nuisance.slope(nominal, centre) * prior.width,
+                "error": width,
                 "source": "given" if nuisance.name in parameters.given else nuisance.source,
             },
         }
     return free
-
-
-def _direction(direction: Direction) -> dict[str, Any]:
-    return {
-        "components": direction.components,
-        "error": direction.error,
-        "words": direction.words,
-    }
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, Any]:

@@ -19,16 +19,14 @@ from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
-from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.validation.compare import read_metrics
 from cpunet.jobs.validation.drawings import Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.figure_store import STORE, read_drawings
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
-from cpunet.regular_files import read_text
-from cpunet.yaml_files import MAX_BYTES, plain_json
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
 _HISTOGRAMS = "histograms"
@@ -67,16 +65,8 @@ class Report:
         CpunetError
             If the folder is not a report, or cannot be read.
         """
-        file = Path(folder) / METRICS
-        try:
-            metrics = plain_json(read_text(file, MAX_BYTES))
-        except (OSError, ValueError) as error:
-            raise CpunetError(
-                f"{file}: cannot be read ({error}); give the folder of a report, or make one "
-                "with cpunet.validate"
-            ) from error
-        if not (isinstance(metrics, dict) and isinstance(metrics.get("peaks"), dict)):
-            raise CpunetError(f"{file}: holds no scores; make the report again")
+        remedy = "give the folder of a report, or make one with cpunet.validate"
+        metrics = read_metrics(Path(folder) / METRICS, remedy)
         drawn, _ = read_drawings(Path(folder) / STORE)
         values: dict[str, ByMethod] = {}
         for one in drawn.values():

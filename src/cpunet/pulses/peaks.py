@@ -80,7 +80,7 @@ class EnergySelection:
         """Its lines and ranges, each as a selection of its own."""
         lines = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
         return lines + [
-            EnergySelection(f"{low:g}-{high:g}", self.peaks, (), ((low, high),))
+            EnergySelection(_range_name(low, high), self.peaks, (), ((low, high),))
             for low, high in self.ranges_kev
         ]
 
@@ -142,4 +142,11 @@ def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelecti
                 f"energies {text!r}: the range {part!r} is empty; give the lower end first"
             )
         ranges.append((low, high))
-    return EnergySelection(text, peaks, tuple(chosen), tuple(ranges))
+    # what is given twice counts once
+    lines_once, ranges_once = tuple(dict.fromkeys(chosen)), tuple(dict.fromkeys(ranges))
+    return EnergySelection(text, peaks, lines_once, ranges_once)
+
+
+def _range_name(low: float, high: float) -> str:
+    """A range in keV as the user writes it; an open one has no upper end."""
+    return f"{low:.12g}-" if high == np.inf else f"{low:.12g}-{high:.12g}"

@@ -17,7 +17,7 @@ from cpunet.simulation.grid import Grid
 from cpunet.simulation.poisson import Potentials
 
 # part of the file name, so that results of an older solver are not used
-SOLVER_VERSION = 2
+SOLVER_VERSION = 3
 
 _OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
 _OF_NODES = ("point_contact", "bias", "impurities", "tilt", "surface")

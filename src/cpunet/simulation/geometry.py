@@ -57,6 +57,8 @@ class Detector(Config):
     ``siggen_conventions`` places the lithium boundary on tapers, the walls of the ditch (half
     a grid step wider) and the charge in the ditch as fieldgen does, so that pulses agree with
     siggen's. Without it the geometry is exact. docs/simulation.md gives the difference.
+    The surface charge lies on the germanium of z = 0; without the conventions also on the walls
+    and the floor of the ditch.
     """
 
     name: str = ""

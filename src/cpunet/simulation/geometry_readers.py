@@ -7,7 +7,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
@@ -17,7 +16,7 @@ from cpunet.simulation.legend_crystal import LONGEST_MM, impurity_values
 from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
-from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields, yaml_names
+from cpunet.yaml_files import MAX_BYTES, key_and_value, shown, yaml_fields, yaml_names
 
 _FOLDER = files("cpunet.simulation") / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
@@ -75,15 +74,10 @@ def read_detector(
             "file; leave out --crystal"
         )
     for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals:
+        pair = key_and_value(override, f"detector {name}")
+        if pair is None:
             raise CpunetError(f"detector {name}: {shown(override)} is no KEY=VALUE")
-        try:
-            values[key.strip()] = parsed(value)
-        except yaml.YAMLError as error:
-            raise CpunetError(
-                f"detector {name}: {shown(override)} has no plain value"
-            ) from error
+        values |= [pair]
     try:
         return Detector.model_validate({"name": Path(name).stem, **values})
     except ValidationError as error:

@@ -23,7 +23,14 @@ import scipy.sparse as sp
 from scipy.constants import elementary_charge, epsilon_0
 from scipy.sparse.linalg import splu
 
-from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector, FloatArray
+from cpunet.errors import CpunetError
+from cpunet.simulation.geometry import (
+    GERMANIUM,
+    LI_CONTACT,
+    POINT_CONTACT,
+    Detector,
+    FloatArray,
+)
 from cpunet.simulation.grid import Grid
 
 EPSILON_GERMANIUM = 16.0
@@ -45,7 +52,7 @@ class Potentials:
         Potential with 1 on the lithium and 0 on the point contact.
     impurities, tilt, surface
         Potentials in V with all electrodes at 0: of the impurities, of a unit of their tilt,
-        and of a charge on z = 0.
+        and of the charge of the passivated surface.
     capacitance_pF
         Capacitance of the point contact in pF.
     """
@@ -192,13 +199,39 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
 
 
 def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
-    """Charge of each ring on the passivated face z = 0, in the units of `charges`."""
+    """Charge of each ring on the passivated germanium, in the units of `charges`.
+
+    In fieldgen this is the germanium on z = 0; the ditch carries none. With the exact geometry
+    the walls and the floor of the ditch are passivated as well.
+
+    Raises
+    ------
+    CpunetError
+        If the ditch leaves no germanium on z = 0 and, as in fieldgen, carries no charge.
+    """
     inner, outer = _half_rings(grid)
-    charge = np.zeros(grid.region.shape)
-    face = (inner + outer) * (grid.region[:, 0] > LI_CONTACT)
+    face = np.zeros(grid.region.shape)
+    if detector.siggen_conventions:
+        face[:, 0] = (inner + outer) * (grid.region[:, 0] == GERMANIUM)
+        if not face.any():
+            raise CpunetError(
+                f"detector {detector.name}: the ditch leaves no germanium on z = 0 for "
+                "surface_charge_1e10_per_cm2; give siggen_conventions=false, which also "
+                "charges the walls of the ditch"
+            )
+    else:
+        germanium = _germanium_in_cells(detector, grid)
+        face[1:, 0] += germanium[:, 0] * inner[1:]
+        face[:-1, 0] += germanium[:, 0] * outer[:-1]
+        floor = np.abs(np.diff(germanium, axis=1))
+        face[1:, 1:-1] += floor * inner[1:, np.newaxis]
+        face[:-1, 1:-1] += floor * outer[:-1, np.newaxis]
+        half_wall = np.abs(np.diff(germanium, axis=0)) * grid.step_mm / 2
+        half_wall *= grid.r_mm[1:-1, np.newaxis]
+        face[1:-1, 1:] += half_wall
+        face[1:-1, :-1] += half_wall
     # 1e10 / cm2 over 1 mm is 10 times 1e10 / cm3
-    charge[:, 0] = 10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face
-    return charge
+    return np.asarray(10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face)
 
 
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:

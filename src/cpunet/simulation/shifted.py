@@ -15,7 +15,7 @@ from cpunet.recipes.base import Config
 from cpunet.regular_files import read_text
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields
+from cpunet.yaml_files import MAX_BYTES, key_and_value, shown, yaml_fields
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -91,14 +91,8 @@ hole_velocity_low_factor, hole_velocity_high_factor
         """
         values: dict[str, Any] = {}
         for part in parts:
-            key, equals, value = part.partition("=")
-            if not equals:
-                values |= _file_values(Path(part))
-                continue
-            try:
-                values[key.strip()] = parsed(value)
-            except yaml.YAMLError as error:
-                raise CpunetError(f"shift: {shown(part)} has no plain value") from error
+            pair = key_and_value(part, "shift")
+            values |= _file_values(Path(part)) if pair is None else [pair]
         try:
             return cls.model_validate(values)
         except ValidationError as error:

@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.file_locks import locked
-from cpunet.files import written_aside
+from cpunet.files import not_written, written_aside
 from cpunet.outputs import (
     MARKER,
     FolderKind,
@@ -135,8 +135,7 @@ def working_folder(
             yield out
     except OSError as error:
         raise CpunetError(
-            f"{out}: cannot be written ({error.strerror or error}); what is finished is kept, "
-            "continue with --resume"
+            f"{not_written(error, out)}; what is finished is kept, continue with --resume"
         ) from error
 
 

@@ -31,13 +31,17 @@ class Kept:
     rms
         RMS of what it adds around the half maximum, in pulse heights; 0 if unused.
     held_out_before, held_out_after
-        Chi-square per function of the held-out sets without and with it.
+        Chi-square per function of the held-out sets without and with it; None if there were
+        too few pulses for a test.
     """
 
     kept: bool
     rms: float
-    held_out_before: float
-    held_out_after: float
+    held_out_before: float | None
+    held_out_after: float | None
+
+
+NOT_TESTED = Kept(kept=False, rms=0.0, held_out_before=None, held_out_after=None)
 
 
 @dataclass(frozen=True, eq=False)

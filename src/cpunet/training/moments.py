@@ -36,11 +36,12 @@ EDGE = 60  # samples on either side of the half maximum that contain the steepes
 EARLY, WRONG, LATE = 30, 20.0, 2.0
 MIN_SHARE = 0.2  # of the median amplitude; below it, there is no single pulse
 QUIET = 0.05  # of the height; above it before the pulse, there is another pulse
-# Maximum fraction of translated pulses to remove by the data's range of tail slopes.  If it is
-# larger, none are removed: the response is still far off.
-MAX_CUT = 0.2
 # Maximum number of measured pulses that define the functions, and pulses read at a time.
 DRAWN, BLOCK = 8192, 512
+
+
+class TooFewPulsesError(CpunetError):
+    """There are too few measured pulses to define the functions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ class Moments:
 
         Raises
         ------
-        CpunetError
+        TooFewPulsesError
             If there are too few pulses.
         """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
@@ -126,7 +127,7 @@ class Moments:
         if usable.any():
             usable &= log_amplitude > _least(log_amplitude[usable])
         if usable.sum() < MIN_N:
-            raise CpunetError(
+            raise TooFewPulsesError(
                 f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
                 "needed: select more energies (--peak) or give more files"
             )
@@ -168,10 +169,8 @@ class Moments:
         self,
         records: FloatArray,
         last: int,
-        *,
-        cut: bool = True,
         weights: Values | None = None,
-    ) -> Readings:
+    ) -> tuple[Readings, npt.NDArray[np.bool_]]:
         """Read records with noise.
 
         Parameters
@@ -180,16 +179,14 @@ class Moments:
             Shape (pulses, samples), of about the height of prepared pulses; changed in place.
         last
             Sample after all half maxima.
-        cut
-            Whether to exclude pulses with tail slopes outside the range of the data, unless
-            there are too many of them (`MAX_CUT`).
         weights
             Weights of the pulses; 1 by default.
 
         Returns
         -------
-        Readings
-            Readings of the pulses that are used.
+        tuple
+            Readings of the pulses that can be aligned, and whether the tail slope of each is
+            outside the range of the data.
         """
         window = _window(self.config, self.preparation, self.level, last)
         aligned, slopes, log_amplitude = _aligned(records, window)
@@ -197,12 +194,10 @@ class Moments:
         linear = (linear - self.centres) / self.spreads
         beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
         counts = np.isfinite(linear).all(axis=1) & np.isfinite(log_amplitude)
-        if cut and beyond.mean() < MAX_CUT:
-            counts &= ~beyond
         readings = Readings(
             linear, log_amplitude, np.ones(len(linear)) if weights is None else weights
         )
-        return readings if counts.all() else readings[counts]
+        return (readings, beyond) if counts.all() else (readings[counts], beyond[counts])
 
     def functions(self, readings: Readings, clip: float | None = None) -> Values:
         """Functions of each pulse, shape (pulses, moments).

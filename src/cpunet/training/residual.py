@@ -61,8 +61,10 @@ def fit_residual(
 
     Raises
     ------
+    TooFewPulsesError
+        If too few measured pulses are left for the training.
     CpunetError
-        If there are too few pulses, or the training diverges.
+        If the training diverges.
     """
     config = recipe.residual
     rng = np.random.default_rng(seed)
@@ -78,10 +80,7 @@ def fit_residual(
         )
     )
     aim = Aim.at(data[own_data], recipe)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = EdgeResidual(config)
-    trained = _train(network, aim, records[own], noise, config, rng)
+    trained = _train(no_residual(recipe, seed), aim, records[own], noise, config, rng)
     held_out = aim.at_others(data[held_data])
     dealt = noise[torch.from_numpy(rng.permutation(len(noise))[: len(held)])]
     found = judge(trained, held_out, records[held], dealt, config.least_fall, rng)
@@ -90,6 +89,13 @@ def fit_residual(
     else:
         trained.clear()
     return trained.eval(), found
+
+
+def no_residual(recipe: Recipe, seed: int) -> EdgeResidual:
+    """A correction that is zero, with the weights from which its training starts."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return EdgeResidual(recipe.residual)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ are kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -36,6 +36,12 @@ PLATEAU = 100  # samples after the window whose mean gives the height of a recor
 # they share the traces, with other start samples and signs.
 NOISE_TRACES = 4096
 SPECTRA_BYTES = 2**27  # of pulse spectra that are cached between responses
+# Maximum fraction of translated pulses to remove by the data's range of tail slopes.  If it is
+# larger, none are removed: the response is still far off.
+MAX_CUT = 0.2
+
+# Sums over pulses, and the total weight of these.
+Total = tuple[tuple[Values, ...], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +181,7 @@ class Translated:
         *,
         cut: bool = True,
         draws: int | None = None,
-    ) -> tuple[tuple[Values, ...], float]:
+    ) -> Total:
         """Sums over all pulses and draws of noise, and the weight of the pulses used.
 
         Parameters
@@ -185,7 +191,8 @@ class Translated:
         of
             Function for the weighted sums over one block of pulses; called in several threads.
         cut
-            See `Moments.read`.
+            Whether to exclude pulses with tail slopes outside the range of the data, unless
+            there are too many of them among all (`MAX_CUT`).
         draws
             Number of draws to use; None for all.
 
@@ -194,9 +201,7 @@ class Translated:
         tuple
             The sums, and the total weight of the pulses in them.
         """
-        parts = self.sums_of_blocks(response, of, cut=cut, draws=draws)
-        sums = zip(*(found for found, _ in parts), strict=True)
-        return tuple(np.sum(np.stack(one), axis=0) for one in sums), sum(n for _, n in parts)
+        return _added(self.sums_of_blocks(response, of, cut=cut, draws=draws))
 
     def sums_of_blocks(
         self,
@@ -206,7 +211,7 @@ class Translated:
         size: int = BLOCK,
         cut: bool = True,
         draws: int | None = None,
-    ) -> list[tuple[tuple[Values, ...], float]]:
+    ) -> list[Total]:
         """Same as `sums`, for each block of `size` pulses in their order."""
         transfer = self._transfer(response)
         stretch = [] if response.drift is None else response.drift.stretch.tolist()
@@ -215,22 +220,30 @@ class Translated:
             self._stretch[:] = stretch
         threads = torch.get_num_threads()
 
-        def one(first: int) -> tuple[tuple[Values, ...], float]:
-            found = [
-                (of(readings), float(readings.weights.sum()))
-                for readings in self._block(response, transfer, first, size, cut, draws)
-            ]
-            sums = zip(*(totals for totals, _ in found), strict=True)
-            return tuple(np.sum(np.stack(each), axis=0) for each in sums), sum(
-                n for _, n in found
-            )
+        def one(first: int) -> tuple[list[Total], list[Total], int]:
+            """Totals of each draw, within the data's range and beyond it, and pulses beyond."""
+            within, outside, n = [], [], 0
+            for readings, beyond in self._block(response, transfer, first, size, draws):
+                if cut and beyond.any():
+                    others, readings = readings[beyond], readings[~beyond]
+                    outside.append((of(others), float(others.weights.sum())))
+                    n += len(others)
+                within.append((of(readings), float(readings.weights.sum())))
+            return within, outside, n
 
         starts = range(0, len(self), size)
         if threads == 1 or len(starts) == 1:
-            return [one(first) for first in starts]
-        with ThreadPoolExecutor(min(threads, len(starts))) as pool:
-            # in the order of the pulses, whichever thread finishes first
-            return list(pool.map(one, starts))
+            blocks = [one(first) for first in starts]
+        else:
+            with ThreadPoolExecutor(min(threads, len(starts))) as pool:
+                # in the order of the pulses, whichever thread finishes first
+                blocks = list(pool.map(one, starts))
+        # decided for all pulses together, so that it does not depend on the blocks
+        n_read = len(self) * len(range(len(self.noise.factor))[:draws])
+        exclude = sum(n for _, _, n in blocks) < MAX_CUT * n_read
+        return [
+            _added(within if exclude else within + outside) for within, outside, _ in blocks
+        ]
 
     def _transfer(self, response: ElectronicsResponse) -> npt.NDArray[np.complex64]:
         with torch.no_grad():
@@ -243,10 +256,9 @@ class Translated:
         transfer: npt.NDArray[np.complex64],
         first: int,
         size: int,
-        cut: bool,
         draws: int | None,
-    ) -> Iterator[Readings]:
-        """Readings of one block of pulses, draw by draw."""
+    ) -> Iterator[tuple[Readings, npt.NDArray[np.bool_]]]:
+        """Result of `Moments.read` for one block of pulses, draw by draw."""
         preparation = self.moments.preparation
         spectrum = self._spectrum(response, first, size) * transfer
         padded = padded_length(self.length)
@@ -259,7 +271,7 @@ class Translated:
         for draw in range(len(self.noise.factor))[:draws]:
             noisy = self.noise.add(records, draw, first)
             weights = self.weights[first : first + size]
-            yield self.moments.read(noisy, last, cut=cut, weights=weights)
+            yield self.moments.read(noisy, last, weights)
 
     def _spectrum(
         self, response: ElectronicsResponse, first: int, size: int
@@ -282,3 +294,9 @@ class Translated:
         if (first + len(sim)) * spectrum[0].nbytes <= SPECTRA_BYTES:
             self._spectra[first, len(sim)] = spectrum
         return spectrum
+
+
+def _added(parts: Sequence[Total]) -> Total:
+    """Sum of totals, in their order."""
+    sums = zip(*(found for found, _ in parts), strict=True)
+    return tuple(np.sum(np.stack(one), axis=0) for one in sums), sum(n for _, n in parts)

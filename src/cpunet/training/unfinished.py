@@ -23,7 +23,7 @@ from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.file_locks import locked
-from cpunet.files import folder_written_aside
+from cpunet.files import folder_written_aside, not_written
 from cpunet.outputs import (
     FolderKind,
     Given,
@@ -119,8 +119,7 @@ def unfinished_folder(
                     told_kept(folder, remove_own(folder, UNFINISHED), note)
     except OSError as error:
         raise CpunetError(
-            f"{folder}: cannot be written ({error.strerror or error}); what is stored is kept, "
-            "continue with --resume"
+            f"{not_written(error, folder)}; what is stored is kept, continue with --resume"
         ) from error
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +19,7 @@ from cpunet.analysis.calibration_figures import directions_figure
 from cpunet.analysis.calibration_page import calibration_page
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics
+from cpunet.calibration.nuisances import Physics, known_before
 from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
 from cpunet.calibration.titles import titled
@@ -210,17 +210,14 @@ class Calibration:
             information = search.plan()
         sides.forget()
         directions = {
-            str(n): [
-                {"components": d.components, "error": d.error, "words": d.words}
-                for d in information.for_pulses(n / 2).directions()
-            ]
+            str(n): [found.describe() for found in information.for_pulses(n / 2).directions()]
             for n in PLANNED
         }
         return {
             "cpunet": cpunet.__version__,
             "detector": sides.physics.detector.name,
             "pulses": list(PLANNED),
-            "errors": _errors_by_pulses(information, search.simulator.physics),
+            "errors": _errors_by_pulses(information, search.simulator.physics, search.given),
             "directions": directions,
         }
 
@@ -304,15 +301,20 @@ def _write_physics(folder: Path, detector: Detector, settings: SimulationSetting
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def _errors_by_pulses(information: Information, physics: Physics) -> dict[str, Any]:
+def _errors_by_pulses(
+    information: Information, physics: Physics, given: Mapping[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """Simulated value, prior error and expected errors of each parameter, by name."""
     found: dict[str, Any] = {}
+    before = known_before(physics, given)
     of_pulses = {n: information.for_pulses(n / 2) for n in PLANNED}
     for i, nuisance in enumerate(information.nuisances):
         nominal = physics.nominal(nuisance)
-        slope = nuisance.slope(nominal, nominal)
+        value, error = before[nuisance.name]
+        slope = nuisance.slope(nominal, value)
         found[nuisance.name] = {
             "simulated": nominal,
-            "prior": float(slope * information.widths[i]),
+            "prior": error,
             "alone": {str(n): float(slope * f.errors([i])[0]) for n, f in of_pulses.items()},
             "all_free": {str(n): float(slope * f.errors()[i]) for n, f in of_pulses.items()},
         }

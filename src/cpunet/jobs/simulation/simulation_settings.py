@@ -6,13 +6,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.regular_files import read_text
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_fields
+from cpunet.yaml_files import MAX_BYTES, key_and_value, yaml_fields
 
 
 def load_settings(
@@ -67,14 +66,12 @@ def split_overrides(overrides: Iterable[str]) -> tuple[list[str], dict[str, Any]
     detector: list[str] = []
     settings: dict[str, Any] = {}
     for word in overrides:
-        key, equals, value = word.partition("=")
-        if not equals or key.strip() not in SimulationSettings.model_fields:
+        of_settings = word.partition("=")[0].strip() in SimulationSettings.model_fields
+        pair = key_and_value(word, "settings") if of_settings else None
+        if pair is None:
             detector.append(word)
-            continue
-        try:
-            settings[key.strip()] = parsed(value)
-        except yaml.YAMLError as error:
-            raise CpunetError(f"settings: {shown(word)} has no plain value") from error
+        else:
+            settings |= [pair]
     return detector, settings
 
 

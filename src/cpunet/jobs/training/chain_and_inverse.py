@@ -22,9 +22,11 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.held_out import NOT_TESTED
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.levenberg_marquardt import Listener
-from cpunet.training.residual import fit_residual
+from cpunet.training.moments import TooFewPulsesError
+from cpunet.training.residual import fit_residual, no_residual
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run_folder import load_network, read_recipe
@@ -141,11 +143,17 @@ def match(
     ren, parts = chain, {}
     windows, energy_kev = sides.sim.waveforms, sides.sim.energy_kev
     if isinstance(recipe.generator, HybridConfig):
-        residual, kept = fit_residual(
-            chain, windows, sides.data.waveforms, energy_kev, recipe, seed=seed
-        )
-        if not kept.kept:
-            monitor.note("the residual does not help held-out pulses and is left out")
+        try:
+            residual, kept = fit_residual(
+                chain, windows, sides.data.waveforms, energy_kev, recipe, seed=seed
+            )
+        except TooFewPulsesError as error:
+            residual, kept = no_residual(recipe, seed).eval(), NOT_TESTED
+            share = f"{100 * recipe.residual.held_out:.0f} %"
+            monitor.note(f"the residual is left out: without the {share} for its test, {error}")
+        else:
+            if not kept.kept:
+                monitor.note("the residual does not help held-out pulses and is left out")
         # stored beside the chain, which stays in its usual place for readers of chains
         ren, parts = HybridGenerator(chain, residual), {"residual": residual}
         told["residual"] = asdict(kept)

@@ -158,6 +158,7 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
             "Current amplitude [1/sample]": {n: _amplitudes(one) for n, one in sides.items()},
         },
         checked.sides["data"].dt_ns,
+        {name: len(one.prepared) for name, one in sides.items()},
     )
     with written_aside(picture) as aside:
         figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=DPI)

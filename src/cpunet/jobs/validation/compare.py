@@ -62,8 +62,8 @@ def compare_reports(
     return table
 
 
-def read_metrics(file: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``.
+def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str, Any]:
+    """Read a ``metrics.json``; `remedy` says what to do if that fails.
 
     Raises
     ------
@@ -74,9 +74,7 @@ def read_metrics(file: Path) -> dict[str, Any]:
         content = plain_json(read_text(file, MAX_BYTES))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise CpunetError(
-            f"{file}: cannot be read ({reason}); validate the run again"
-        ) from error
+        raise CpunetError(f"{file}: cannot be read ({reason}); {remedy}") from error
     if not isinstance(content, dict) or not isinstance(content.get("peaks"), dict):
         raise CpunetError(f"{file}: holds no scores by peak; give a report of cpunet validate")
     return content

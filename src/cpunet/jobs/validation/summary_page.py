@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -25,6 +25,7 @@ def summarise_reports(
     out: Path,
     *,
     names: Sequence[tuple[str, str]] | None = None,
+    failed: Collection[Path] = (),
     missing_ok: bool = False,
     force: bool = False,
 ) -> list[Entry]:
@@ -40,6 +41,8 @@ def summarise_reports(
         Page to write, with links to the reports.
     names
         Detector and period of each report, if known otherwise.
+    failed
+        Reports to list as missing: what is in their folders is of an earlier validation.
     missing_ok
         Whether to list missing or unfinished reports instead of raising.
     force
@@ -59,7 +62,10 @@ def summarise_reports(
     if out.is_dir():
         raise CpunetError(f"{out}: is a folder; give the name of a page, as index.html")
     refuse_existing(out, *reports, force=force)
-    found = [_metrics(report, missing_ok=missing_ok) for report in reports]
+    found = [
+        None if report in failed else _metrics(report, missing_ok=missing_ok)
+        for report in reports
+    ]
     whose = names or _recorded(found) or [detector_and_period(report) for report in reports]
     known: dict[tuple[str, str], Path] = {}
     entries = []
@@ -71,7 +77,8 @@ def summarise_reports(
             )
         known[one] = report
         target = report / PAGE
-        link = quote(os.path.relpath(target, out.parent)) if target.is_file() else None
+        linked = report not in failed and target.is_file()
+        link = quote(os.path.relpath(target, out.parent)) if linked else None
         entries.append(Entry(*one, metrics, link))
     if all(entry.metrics is None for entry in entries):
         raise CpunetError(f"{out}: none of the {len(entries)} reports is there yet")

@@ -61,5 +61,9 @@ def validate_channels(
         folders = [out / name for name in channels]
         period = period_of(data.path) or data.path.stem
         names = [(name, period) for name in channels]
-        summarise_reports(folders, out / INDEX, names=names, missing_ok=True, force=True)
+        # without force, a channel with a report fails and keeps it
+        failed = [out / name for name in outcome.failed if force]
+        summarise_reports(
+            folders, out / INDEX, names=names, failed=failed, missing_ok=True, force=True
+        )
     return outcome

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from typing import Literal
@@ -36,6 +37,8 @@ _HEAD_BYTES = 520
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PICKLE, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
 _TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
+# signs of any encoding, but no control characters
+_COMMENT = re.compile(rb"#[^\x00-\x1f\x7f]*")
 
 
 def recognise(path: Path) -> Format:
@@ -98,6 +101,6 @@ def _by_content(head: bytes, path: Path) -> Format | None:
         return "spe"
     if head[0] == _PICKLE and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
         return "pickle"
-    if set(head) <= _TEXT_BYTES:
+    if set(_COMMENT.sub(b"", head)) <= _TEXT_BYTES:
         return "text"
     return None
