@@ -325,6 +325,15 @@ def test_files_to_write_are_not_each_other_and_not_in_vain(tmp_path, reference_d
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("file", "words"), [("stand.json", "a virtual test stand"), ("report.html", "a report")]
+)
+def test_other_folders_are_named(tmp_path, file, words):
+    (tmp_path / file).write_text("")
+    with pytest.raises(CpunetError, match=f"{words}, .* a folder without run.json"):
+        describe(tmp_path)
+
+
 def test_a_page_of_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
     told = describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "page.html")

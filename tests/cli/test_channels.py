@@ -64,6 +64,12 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert translated.out.startswith("ch1  ")
     assert len(lh5.read("geds/iren/energy", out / "ch2.lh5")) == len(stand.data_kev)
 
+    # one simulation serves all channels
+    made = tmp_path / "made"
+    one = command("translate", tmp_path / "runs", stand.sim, "--table", "all", "--out", made)
+    assert one.code == 0, one.err
+    assert sorted(file.name for file in made.glob("*.lh5")) == ["ch1.lh5", "ch2.lh5"]
+
     # every option reaches the channels
     refused = command(
         "translate",

@@ -38,6 +38,11 @@ from cpunet.simulation.hit_readers import holds_hits
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
 _RUN_FILE = "run.json"
+# what other folders are, by a file that they hold
+_NO_RUNS = {
+    "stand.json": "a virtual test stand, whose sim.lh5 and data.lh5 can be given; ",
+    "report.html": "a report, to be opened in a browser (report.html); ",
+}
 LOOKED_AT, REMAINS_BLOCK = 256, 4096  # traces read at a time
 
 
@@ -314,8 +319,9 @@ def _range(values: list[float]) -> list[float]:
 def _run(folder: Path) -> dict[str, Any]:
     file = folder / _RUN_FILE
     if not file.is_file():
+        hint = next((hint for name, hint in _NO_RUNS.items() if (folder / name).is_file()), "")
         raise CpunetError(
-            f"{folder}: a folder without {_RUN_FILE}; give the folder of a run, or a file"
+            f"{folder}: {hint}a folder without {_RUN_FILE}; give the folder of a run, or a file"
         )
     try:
         content = plain_json(read_text(file, MAX_BYTES))

@@ -114,7 +114,7 @@ def train_ensemble(
         jobs, threads = shared_cores(jobs, threads, len(left), device)
         _remove_leavings(folder)
         outcomes = work_off(member, left, jobs=jobs, threads=threads, monitor=monitor)
-        title = f"Training {len(left)} seeds in {jobs} processes"
+        title = f"Training {len(left)} seeds, {jobs} at a time"
         with _stage(monitor, title, len(left), recipe) as count, closing(outcomes):
             for outcome in outcomes:
                 count(outcome)

@@ -133,7 +133,7 @@ def tune_recipe(
         jobs, threads = shared_cores(jobs, threads, len(left), device)
         tuner = _Tuner(sim, data, folder, recipe, peak, seed, device, trials)
         outcomes = work_off(tuner, left, jobs=jobs, threads=threads, monitor=monitor)
-        title = f"Trials in {jobs} processes"
+        title = f"Trials, {jobs} at a time"
         with monitor.stage(title, len(left)) as advance, closing(outcomes):
             for outcome in outcomes:
                 if isinstance(outcome, Outcome):

@@ -163,7 +163,7 @@ class RealisticLibrary:
         return utils.HPGePulseShapeLibrary(currents, mm, mm, ns, self.r_mm, self.z_mm, times)
 
 
-def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
+def read_library(path: Path | str, detector: str | None = None) -> RealisticLibrary:
     """Read a realistic library, of whole templates or of components.
 
     Parameters
@@ -178,6 +178,7 @@ def read_library(path: Path, detector: str | None = None) -> RealisticLibrary:
     CpunetError
         If there is no such library in the file.
     """
+    path = Path(path)
     with opened(path) as file:
         require_all_stored(path, file)
         names = realistic_libraries(file)

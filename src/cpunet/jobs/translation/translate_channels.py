@@ -26,6 +26,8 @@ def translate_channels(
 ) -> Outcome[dict[str, Any]]:
     """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
+    A single table, such as a simulation that serves all channels, is translated with each run.
+
     The noise depends on the seed and the name of the channel, so that of channels differs.
 
     Parameters
@@ -58,4 +60,8 @@ def translate_channels(
         )
 
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
+    if len(channels) == 1 and not any(own_folder(runs, n, INFO).is_dir() for n in channels):
+        (single,) = channels.values()
+        trained = sorted(info.parent.name for info in runs.glob(f"*/{INFO}"))
+        channels = dict.fromkeys(trained, single) or channels
     return one_by_one(channels, out, translate, monitor.note)
