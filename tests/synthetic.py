@@ -20,6 +20,7 @@ import scipy.signal
 import torch
 from matplotlib.figure import Figure
 
+from cpunet.analysis.paired import PairedScores, pair_squares, scores_of_squares
 from cpunet.electronics.finishing import finish
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Advance, Monitor
@@ -231,3 +232,8 @@ def same_random_numbers() -> Iterator[None]:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         yield
+
+
+def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) -> PairedScores:
+    """Differences from the truth as a validation computes them."""
+    return scores_of_squares(pair_squares({"ren": translated}, truth, edge_samples)["ren"])

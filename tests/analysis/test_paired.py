@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.analysis import paired
-from cpunet.analysis.paired import align_half_maximum, pair_squares, scores_of_squares
+from cpunet.analysis.paired import align_half_maximum
 from cpunet.errors import CpunetError
+from synthetic import paired_scores
 
 TIME = np.arange(800.0)
 
@@ -18,10 +19,6 @@ TIME = np.arange(800.0)
 def edge(time: np.ndarray, sigma: float) -> np.ndarray:
     """A Gaussian edge at 0, as after bandwidth poles; exactly 0.5 at time 0."""
     return ndtr(time / sigma)
-
-
-def paired_scores(translated: np.ndarray, truth: np.ndarray, edge_samples: int):
-    return scores_of_squares(pair_squares({"ren": translated}, truth, edge_samples)["ren"])
 
 
 @pytest.mark.parametrize("sigma", [2.5, 4.0, 10.0])  # 40 ns is the fastest real readout

@@ -11,7 +11,6 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.analysis.paired import paired_scores
 from cpunet.electronics.baseline_methods.gauss_exp import GaussExp
 from cpunet.electronics.baseline_methods.raw import Raw
 from cpunet.electronics.baseline_methods.rc import RC
@@ -24,6 +23,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from synthetic import paired_scores
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, ALIGN = 16.0, CONFIG.samples_before
