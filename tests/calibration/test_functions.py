@@ -92,3 +92,9 @@ def test_a_wider_clip_widens_the_bins(functions):
     readings.linear[:, DRIFT] = 6.0
     assert values_of(functions, readings, "drift time, bin").max() < 1e-12
     assert values_of(functions, readings, "drift time, bin", clip=64.0).max() > 1e-3
+
+
+def test_a_block_without_pulses_has_no_rows(functions):
+    """Blocks are made of simulated pulses, of which all can be left out."""
+    readings, none = readings_of(5), readings_of(0)
+    assert functions(none).shape == (0, functions(readings).shape[1])

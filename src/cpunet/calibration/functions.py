@@ -115,6 +115,7 @@ def _bins(values: Values, points: tuple[Values, Values], wider: float) -> Values
 
 
 def _products(values: Values, slices: Values) -> Values:
-    return np.asarray(
-        (values[:, :, np.newaxis] * slices[:, np.newaxis, :]).reshape(len(values), -1)
-    )
+    # the number of columns is given, since a block of pulses can be empty
+    columns = values.shape[1] * slices.shape[1]
+    products = values[:, :, np.newaxis] * slices[:, np.newaxis, :]
+    return np.asarray(products.reshape(len(values), columns))

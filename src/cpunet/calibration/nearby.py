@@ -73,8 +73,9 @@ class Simulator:
 
     def coarse(self, pulses: FloatArray) -> FloatArray:
         """Average fine samples over the sampling period."""
-        whole = pulses.shape[1] // self._finer * self._finer
-        blocks = pulses[:, :whole].reshape(len(pulses), -1, self._finer)
+        samples = pulses.shape[1] // self._finer
+        whole = pulses[:, : samples * self._finer]
+        blocks = whole.reshape(len(pulses), samples, self._finer)
         return np.asarray(blocks.mean(axis=2, dtype=np.float32))
 
 

@@ -19,8 +19,8 @@ FAR = 3.0
 HOPELESS = 50.0
 # Advice where a parameter is unexpected, besides the general one.
 ADVICE = {
-    "self_repulsion": "it acts within each hit, so hits merged within more (--cluster-mm 0.2) "
-    "need less of it"
+    "self_repulsion": "it acts within each hit, so hits that are not merged within "
+    "0.2 mm (--cluster-mm), as tracks are long, need more of it"
 }
 # Minimum decrease of chi-square that is reported for a further parameter.
 WORTH_TELLING = 9.0

@@ -118,7 +118,7 @@ def calibrate(
     detector: DetectorFile = None,
     hits: HitFileName = None,
     frame: HitFrame,
-    cluster_mm: ClusterMm = 0.05,
+    cluster_mm: ClusterMm = 0.2,
     settings_file: SettingsFile = None,
     set_values: Set = None,
     crystal: options.Crystal = None,

@@ -115,7 +115,7 @@ ClusterMm = Annotated[
     float,
     typer.Option(
         callback=options.within(0, 100),
-        help="Merge hits nearer than this; 0.05 changes no sample by more than 0.001.",
+        help="Merge hits nearer than this. Charge repels within what is merged.",
         rich_help_panel=PULSES,
     ),
 ]
@@ -223,7 +223,7 @@ def simulate(
     cloud_fwhm_mm: CloudFwhm = None,
     self_repulsion: SelfRepulsion = None,
     exact: Exact = None,
-    cluster_mm: ClusterMm = 0.05,
+    cluster_mm: ClusterMm = 0.2,
     resolution: ResolutionText = None,
     seed: options.Seed = 0,
     force: options.Force = False,

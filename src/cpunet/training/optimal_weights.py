@@ -70,7 +70,8 @@ class ConditionalFunctions:
         components = values[:, first : first + self.moments.config.components]
         bins = self.density(readings.log_amplitude)
         both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
-        return np.concatenate([values, bins, both.reshape(len(values), -1)], axis=1)
+        columns = components.shape[1] * bins.shape[1]  # given: a block of pulses can be empty
+        return np.concatenate([values, bins, both.reshape(len(values), columns)], axis=1)
 
     def sum(self, readings: Readings) -> Values:
         """Weighted sum of the functions over pulses, without storing them for each pulse."""

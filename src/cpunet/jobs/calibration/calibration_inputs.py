@@ -25,6 +25,7 @@ from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import solve
@@ -114,7 +115,7 @@ class Start:
     hits: HitFile | None = None
     detector: Detector | None = None
     settings: SimulationSettings | None = None
-    cluster_mm: float = 0.05
+    cluster_mm: float = MERGING_MM
 
     def __post_init__(self) -> None:
         if (self.sim is None) == (self.hits is None):

@@ -18,7 +18,7 @@ from cpunet.jobs.simulation.hit_sources import HitFile, HitSource, Window
 from cpunet.jobs.simulation.simulation_summary import Clock, Summary
 from cpunet.outputs import refuse_inputs
 from cpunet.pulses.writing import PulseWriter
-from cpunet.simulation.clustering import cluster_hits, merge_hits
+from cpunet.simulation.clustering import MERGING_MM, cluster_hits, merge_hits
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields, scaled_to_depletion
 from cpunet.simulation.gammas import with_resolution
@@ -62,7 +62,7 @@ def simulate_file(
     windows: tuple[Window, ...] = (),
     impurity_from: ImpurityFrom = "file",
     mode: Mode = "auto",
-    cluster_mm: float = 0.05,
+    cluster_mm: float = MERGING_MM,
     resolution: Resolution | None = None,
     seed: int = 0,
     force: bool = False,

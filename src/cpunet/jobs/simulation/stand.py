@@ -21,7 +21,6 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.growing_archive import GrowingArchive
 from cpunet.jobs.simulation.hit_sources import Window
 from cpunet.jobs.simulation.stand_plan import (
-    CLUSTER_MM,
     LABELS,
     OTHER,
     Kind,
@@ -33,6 +32,7 @@ from cpunet.outputs import FolderKind
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
+from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
 from cpunet.simulation.hit_readers.hit_table import hit_columns
@@ -232,7 +232,7 @@ def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
         "detector": side.detector.model_dump(mode="json"),
         "settings": side.settings.model_dump(mode="json") | {"dt_ns": dt_ns},
         "hits": side.source.provenance(),
-        "cluster_mm": CLUSTER_MM,
+        "cluster_mm": MERGING_MM,
     }
 
 

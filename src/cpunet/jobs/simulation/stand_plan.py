@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import GammaSource, Window
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.clustering import MERGING_MM, merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector
@@ -34,8 +34,6 @@ OTHER = 3
 _FINE_NS = 4.0
 # The source, a disc above the crystal.
 _HEIGHT_MM, _RADIUS_MM = 20.0, 5.0
-# Default of `cpunet simulate`.
-CLUSTER_MM = 0.05
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Side:
         gain = 0.0
         with monitor.stage(title, opened.n_events) as advance:
             for hits in opened.blocks:
-                merged = merge_hits(hits, self.detector, CLUSTER_MM)
+                merged = merge_hits(hits, self.detector, MERGING_MM)
                 events = simulate_events(fields, merged, self.settings, mode, library=library)
                 kept = events.collected_kev > 0
                 pulses = events.pulses()
