@@ -27,7 +27,8 @@ OPTIONS = (
 SEARCHED_LAST = "---\nsearch: {boost: 0.2}\n---\n"
 FRONT = """# Python
 
-What `import cpunet` gives is the stable interface; everything else is sorted by room, in the order in which data flow.
+What `import cpunet` gives is the stable interface; everything else is sorted by room, in the
+order in which data flow.
 
 ::: cpunet.train
 
