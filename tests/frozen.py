@@ -1,9 +1,9 @@
 """Frozen references: what the program computes, to the last bit.
 
 ``python tests/frozen.py`` runs demo, stands, translations, a calibration, a library and some
-steps of a network, and compares digests of all arrays and scores with ``frozen.json``. It guards
-a change that should change no result. If one must, ``python tests/frozen.py --freeze "reason"
-PART ...`` stores the new digests, with the reason.
+steps of a network, and compares digests of all arrays and scores with ``frozen.json``. It
+guards a change that should change no result. If one must, it stores the new digests, with the
+reason, by ``python tests/frozen.py --freeze "reason" PART ...``.
 
 The last bits depend on processor and libraries: on another machine than the one that froze
 them, freeze the commit before the change first, and do not commit that.
@@ -67,8 +67,9 @@ LANES: list[dict[str, list[str]]] = [
         ],
         "network": [
             f"train --recipe paper-noise {STAND.format('stand')} --out network"
-            " --set generator.width=4 --set training.iterations=20 --set training.decay_start=10"
-            " --set training.log_interval=1 --set training.statistics_batches=2",
+            " --set generator.width=4 --set training.iterations=20"
+            " --set training.decay_start=10 --set training.log_interval=1"
+            " --set training.statistics_batches=2",
         ],
     },
     {
