@@ -137,16 +137,6 @@ def all_undrawn() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
-def unprobed(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Open files without a process that looks at them first, which each test would pay for.
-
-    Tests of damaged files are marked `probed`.
-    """
-    if request.node.get_closest_marker("probed") is None:
-        monkeypatch.setattr("cpunet.file_probe._fate", lambda *_: "")
-
-
 @pytest.fixture(autouse=True, scope="session")
 def few_sums() -> Iterator[None]:
     """Scores compare the translations of a few sums: two hundred take seconds each time."""

@@ -6,10 +6,9 @@ import resource
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from cpunet import machine_memory, npz_files
+from cpunet import machine_memory
 from cpunet.errors import CpunetError
 from cpunet.machine_memory import available_bytes, require_memory
 from cpunet.simulation.geometry_readers import read_detector
@@ -101,12 +100,7 @@ def test_a_line_says_what_is_needed_and_what_there_is(small) -> None:
         require_memory(3e9, "a.lh5: 10 pulses", "give fewer")
 
 
-def test_a_grid_and_an_array_that_do_not_fit(small, tmp_path) -> None:
+def test_a_grid_that_does_not_fit(small) -> None:
     detector = read_detector("ppc")
     with pytest.raises(CpunetError, match=r"nodes: about .* GB are free; give a coarser one"):
         make_grid(detector)
-    path = tmp_path / "pulses.npz"
-    np.savez(path, waveform=np.zeros((400, 1000), np.float32))
-    header = npz_files.headers(path)["waveform"]
-    with pytest.raises(CpunetError, match=r"pulses.npz: 'waveform': about 0.0016 GB"):
-        npz_files.read_array(path, "waveform", header)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -71,3 +72,26 @@ def test_any_truncation_is_one_line_naming_the_file(tmp_path_factory, fraction, 
     with pytest.raises(CpunetError, match=r"^[^\n]+; [^\n]+$") as error:
         open_pulses(path, dt_ns=dt_ns).read()
     assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.zeros(5), np.zeros((5, 4, 4)), np.full((5, 9), b"a")],
+    ids=["1d", "3d", "text"],
+)
+def test_lh5_values_that_are_no_traces(tmp_path, values):
+    path = tmp_path / "file.lh5"
+    write_pulses(path, Pulses.of(np.zeros((5, 20)), dt_ns=16))
+    with h5py.File(path, "r+") as file:
+        old = "geds/sim/waveform/values"
+        attributes = dict(file[old].attrs)
+        del file[old]
+        file[old] = values
+        file[old].attrs.update(attributes)
+    with pytest.raises(CpunetError, match=r"file.lh5: [^\n]*; [^\n]*$"):
+        open_pulses(path)
+
+
+def test_energies_that_are_nan_are_passed_on_to_be_counted(tmp_path):
+    write_pulses(tmp_path / "a.lh5", Pulses.of(np.zeros((2, 20)), dt_ns=16))
+    assert np.isnan(open_pulses(tmp_path / "a.lh5").read().energy_kev).all()

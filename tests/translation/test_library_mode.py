@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import h5py
@@ -291,27 +290,6 @@ def test_other_files_are_refused_in_one_line(chain, tmp_path, change, words):
     assert words in str(error.value)
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["psl.lh5"]
-
-
-def test_a_damaged_column_is_refused_in_one_line(chain, tmp_path):
-    """HDF5's own copy of this one crashes; the other cannot be unpacked."""
-    source = write(tmp_path / "psl.lh5", templates(300, 8.0), 8.0)
-    whole = source.read_bytes()
-    shape = struct.pack("<BBB5xQQ", 1, 2, 1, 3, 4)  # of drift times, in their header
-    assert whole.count(shape) == 1
-    at = whole.index(shape) - 8  # type of the message
-    source.write_bytes(whole[: at + 1] + b"\xec" + whole[at + 2 :])
-    with pytest.raises(CpunetError, match=r"'drift_time_000_deg' is no array; write it again"):
-        translate_library(chain, source, tmp_path / "ren.lh5")
-
-    source.write_bytes(whole)
-    with h5py.File(source) as file:
-        chunk = file["V01/drift_time_000_deg"].id.get_chunk_info(0)
-    at = chunk.byte_offset
-    source.write_bytes(whole[:at] + bytes(chunk.size) + whole[at + chunk.size :])
-    with pytest.raises(CpunetError, match=r"'drift_time_000_deg' cannot be read"):
-        translate_library(chain, source, tmp_path / "ren.lh5")
-    assert [p.name for p in tmp_path.iterdir()] == ["psl.lh5"]
 
 
 def test_currents_are_refused(chain, tmp_path):

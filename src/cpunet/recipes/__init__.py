@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -11,7 +12,7 @@ from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
-from cpunet.regular_files import is_there, read_text
+from cpunet.regular_files import read_text
 from cpunet.yaml_files import MAX_BYTES, parsed, shown, yaml_names
 
 _FOLDER = files("cpunet.recipes")
@@ -45,7 +46,7 @@ def load_recipe(name: str, overrides: Iterable[str] = ()) -> Recipe:
     """
     if name in recipe_names():
         text = (_FOLDER / f"{name}.yaml").read_text("utf-8")
-    elif is_there(name):
+    elif Path(name).exists():
         try:
             text = read_text(name, MAX_BYTES)
         except OSError as error:

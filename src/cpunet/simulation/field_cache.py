@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import platformdirs
 
-from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
+from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.grid import Grid
 from cpunet.simulation.poisson import Potentials
 
@@ -35,8 +35,7 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
     Returns None if they are missing or damaged.
     """
     try:
-        file = cache_file(key)
-        kept = npz_files.read_arrays(file, npz_files.keys(file))
+        kept = read_arrays(cache_file(key))
         axes = {name: kept[name] for name in _OF_GRID}
         nodes = {name: kept[name] for name in _OF_NODES}
         capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
@@ -44,7 +43,7 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
         known = np.isfinite(capacitance) and depletion >= 0
         if not (known and _belong_together(axes, nodes)):
             return None
-    except npz_files.DAMAGED:
+    except (CpunetError, LookupError):
         return None  # solved again and overwritten
     grid = Grid(step_mm=step_mm, **axes)
     return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion

@@ -21,7 +21,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from cpunet.errors import CpunetError
-from cpunet.regular_files import require_file
 from cpunet.training.loop import State
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
@@ -98,7 +97,7 @@ def read_checkpoints(folder: Path) -> Iterator[Checkpoint | None]:
 
 def _read(path: Path) -> Checkpoint | None:
     try:
-        with safe_open(require_file(path), "pt") as file:
+        with safe_open(path, "pt") as file:
             metadata = file.metadata()
             # copies: an optimiser must not continue with views of the file
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118

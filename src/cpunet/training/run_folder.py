@@ -31,7 +31,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind
 from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe
-from cpunet.regular_files import read_text, require_file
+from cpunet.regular_files import read_text
 from cpunet.training.loop import Record
 from cpunet.training.run_schema import FORMAT, problem
 from cpunet.yaml_files import MAX_BYTES, json_mapping, parsed, plain_json
@@ -145,7 +145,7 @@ def read_losses(run: Path) -> list[Record]:
     if not path.is_file():
         return []
     try:
-        lines = require_file(path).read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
         records = [plain_json(line) for line in lines]
         if not all(map(_is_record, records)):
             raise ValueError("a line holds no losses")
@@ -235,7 +235,7 @@ def _require_weights(path: Path, name: str, weights: dict[str, Tensor]) -> None:
 def _weights_of(run: Path, device: str) -> dict[str, Tensor]:
     path = Path(run) / WEIGHTS
     try:
-        weights: dict[str, Tensor] = load_file(require_file(path), device=device)
+        weights: dict[str, Tensor] = load_file(path, device=device)
     except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise CpunetError(f"{path}: no readable weights; train again") from error
     return weights

@@ -19,11 +19,10 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.pickles import PickledPulse, as_pulse, entries
+from cpunet.pulses.reading.pickles import PickledPulse, TruncatedError, as_pulse, entries
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.restricted_unpickler import TruncatedError
 from cpunet.training.run_folder import RUN, versions, write_run
 from cpunet.translation.published import read_discriminator, read_generator
 

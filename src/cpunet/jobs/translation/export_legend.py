@@ -24,7 +24,7 @@ from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
-from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
@@ -199,7 +199,6 @@ def _of_library(
 ) -> dict[str, Any]:
     """Errors of A/E by the kernel, relative to the chain, for templates of a detector."""
     with opened(source) as file:
-        require_whole(file, source, set())
         held = chosen_libraries(file, source, wanted, known)
         library = IdealLibrary.of(file, held[0], source)
         values = file[f"{library.path}/waveform_{library.angles[0]}"]

@@ -1,4 +1,4 @@
-"""Check and copy pulse-shape libraries in files."""
+"""Check pulse-shape libraries in files."""
 
 from __future__ import annotations
 
@@ -10,30 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, require_stored, text_attribute
-from cpunet.machine_memory import require_memory
+from cpunet.hdf5_files import is_column, text_attribute
 from cpunet.pulses.reading.columns import TIME_UNITS
-from cpunet.pulses.reading.source import MAX_SAMPLES
 
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 # Templates of charge end near their maximum; templates of current do not.
 _MIN_END = 0.5
-
-
-def require_whole(group: h5py.Group, source: Path, seen: set[tuple[int, int]]) -> None:
-    """Raise an error for broken or repeated links, and for arrays without stored values."""
-    info = h5py.h5o.get_info(group.id)
-    if (info.fileno, info.addr) in seen:
-        raise CpunetError(f"{source}: {group.name} is linked twice; write the library again")
-    seen.add((info.fileno, info.addr))
-    for name in group:
-        item = group.get(name)
-        if item is None:
-            raise CpunetError(f"{source}: {group.name}: link {name} leads nowhere; remove it")
-        if isinstance(item, h5py.Group):
-            require_whole(item, source, seen)
-        elif isinstance(item, h5py.Dataset):
-            require_stored(source, item)
 
 
 def libraries(file: h5py.File, source: Path) -> list[str]:
@@ -79,7 +61,7 @@ def n_templates(file: h5py.File, path: str, source: Path) -> int:
         expected = (len(library["r"]), len(library["z"]))
         if library[name].dtype.kind not in "iuf":
             raise CpunetError(f"{where}/{name}: is of {library[name].dtype}; give numbers")
-        if len(shape) != 3 or shape[:2] != expected or not 2 <= shape[2] <= MAX_SAMPLES:
+        if len(shape) != 3 or shape[:2] != expected or shape[2] < 2:
             raise CpunetError(
                 f"{where}/{name}: shape {shape} beside r and z of {expected}; expected "
                 "(r, z, samples)"
@@ -136,36 +118,3 @@ def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
             "these are currents, of negative sign, or behind electronics already; give the "
             "library of charge pulses"
         )
-
-
-def copy_values(item: h5py.Dataset, made: h5py.Group, name: str) -> None:
-    """Copy a dataset by value, since HDF5's own copy crashes on damaged datasets."""
-    if not isinstance(item, h5py.Dataset):  # an array without its shape looks like a type
-        raise CpunetError(f"{item.file.filename}: '{name}' is no array; write it again")
-    require_memory(item.nbytes, f"{item.file.filename}: '{name}'", "give a smaller library")
-    try:
-        values = item[()]
-    except OSError as error:
-        said = " ".join(str(error).split())
-        raise CpunetError(
-            f"{item.file.filename}: '{name}' cannot be read ({said}); write it again"
-        ) from error
-    stored = item.id.get_create_plist()  # includes the filters, also those of plugins
-    if stored.get_external_count() or item.is_virtual:
-        copy = made.create_dataset(name, data=values)
-    else:
-        space, kind = item.id.get_space(), item.id.get_type()
-        h5py.h5d.create(made.id, name.encode(), kind, space, dcpl=stored)
-        copy = made[name]
-        copy[()] = values
-    copy.attrs.update(item.attrs)
-
-
-def copy_group(given: h5py.Group, made: h5py.Group) -> None:
-    """Copy a group and everything in it by value; see `copy_values`."""
-    made.attrs.update(given.attrs)
-    for name, item in given.items():
-        if isinstance(item, h5py.Group):
-            copy_group(item, made.create_group(name))
-        else:
-            copy_values(item, made, name)

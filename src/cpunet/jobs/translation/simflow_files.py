@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.files import written_aside
-from cpunet.hdf5_files import is_column, opened, require_all_stored, text_attribute
+from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.jobs.simulation.library_arrays import put_column
-from cpunet.jobs.translation.library_file import copy_group, number
+from cpunet.jobs.translation.library_file import number
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.translation.low_rank import Loss
@@ -180,7 +180,6 @@ def read_library(path: Path | str, detector: str | None = None) -> RealisticLibr
     """
     path = Path(path)
     with opened(path) as file:
-        require_all_stored(path, file)
         names = realistic_libraries(file)
         if detector is None and len(names) == 1:
             detector = names[0]
@@ -269,7 +268,6 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
         for path in sources:
             with opened(path) as file:
-                require_all_stored(path, file)
                 names = realistic_libraries(file)
                 if not names:
                     raise CpunetError(
@@ -287,7 +285,9 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
 def _copy(group: h5py.Group, made: h5py.File) -> None:
     """Copy a library to the same place in another file."""
     copy = made.create_group(group.name)
-    copy_group(group, copy)
+    copy.attrs.update(group.attrs)
+    for name in group:
+        group.copy(name, copy)
     describe(copy.parent)
 
 
@@ -335,7 +335,6 @@ def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]
     """
     refuse_existing(out, source, force=force)
     with opened(source) as file:
-        require_all_stored(source, file)
         names = realistic_libraries(file)
         if not any(_COMPONENTS in file[name] for name in names):
             raise CpunetError(

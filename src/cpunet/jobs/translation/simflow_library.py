@@ -22,7 +22,7 @@ from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.translation.library_file import n_not_ending, require_charge, require_whole
+from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
     chosen_libraries,
@@ -112,7 +112,6 @@ def translate_for_simflow(
     ren = REN.load(run, resolve_device(device))
     told: dict[str, Any] = {}
     with opened(source) as given:
-        require_whole(given, source, set())
         names = chosen_libraries(given, source, detectors, known_detector(run, info))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
         made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}

@@ -18,12 +18,10 @@ from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.translation.library_file import (
     WAVEFORM,
-    copy_values,
     libraries,
     n_not_ending,
     n_templates,
     require_charge,
-    require_whole,
     sampling_period_ns,
 )
 from cpunet.outputs import refuse_existing
@@ -133,7 +131,6 @@ def translate_library(
     ren = REN.load(run, resolve_device(device))
     tally = _Tally(currents)
     with opened(source) as given:
-        require_whole(given, source, set())
         paths = libraries(given, source)
         total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
@@ -174,7 +171,7 @@ def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
         if isinstance(item, h5py.Group):
             _copy(item, made.create_group(name), job)
         elif name not in replaced:
-            copy_values(item, made, name)
+            given.copy(name, made)
     if not angles:
         return
     dt_ns = sampling_period_ns(given, f"{job.source}: {given.name.strip('/') or '/'}")

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translation_record import run_print, source_print
 from cpunet.jobs.validation.drawings import KINDS, Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
+from cpunet.pulses.reading.arrays import read_arrays
 
 STORE = "figures.npz"
 _INDEX = "index"
@@ -59,7 +59,7 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
         If the file cannot be read.
     """
     try:
-        arrays = npz_files.read_arrays(file, npz_files.keys(file))
+        arrays = read_arrays(file)
         index = json.loads(str(arrays[_INDEX]))
         drawings = {
             name: Drawing(one["kind"], _found(one["values"], arrays))
@@ -70,10 +70,9 @@ def read_drawings(file: Path) -> tuple[dict[str, Drawing], Made]:
             raise ValueError(f"no figures of kind {min(unknown)}")
         if not isinstance(made, dict):
             raise ValueError("the inputs of the figures are missing")
-    except (*npz_files.DAMAGED, AttributeError) as error:
+    except (CpunetError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CpunetError(
-            f"{file}: cannot be read ({npz_files.said(error)}); remove it, and score the run "
-            "again"
+            f"{file}: cannot be read ({error}); remove it, and score the run again"
         ) from error
     return drawings, made
 

@@ -1,58 +1,85 @@
-"""Read pulses from NumPy files: ``.npz`` with columns of values per event, ``.npy`` without."""
+"""Read NumPy files: ``.npz`` with columns of values per event, ``.npy`` without."""
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from cpunet import npz_files
 from cpunet.errors import CpunetError
-from cpunet.npz_files import Header
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
 
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+def read_arrays(path: Path) -> Arrays:
+    """Arrays of an ``.npz`` by name, or the array of an ``.npy``, called ``""``, as a map.
+
+    Arrays of objects are left out: they would be pickles, which can execute code.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read.
+    """
+    try:
+        arrays: Arrays = {}
+        with path.open("rb") as stream:  # NumPy would leave a truncated file open
+            if stream.read(2) != b"PK":
+                return {"": np.load(path, mmap_mode="r", allow_pickle=False)}
+            stream.seek(0)
+            content = np.load(stream, allow_pickle=False)
+            for name in content.files:
+                with suppress(ValueError):  # an array of objects
+                    arrays[name] = content[name]
+        return arrays
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        text = " ".join(str(error).split())
+        raise CpunetError(
+            f"{path}: cannot be read as NumPy file ({text[:160]}); write it again"
+        ) from error
+
 
 class ArraySource(PulseSource):
-    """An array of shape ``(events, samples)``, read row by row.
+    """An array of shape ``(events, samples)``.
 
     The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array
     that the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
-    ``dt``), energies and event numbers, are columns. Pickled objects are never loaded.
+    ``dt``), energies and event numbers, are columns.
     """
 
     def __init__(self, options: ReadOptions) -> None:
-        with _readable(options.path):
-            headers = npz_files.headers(options.path)
-            self._key = _waveform_key(options, headers)
-            header = headers[self._key]
-            columns = _columns(options.path, headers)
-        _require_plain(options.path, self._key, header)
-        self._header = header
-        super().__init__(options, Layout.of_array("NumPy", self._key, header.shape, columns))
+        arrays = read_arrays(options.path)
+        name = _waveform_name(options, arrays)
+        self._values = arrays[name]
+        if self._values.dtype.kind not in "iuf":
+            raise CpunetError(
+                f"{options.path}: array {name or 'in it'} is of {self._values.dtype}; save "
+                "plain numbers"
+            )
+        columns = {
+            name: MemoryColumn(values)
+            for name, values in arrays.items()
+            if values.ndim <= 1 and values.dtype.kind in "iufb"
+        }
+        super().__init__(options, Layout.of_array("NumPy", name, self._values.shape, columns))
 
     def _traces(self, size: int) -> Iterator[Traces]:
-        row_bytes = self.length * self._header.dtype.itemsize
-        with _readable(self.path), npz_files.member(self.path, self._key) as file:
-            npz_files.read_header(file)
-            for start in range(0, self._header.shape[0], size):
-                n_rows = min(size, self._header.shape[0] - start)
-                data = file.read(n_rows * row_bytes)
-                if len(data) < n_rows * row_bytes:
-                    row = start + len(data) // row_bytes
-                    raise CpunetError(
-                        f"{self.path}: event {row}: the file is cut off; write it again"
-                    )
-                rows = np.frombuffer(data, self._header.dtype)
-                yield Traces(rows.reshape(n_rows, self.length))
+        for start in range(0, len(self._values), size):
+            yield Traces(self._values[start : start + size])
 
 
-def _waveform_key(options: ReadOptions, headers: dict[str, Header]) -> str:
-    matrices = [key for key, header in headers.items() if len(header.shape) == 2]
+def _waveform_name(options: ReadOptions, arrays: Arrays) -> str:
+    matrices = [name for name, values in arrays.items() if values.ndim == 2]
     if options.table is not None:
         if options.table not in matrices:
             raise CpunetError(
@@ -60,10 +87,10 @@ def _waveform_key(options: ReadOptions, headers: dict[str, Header]) -> str:
                 f"there are {shortened(matrices)}"
             )
         return options.table
-    named = [key for key in _WAVEFORMS if key in matrices] or matrices
+    named = [name for name in _WAVEFORMS if name in matrices] or matrices
     if not named:
         raise CpunetError(
-            f"{options.path}: no waveforms in it; it holds {shortened(headers)}; "
+            f"{options.path}: no waveforms in it; it holds {shortened(arrays)}; "
             "give an array of two dimensions (event, sample)"
         )
     if len(named) > 1:
@@ -72,34 +99,3 @@ def _waveform_key(options: ReadOptions, headers: dict[str, Header]) -> str:
             "choose one with --table (--sim-table, --data-table)"
         )
     return named[0]
-
-
-def _require_plain(path: Path, key: str, header: Header) -> None:
-    if header.dtype.kind not in "iuf":
-        raise CpunetError(
-            f"{path}: array {key or 'in it'} is of {header.dtype}; save plain numbers"
-        )
-    if header.by_columns and min(header.shape) > 1:
-        raise CpunetError(
-            f"{path}: array {key or 'in it'} is stored column by column, "
-            "so that no row can be read alone; save numpy.ascontiguousarray of it"
-        )
-
-
-def _columns(path: Path, headers: dict[str, Header]) -> dict[str, MemoryColumn]:
-    """Read the arrays with one value per event, or one value, as a whole."""
-    return {
-        key: MemoryColumn(npz_files.read_array(path, key, header))
-        for key, header in headers.items()
-        if len(header.shape) <= 1 and header.dtype.kind in "iufb"
-    }
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except npz_files.DAMAGED as error:
-        raise CpunetError(
-            f"{path}: cannot be read as NumPy file ({npz_files.said(error)}); write it again"
-        ) from error

@@ -14,11 +14,8 @@ import numpy.typing as npt
 from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
-from cpunet.file_probe import require_survivable
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
-
-_MAX_CHANNELS = 1 << 16
 
 
 class FlashCamSource(PulseSource):
@@ -82,8 +79,6 @@ class FlashCamSource(PulseSource):
         if rows.size == 0:
             return None
         number = int(event.eventnumber)
-        if rows[0] >= len(event.trace):
-            raise CpunetError(f"{self.path}: event {number}: no traces; copy the file again")
         trace = event.trace[rows[0]].copy()
         if len(trace) != self.length:
             raise CpunetError(
@@ -109,16 +104,13 @@ def channel_sizes(path: Path) -> dict[str, int | None]:
         while _next(path, stream):
             if stream.tag in (Tags.Event, Tags.SparseEvent):
                 counts.update(int(channel) for channel in stream.event.trace_list)
-    return {str(c): counts[c] for c in sorted(counts) if 0 <= c < n_channels}
+    return {str(c): counts[c] for c in sorted(counts)}
 
 
 def _n_channels(path: Path, stream: FCIO) -> int:
     if stream.config is None:
         raise CpunetError(f"{path}: holds no configuration; copy it again")
-    n_channels = int(stream.config.adcs)
-    if not 0 < n_channels <= _MAX_CHANNELS:
-        raise CpunetError(f"{path}: {n_channels} channels; copy the file again")
-    return n_channels
+    return int(stream.config.adcs)
 
 
 def _next(path: Path, stream: FCIO) -> bool:
@@ -147,7 +139,6 @@ def _channel(options: ReadOptions, n_channels: int) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[FCIO]:
-    require_survivable(path, "FlashCam")
     try:
         with _quiet():
             stream = fcio_open(str(path))

@@ -1,18 +1,103 @@
-"""Read columns with one value per event from HDF5 files."""
+"""Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+import lh5
 import numpy as np
 import numpy.typing as npt
+from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.pulses.reading.columns import shortened
+from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
+from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+
+# preference among several waveform columns of a table: full record, then full-rate window
+_PREFERRED = ("waveform", "waveform_windowed")
+_PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
+
+
+def open_hdf5(options: ReadOptions) -> PulseSource:
+    """Open the waveforms of an HDF5 file, LH5 or not; see `opening.open_pulses`."""
+    with opened(options.path) as file:
+        if is_majorana(file):
+            return MajoranaSource(options)
+        chosen = choose_waveforms(options.path, file, options.table)
+    return Lh5Source(options, chosen) if chosen.is_lh5 else Hdf5Source(options, chosen)
+
+
+class Lh5Source(PulseSource):
+    """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
+
+    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+        self._values = f"{chosen.path}/values"
+        with opened(options.path) as file:
+            n_pulses = lh5.read_n_rows(self._values, file) or 0
+            first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
+            layout = Layout(
+                format="LH5",
+                table=chosen.path,
+                n_pulses=n_pulses,
+                length=first.shape[1],
+                columns=columns_of(options.path, file[chosen.table or "/"]),
+                period_name=f"{chosen.path}/dt",
+                period=columns_of(options.path, file[chosen.path]).get("dt"),
+            )
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        with opened(self.path) as file:
+            for start in range(0, self.n_pulses or 0, size):
+                yield Traces(self._rows(file, start, size, self.length))
+
+    def _rows(
+        self, file: h5py.File, start: int, size: int, length: int | None
+    ) -> npt.NDArray[Any]:
+        # lh5 decodes LEGEND's encoded waveforms; it reads only the requested rows.
+        values = lh5.read(self._values, file, start_row=start, n_rows=size)
+        if not isinstance(values, VectorOfVectors):
+            traces = np.asarray(values.nda)
+            if traces.ndim != 2 or traces.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
+                    f"{traces.shape}; give a file of traces"
+                )
+            return traces
+        lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
+        expected = int(lengths[0]) if length is None else length
+        if (other := lengths != expected).any():
+            first = int(other.argmax())
+            raise CpunetError(
+                f"{file.filename}: event {start + first}: {lengths[first]} samples, before it "
+                f"{expected}; split the file by length"
+            )
+        flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
+        return flat.reshape(len(lengths), expected)
+
+
+class Hdf5Source(PulseSource):
+    """A dataset of shape ``(events, samples)``, and the columns beside it."""
+
+    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+        self._values = chosen.path
+        with opened(options.path) as file:
+            dataset = file[chosen.path]
+            columns = columns_of(options.path, file[chosen.table or "/"])
+            layout = Layout.of_array("HDF5", chosen.path, dataset.shape, columns)
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        with opened(self.path) as file:
+            dataset = file[self._values]
+            for start in range(0, self.n_pulses or 0, size):
+                yield Traces(dataset[start : start + size])
 
 
 @dataclass(frozen=True)
@@ -74,3 +159,141 @@ def column_of(path: Path, name: str) -> Hdf5Column:
 def _column(path: Path, dataset: h5py.Dataset) -> Hdf5Column:
     units = text_attribute(dataset, "units")
     return Hdf5Column(path, dataset.name, units, dataset.size, dataset.ndim == 0)
+
+
+@dataclass(frozen=True)
+class WaveformColumn:
+    """Waveforms in a file.
+
+    Parameters
+    ----------
+    table
+        Path of the group that contains the waveforms and the other columns.
+    name
+        Name of the waveforms in it.
+    is_lh5
+        Whether they are an LH5 waveform table (t0, dt, values), not a plain dataset of shape
+        ``(events, samples)``.
+    """
+
+    table: str
+    name: str
+    is_lh5: bool
+
+    @property
+    def path(self) -> str:
+        """Path of the waveform column in the file."""
+        return f"{self.table}/{self.name}".strip("/")
+
+
+def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> WaveformColumn:
+    """Choose the waveforms at `table`: a table, a waveform column, or a group around one.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such table, or not exactly one choice; the message lists the choices.
+    """
+    if table is None or not table.strip("/"):
+        found = list(_walk(file, set()))
+        if not found:
+            raise CpunetError(
+                f"{path}: no waveforms in it; it holds {shortened(_tables(file))}; "
+                "give a file of traces (their energies may be here: --data-energy FILE:COLUMN)"
+            )
+        return _only(path, found)
+    item = file.get(table)
+    if item is None:
+        known = sorted({c.table for c in _walk(file, set())}) or _tables(file)
+        raise CpunetError(f"{path}: no table {table}; there are {shortened(known)}")
+    column = _as_column(item)
+    if column is not None:
+        return column
+    found = list(_walk(item, set())) if isinstance(item, h5py.Group) else []
+    if not found:
+        raise CpunetError(
+            f"{path}: no waveforms in {table}; "
+            f"they are in {shortened(sorted({c.table for c in _walk(file, set())}))}"
+        )
+    return _only(path, found)
+
+
+def waveform_tables(file: h5py.File) -> list[str]:
+    """Paths of the tables that contain waveforms, sorted."""
+    return sorted({column.table for column in _walk(file, set())})
+
+
+def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
+    tables = sorted({column.table for column in found})
+    if len(tables) > 1:
+        raise CpunetError(
+            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
+            "choose one with --table (--sim-table, --data-table)"
+        )
+    if len(found) == 1:
+        return found[0]
+    by_name = {column.name: column for column in found}
+    for name in _PREFERRED:
+        if name in by_name:
+            return by_name[name]
+    raise CpunetError(
+        f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
+        "choose one with --table (--sim-table, --data-table)"
+    )
+
+
+def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformColumn]:
+    # links can give an object several names or form cycles: visit each object once
+    info = h5py.h5o.get_info(group.id)
+    if (info.fileno, info.addr) in seen:
+        return
+    seen.add((info.fileno, info.addr))
+    columns = [_as_column(group.get(name), group, name) for name in group]
+    found = [column for column in columns if column is not None]
+    lh5_found = [column for column in found if column.is_lh5]
+    plain = [column for name in _PLAIN for column in found if column.name == name]
+    yield from lh5_found or plain[:1]
+    # other columns of a table can be groups of many datasets, but contain no waveforms
+    if text_attribute(group, "datatype").startswith("table"):
+        return
+    names = {column.name for column in found}
+    for name in group:
+        # None for a broken link
+        inner = group.get(name)
+        if name not in names and isinstance(inner, h5py.Group):
+            yield from _walk(inner, seen)
+
+
+def _as_column(
+    item: object, parent: h5py.Group | None = None, name: str | None = None
+) -> WaveformColumn | None:
+    """Return an item, `name` in `parent`, as a waveform column; None if it is not one."""
+    if isinstance(item, h5py.Group):
+        is_lh5 = text_attribute(item, "datatype").startswith("table") and (
+            "values" in item and "dt" in item
+        )
+        if not is_lh5:
+            return None
+    elif isinstance(item, h5py.Dataset):
+        is_lh5 = False
+        if item.ndim != 2 or item.dtype.kind not in "iuf":
+            return None
+    else:
+        return None
+    if parent is None or name is None:
+        table, _, name = item.name.rpartition("/")
+    else:
+        table = parent.name
+    return WaveformColumn(table.strip("/"), name, is_lh5)
+
+
+def _tables(group: h5py.Group) -> list[str]:
+    """LH5 tables, or the top-level groups if there are none; for messages."""
+    tables: list[str] = []
+
+    def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if text_attribute(item, "datatype").startswith("table"):
+            tables.append(name)
+
+    group.visititems(note)
+    return tables or list(group)

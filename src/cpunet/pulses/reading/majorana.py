@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, require_stored
+from cpunet.hdf5_files import is_column, opened
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
 from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
@@ -48,11 +48,6 @@ class MajoranaSource(PulseSource):
         path = options.path
         with opened(path) as file:
             dataset = file[WAVEFORMS]
-            require_stored(path, dataset)
-            if dataset.dtype.kind not in "iuf":
-                raise CpunetError(
-                    f"{path}: {WAVEFORMS} is of {dataset.dtype}; download the file again"
-                )
             self._rows = _rows(options, file, dataset.shape[0])
             columns = {
                 name: MemoryColumn(values[self._rows], units)

@@ -4,11 +4,13 @@ The layout is that of the README of their repository (kevinhbhimani/CPU-Net on G
 record 10.5281/zenodo.15311838: files such as ``fep_wf_ornl.pickle`` and ``fep_wf_sim.pickle``,
 in which one pickle follows the other, each a dictionary ``{wf, tp0, energy}`` of samples, index
 of the rise and energy in keV; their ``dataset.py`` also knows ``event`` and ``dc_label``.
-Nothing of a pickle is executed, see `cpunet.restricted_unpickler`.
+A pickle is a program that can call any function by name; only the names with which NumPy
+stores arrays and numbers are allowed.
 """
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,16 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.source import (
-    MAX_SAMPLES,
-    Layout,
-    PulseSource,
-    ReadOptions,
-    Traces,
-)
-from cpunet.restricted_unpickler import TruncatedError, load_all
+from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
 
-_MAX_NUMBER = 2**62
+# NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
+_ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
+    (f"numpy.{core}.{module}", name)
+    for core in ("core", "_core")
+    for module, name in (
+        ("multiarray", "_reconstruct"),
+        ("multiarray", "scalar"),
+        ("numeric", "_frombuffer"),
+    )
+}
 _PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
 _CONVERT = "convert it with `cpunet import pulses`, which leaves such out and counts them"
 _WHY = {
@@ -46,6 +50,20 @@ class PickledPulse:
     event: int
 
 
+class TruncatedError(Exception):
+    """The pickle is truncated or damaged."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise CpunetError(
+                f"asks for {module}.{name}, which no list of pulses needs; refused, nothing of "
+                "it was executed"
+            )
+        return super().find_class(module, name)
+
+
 def entries(path: Path) -> Iterator[Any]:
     """Yield the objects pickled one after the other in a file, and the items of lists.
 
@@ -56,11 +74,22 @@ def entries(path: Path) -> Iterator[Any]:
     TruncatedError
         If it is truncated or damaged; the objects before that are yielded first.
     """
-    for value in load_all(path):
-        if isinstance(value, list | tuple):
-            yield from value
-        else:
-            yield value
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    with stream:
+        while stream.peek(1):
+            try:
+                value = _Unpickler(stream).load()
+            except CpunetError as error:
+                raise CpunetError(f"{path}: {error}") from error
+            except Exception as error:  # a damaged pickle can raise anything
+                raise TruncatedError(str(error) or type(error).__name__) from error
+            if isinstance(value, list | tuple):
+                yield from value
+            else:
+                yield value
 
 
 def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
@@ -76,7 +105,8 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
     if not isinstance(entry, dict) or "wf" not in entry:
         return None, "no_pulse"
     try:
-        samples = _samples(entry["wf"])
+        with np.errstate(over="ignore"):  # values beyond single precision are counted later
+            samples = np.asarray(entry["wf"], np.float32)
         event = int(entry.get("event", number))
         numbers = dict.fromkeys(("tp0", "energy"), float("nan"))
         for name, value in entry.items():
@@ -84,22 +114,9 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
                 numbers[name] = float(value)
     except (TypeError, ValueError, OverflowError):
         return None, "no_numbers"
-    if abs(event) > _MAX_NUMBER:
-        return None, "no_numbers"
-    if samples.ndim != 1 or not 0 < len(samples) <= MAX_SAMPLES:
+    if samples.ndim != 1 or not len(samples):
         return None, "no_trace"
     return PickledPulse(samples, numbers, event), ""
-
-
-def _samples(trace: Any) -> npt.NDArray[np.float32]:
-    """A trace as an array; empty for nested lists, which may refer to each other."""
-    if isinstance(trace, list | tuple):
-        if len(trace) > MAX_SAMPLES or any(isinstance(v, list | tuple | dict) for v in trace):
-            return np.empty((0, 0), np.float32)
-    elif not isinstance(trace, np.ndarray):
-        raise TypeError
-    with np.errstate(over="ignore"):  # values beyond single precision are counted later
-        return np.asarray(trace, np.float32)
 
 
 @dataclass

@@ -14,10 +14,8 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.columns import Column, require_length
-from cpunet.pulses.reading.energies import resolve_energies
-from cpunet.pulses.reading.sampling import resolve_sampling
+from cpunet.pulses.reading.energies import resolve_energies, resolve_sampling
 
-MAX_SAMPLES = 1 << 20  # length of a trace: 17 ms at 16 ns
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
@@ -94,7 +92,7 @@ class PulseSource(ABC):
     """A file of pulses: iterate over its `blocks`, or `read` it as a whole.
 
     The file is open only during an iteration, so a source need not be closed, and the memory
-    in use does not grow with the file.
+    in use does not grow with the file, except for ``.npz``, which is read as a whole.
 
     Attributes
     ----------
@@ -113,11 +111,6 @@ class PulseSource(ABC):
             raise CpunetError(
                 f"{options.path}: {layout.table or layout.format} holds no pulses; "
                 "give a file with events"
-            )
-        if not 0 < layout.length <= MAX_SAMPLES:
-            raise CpunetError(
-                f"{options.path}: a trace of {layout.length} samples is no pulse (at most "
-                f"{MAX_SAMPLES}); cut the traces"
             )
         self.path = options.path
         self.n_pulses = layout.n_pulses

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import require_stored
 from cpunet.simulation.hit_readers.steps import Steps, whole_numbers
 
 NTUPLE = "default_ntuples/g4sntuple"
@@ -61,5 +60,4 @@ def _column(path: Path, ntuple: h5py.Group, name: str) -> npt.NDArray[np.float64
             f"{path}: no step-wise column {name} in {NTUPLE}; write it with g4simple's "
             "stepwise option"
         )
-    require_stored(path, pages)
     return np.asarray(pages[()], float)

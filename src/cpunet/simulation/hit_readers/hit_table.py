@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, require_stored, text_attribute
+from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 from cpunet.simulation.hits import Hits
 
@@ -54,7 +54,6 @@ def read_hit_table(path: Path, units: Units) -> Steps:
                 raise CpunetError(f"{path}: {TABLE} has no column {name}; write the file again")
             if not is_column(column):
                 raise CpunetError(f"{path}: {TABLE}/{name} holds no numbers; write it again")
-            require_stored(path, column)
             values[name] = np.asarray(column[()])
             named[name] = text_attribute(column, "units")
         pulses = file.get(_EVENTS)

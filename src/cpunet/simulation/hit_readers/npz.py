@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet import npz_files
 from cpunet.errors import CpunetError
+from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.hit_readers.steps import Steps, whole_numbers
 
 _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")
@@ -15,16 +15,12 @@ _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")
 
 def read_npz(path: Path) -> Steps:
     """Read the steps of an archive. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
-    try:
-        arrays = npz_files.read_arrays(path, _NEEDED)
-    except npz_files.DAMAGED as error:
-        raise CpunetError(
-            f"{path}: not a readable NPZ file ({npz_files.said(error)}); is it truncated?"
-        ) from error
+    arrays = read_arrays(path)
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
         raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(_NEEDED)}")
-    for name, values in arrays.items():
+    for name in _NEEDED:
+        values = arrays[name]
         if values.ndim != 1 or values.dtype.kind not in "iuf":
             raise CpunetError(
                 f"{path}: array {name} is of {values.dtype} and shape {values.shape}; give "

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
 
-from cpunet import npz_files
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.regular_files import require_file
 from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
@@ -119,10 +119,9 @@ def holds_hits(path: Path | str) -> bool:
         with opened(file) as content:
             return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
     if start.startswith(_ZIP_MAGIC):
-        try:
-            return {"x_mm", "offsets"} <= set(npz_files.keys(file))
-        except npz_files.DAMAGED:
-            return False  # the reader of pulses reports the error
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+            return {"x_mm.npy", "offsets.npy"} <= set(archive.namelist())
+        return False  # the reader of pulses reports the error
     return start == _CSV_MAGIC
 
 
@@ -134,7 +133,7 @@ def hit_detectors(path: Path | str) -> list[str]:
 def _start(path: Path) -> bytes:
     """First bytes of a file; none if it cannot be read, which its reader reports."""
     try:
-        with require_file(path).open("rb") as stream:
+        with path.open("rb") as stream:
             return stream.read(len(_CSV_MAGIC))
     except OSError:
         return b""
@@ -151,7 +150,7 @@ def _is_remage(path: Path) -> bool:
 
 def _steps(path: Path, detector: str | None, units: Units) -> Steps:
     try:
-        with require_file(path).open("rb") as stream:
+        with path.open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import lh5
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, require_all_stored, text_attribute
-from cpunet.pulses.reading.lh5_rows import read_rows
+from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _AXES = ("xloc", "yloc", "zloc")
@@ -52,7 +52,6 @@ def parts_of(path: Path, detector: str | None, size: int = ROWS) -> list[slice] 
         item = file.get(f"stp/{name}/evtid")
         if not is_column(item) or item.ndim != 1:
             return None  # the reader reports the error
-        require_all_stored(path, item)
         numbers = np.asarray(item[()])
     starts = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
     if len(np.unique(numbers)) != len(starts):
@@ -118,8 +117,9 @@ def _read(path: Path, name: str, rows: slice) -> dict[str, Any]:
                 raise CpunetError(
                     f"{path}: {name} has no column {column}; choose a germanium detector"
                 )
-            require_all_stored(path, item)
-            table[column] = read_rows(item, rows.start, rows.stop - rows.start)
+            table[column] = lh5.read(
+                item.name, item.file, start_row=rows.start, n_rows=rows.stop - rows.start
+            )
     return table
 
 
