@@ -857,7 +857,7 @@ def test_no_space_left_is_told(run, tmp_path, monkeypatch):
         raise OSError("Can't write (file write failed: errno = 28, error message = 'No ...')")
 
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
-    monkeypatch.setattr("cpunet.pulses.lh5_parts.lh5.write", full)
+    monkeypatch.setattr("cpunet.pulses.writing.lh5.write", full)
     with pytest.raises(CpunetError, match=r"out.lh5: cannot be written \(No space left on dev"):
         translate_file(run, source, tmp_path / "out.lh5", device="cpu")
     assert names(tmp_path) == ["sim.lh5"]

@@ -40,12 +40,7 @@ def test_a_truth_without_any_response_is_refused_with_its_last_block(tmp_path, n
 
 def test_responses_that_cannot_be_read(tmp_path):
     path = tmp_path / "truth.npz"
-    np.savez(path, response=np.asfortranarray(np.ones((20, 3))))
-    with pytest.raises(CpunetError, match="stored column by column"):
-        Responses(path, prepared(np.arange(20), 20))
     np.savez(path, response=np.ones((20, 300)))
-    whole = path.read_bytes()
-    responses = Responses(path, prepared(np.arange(20), 20))
-    path.write_bytes(whole[:5000] + b"\1" * 100 + whole[5100:])
-    with pytest.raises(CpunetError, match=r"cannot be read as \.npz"):
-        list(responses.blocks())
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(CpunetError, match="cannot be read as NumPy file"):
+        Responses(path, prepared(np.arange(20), 20))

@@ -226,15 +226,6 @@ def test_no_column_replaces_another(tmp_path):
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 
-def test_a_column_without_values_is_left_out(tmp_path):
-    path = tmp_path / "pulses.h5"
-    with h5py.File(path, "w") as file:
-        file["waveform"] = some().waveforms
-        file["note"] = h5py.Empty("f8")
-    others = RowColumns.of_hdf5(path, "waveform", 6, {"waveform"})
-    assert (others.names, others.left_out) == ({}, {"note": "without values"})
-
-
 def test_no_values_are_appended_to_a_column_that_exists(tmp_path):
     source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
     write_pulses(source, some(6), columns={"more_scale": (np.arange(6.0), "")})

@@ -19,8 +19,7 @@ from cpunet.files import written_aside
 from cpunet.hdf5_files import text_attribute
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.lh5_parts import FileInTheMaking, waveform_table, write_errors
-from cpunet.pulses.writing import Columns
+from cpunet.pulses.writing import Columns, FileInTheMaking, waveform_table, write_errors
 
 
 class ColumnAppender:

@@ -161,15 +161,11 @@ def _in_kev(name: str, units: str) -> bool:
     return name == "energy" and units in ENERGY_UNITS
 
 
-def _unreadable(item: h5py.Group | h5py.Dataset | None, n_pulses: int) -> str:
+def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:
     """Reason why a column cannot be copied; empty if it can."""
-    if item is None:
-        return "a link that leads nowhere"
     if not text_attribute(item, "datatype"):
         if not isinstance(item, h5py.Dataset):
             return "a group that is no column"
-        if item.shape is None:
-            return "without values"
         if item.dtype.kind not in _NUMBERS and not h5py.check_string_dtype(item.dtype):
             return f"of type {item.dtype}"
         rows = n_pulses if item.ndim == 0 else item.shape[0]

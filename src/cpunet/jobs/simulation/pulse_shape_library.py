@@ -14,7 +14,7 @@ from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.outputs import refuse_existing
-from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import SimulationSettings

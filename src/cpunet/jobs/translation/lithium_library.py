@@ -13,7 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.files import written_aside
 from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.outputs import refuse_existing
-from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.simulation.lithium import LithiumLayer, arrived
 
 LENGTH_NS, STEP_MM = 10_000, 0.01  # as in the tables of reboost

@@ -19,7 +19,7 @@ from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.jobs.translation.library_file import number
 from cpunet.outputs import refuse_existing
-from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.translation.low_rank import Loss
 from cpunet.translation.peak_currents import LENGTH, PEAK
 from cpunet.yaml_files import plain_json

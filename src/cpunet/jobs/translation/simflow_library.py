@@ -31,7 +31,7 @@ from cpunet.jobs.translation.simflow_checks import (
 )
 from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing
-from cpunet.pulses.lh5_parts import FileInTheMaking
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.low_rank import MOST, Loss, components

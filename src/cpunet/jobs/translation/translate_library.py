@@ -26,9 +26,9 @@ from cpunet.jobs.translation.library_file import (
 )
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.lh5_parts import FileInTheMaking
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.source import BLOCK_BYTES
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 

@@ -51,7 +51,7 @@ class MajoranaSource(PulseSource):
             self._rows = _rows(options, file, dataset.shape[0])
             columns = {
                 name: MemoryColumn(values[self._rows], units)
-                for name, values, units in _columns(options, file, dataset.shape[0])
+                for name, values, units in _columns(file)
             }
             layout = Layout(
                 format="Majorana release",
@@ -89,11 +89,6 @@ class MajoranaSource(PulseSource):
 
 def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
     """Rows of the chosen detector, in order."""
-    numbers = np.atleast_1d(file[DETECTOR][()])
-    if len(numbers) != n:
-        raise CpunetError(
-            f"{options.path}: {len(numbers)} detectors beside {n} waveforms; download it again"
-        )
     if options.table == WAVEFORMS:
         return np.arange(n)
     known = detectors(file)
@@ -108,21 +103,14 @@ def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64
         raise CpunetError(
             f"{options.path}: no detector {options.table}; there are {shortened(known)}"
         )
-    return np.flatnonzero(numbers.astype(str) == options.table)
+    return np.flatnonzero(file[DETECTOR][()].astype(str) == options.table)
 
 
-def _columns(
-    options: ReadOptions, file: h5py.File, n: int
-) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:
+def _columns(file: h5py.File) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:
     """Yield name, values and units of each column beside the traces (a few bytes per event)."""
     for name in file:
         column = file.get(name)
         if not is_column(column) or column.ndim == 0:
             continue
-        if len(column) != n:
-            raise CpunetError(
-                f"{options.path}: column {name} has {len(column)} values beside {n} "
-                "waveforms; download the file again"
-            )
         shown, units = _RENAMED.get(name, (name, ""))
         yield shown, np.asarray(column[()]), units

@@ -8,13 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.hit_readers.csv_ntuple import read_csv
 from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
-from cpunet.simulation.hit_readers.npz import read_npz
 from cpunet.simulation.hit_readers.remage import detectors_of, parts_of, read_remage
 from cpunet.simulation.hit_readers.steps import (
     ReadHits,
@@ -23,6 +24,7 @@ from cpunet.simulation.hit_readers.steps import (
     Units,
     require_some,
     to_hits,
+    whole_numbers,
 )
 from cpunet.simulation.hits import Hits
 
@@ -30,6 +32,7 @@ _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
 _AS_IN_THE_FILE = Transform()
+_NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")  # arrays of an NPZ
 
 
 def read_hits(
@@ -158,7 +161,7 @@ def _steps(path: Path, detector: str | None, units: Units) -> Steps:
         return _hdf5(path, detector, units)
     if start.startswith(_ZIP_MAGIC):
         _without_detectors(path, detector)
-        return read_npz(path)
+        return _npz(path)
     if start.startswith(_CSV_MAGIC):
         return read_csv(path, detector, units)
     raise CpunetError(
@@ -181,6 +184,28 @@ def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
         f"{path}: HDF5 without hits; expected stp (remage), {TABLE} (cpunet simulate) or "
         f"{NTUPLE} (g4simple)"
     )
+
+
+def _npz(path: Path) -> Steps:
+    """Read the steps of an archive. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
+    arrays = read_arrays(path)
+    missing = [name for name in _NEEDED if name not in arrays]
+    if missing:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(_NEEDED)}")
+    for name in _NEEDED:
+        values = arrays[name]
+        if values.ndim != 1 or values.dtype.kind not in "iuf":
+            raise CpunetError(
+                f"{path}: array {name} is of {values.dtype} and shape {values.shape}; give "
+                "one number per hit, and offsets of the events"
+            )
+    x, y, z, edep = (np.asarray(arrays[name], float) for name in _NEEDED[:-1])
+    offsets = whole_numbers(path, "offsets", arrays["offsets"])
+    rising = len(offsets) > 0 and offsets[0] == 0 and not np.any(np.diff(offsets) < 0)
+    if not rising or {len(a) for a in (x, y, z, edep)} != {int(offsets[-1])}:
+        raise CpunetError(f"{path}: offsets do not divide the hits into events")
+    event = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    return Steps(event, np.stack([x, y, z], axis=1), edep)
 
 
 def _without_detectors(path: Path, detector: str | None) -> None:
