@@ -9,9 +9,7 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from lgdo import Array, Scalar, Table, VectorOfVectors, WaveformTable
+from lgdo import Array, Table, VectorOfVectors, WaveformTable
 from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
@@ -239,24 +237,6 @@ def test_nan_samples_are_passed_on(file):
     pulses = open_pulses(file, kev_per_adc=1.0).read()
     assert np.isnan(pulses.waveforms[1, 2])
     assert np.isnan(pulses.energy_kev).tolist() == [False, True, False]
-
-
-def test_scalars_beside_the_waveforms_do_not_disturb(file, raw):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="geds")
-    lh5.write(Scalar(3.5), "geds/note", file)
-    assert open_pulses(file).n_pulses == N
-
-
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
-@given(size=st.integers(1, 40))
-def test_any_block_size_gives_the_same_pulses(tmp_path_factory, size):
-    file = tmp_path_factory.mktemp("sizes") / "pulses.lh5"
-    values = np.arange(N * 5, dtype=np.float32).reshape(N, 5)
-    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
-    blocks = list(open_pulses(file).blocks(size))
-    assert max(len(block) for block in blocks) <= size
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), values)
-    assert np.concatenate([b.event_number for b in blocks]).tolist() == list(range(N))
 
 
 def test_memory_does_not_grow_with_the_file(file):
