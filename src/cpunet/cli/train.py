@@ -32,7 +32,6 @@ Init = Annotated[
         help="Run to start from, as of another detector or period; a matched one makes pairs."
     ),
 ]
-Board = Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs too.")]
 
 
 @options.grouped
@@ -46,7 +45,6 @@ def train(
     read_as: options.ReadAsOrAll,
     threads: options.Threads = None,
     device: options.Device = "auto",
-    tensorboard: Board = False,
     init: Init = None,
     resume: Resume = False,
     force: options.Force = False,
@@ -91,7 +89,7 @@ def train(
                 read_as.data(data),
                 out_folder,
                 chosen,
-                TrainOptions(on.peak, seed, device, init, resume, force, tensorboard),
+                TrainOptions(on.peak, seed, device, init, resume, force),
                 stop=stop,
                 monitor=shown,
             )

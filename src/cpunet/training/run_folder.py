@@ -41,7 +41,7 @@ RUN = FolderKind(
     name="run",
     command="cpunet train",
     known_by=INFO,
-    own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors|tensorboard(/events\.out\..*)?"
+    own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
     r"|metrics\.json|figures\.npz"  # of an ensemble's members, and of `cpunet figure`
     r"|calibration\.(json|html)|detector\.yaml|settings\.yaml|sim\.lh5",
 )

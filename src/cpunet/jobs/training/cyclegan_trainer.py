@@ -14,7 +14,7 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.network_start import NetworkStart, network_start
-from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions, losses_shown
+from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.held_out import Kept
@@ -77,14 +77,10 @@ class CycleGanTrainer:
         run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
         state = share_state(job.group, run.begin(resume=job.options.resume))
         start = self._start(job)
-        with (
-            losses_shown(job.folder, wanted=job.options.tensorboard) as show,
-            _Stages(job.monitor, start, self.steps, state) as stages,
-        ):
+        with _Stages(job.monitor, start, self.steps, state) as stages:
 
             def listen(records: list[Record]) -> None:
                 run.log(records)
-                show(records)
                 stages.trained(len(records))
 
             hooks = CheckpointHooks(run.save, state, job.stop, stages.paired)

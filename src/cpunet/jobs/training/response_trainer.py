@@ -11,7 +11,7 @@ from pathlib import Path
 from cpunet.errors import CpunetError
 from cpunet.files import folder_written_aside
 from cpunet.jobs.training.chain_and_inverse import known_response, match
-from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions, losses_shown
+from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
@@ -65,17 +65,14 @@ class ResponseTrainer:
         started, clock = datetime.now(UTC), time.perf_counter()
         if job.options.init is not None:
             known = known_response(job.options.init, job.data.dt_ns)
-        with (
-            losses_shown(job.folder, wanted=job.options.tensorboard) as show,
-            # upper limit for one start; most fits need fewer steps
-            job.monitor.stage("Matching", self.recipe.matching.training.steps) as advance,
-        ):
+        # upper limit for one start; most fits need fewer steps
+        steps = self.recipe.matching.training.steps
+        with job.monitor.stage("Matching", steps) as advance:
 
             def listen(step: int, chi_square: float) -> None:
                 losses = {"chi_square": chi_square}
                 record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
                 append_losses(job.folder, [record])
-                show([record])
                 advance(1)
                 job.monitor.state(f"chi-square {chi_square:.4g}")
 

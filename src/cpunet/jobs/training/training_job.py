@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +15,8 @@ from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
-from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup
-from cpunet.training.run_folder import read_losses, versions
-from cpunet.training.tensorboard import LossBoard
+from cpunet.training.run_folder import versions
 
 
 class Trained(NamedTuple):
@@ -60,8 +56,6 @@ class TrainOptions:
         Whether to resume an unfinished training, if any; all else must be unchanged.
     force
         Whether to replace an existing folder and, without `resume`, an unfinished training.
-    tensorboard
-        Whether to write TensorBoard logs (needs the extra ``tensorboard``).
     """
 
     peak: str = "FEP"
@@ -70,7 +64,6 @@ class TrainOptions:
     init: Path | None = None
     resume: bool = False
     force: bool = False
-    tensorboard: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,18 +120,3 @@ class TrainingJob:
             "sim": self.sim.provenance(),
             "data": self.data.provenance(),
         }
-
-
-@contextmanager
-def losses_shown(folder: Path, *, wanted: bool) -> Iterator[Callable[[list[Record]], None]]:
-    """Yield a function that sends records to TensorBoard, if wanted; send logged ones first."""
-    if not wanted:
-        yield lambda _records: None
-        return
-    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # has repeated iterations
-    board = LossBoard(folder)
-    try:
-        board.add(read_losses(folder))
-        yield board.add
-    finally:
-        board.close()
