@@ -37,13 +37,11 @@ def test_translating_the_other_side(command, stand, trained, tmp_path, folder):
 
 
 @pytest.mark.parametrize("inverse", [(), ("--inverse",)])
-@pytest.mark.parametrize("column", [(), ("--append-column", "waveform_new")])
-def test_translating_twice(command, stand, trained, tmp_path, inverse, column):
+def test_translating_twice(command, stand, trained, tmp_path, inverse):
     first, again = tmp_path / "first.lh5", tmp_path / "again.lh5"
     source = stand.data if inverse else stand.sim
-    assert command("translate", trained, source, "--out", first, *inverse, *column).code == 0
-    table = ("--table", f"geds/{'raw' if inverse else 'sim'}/waveform_new") if column else ()
-    words = ("translate", trained, first, *table, "--out", again)
+    assert command("translate", trained, source, "--out", first, *inverse).code == 0
+    words = ("translate", trained, first, "--out", again)
     line = refused(command(*words, *inverse, "--insist"))
     assert f"were translated by {'IREN' if inverse else 'REN'} already" in line
     assert "that they were made of" in line

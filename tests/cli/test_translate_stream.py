@@ -68,11 +68,8 @@ def test_one_finished_file_is_skipped(command, trained, sources, tmp_path):
     assert "20 of 20 pulses translated (it was there already)" in said(again)
 
 
-def test_a_column_and_realisations(command, trained, sources, tmp_path):
+def test_realisations(command, trained, sources, tmp_path):
     first = ("translate", trained, sources / "sim_0.lh5", "--out")
-    assert command(*first, tmp_path / "a.lh5", "--append-column", "waveform_ren").code == 0
-    table = lh5.read("geds/sim", tmp_path / "a.lh5")
-    assert {"waveform", "waveform_ren", "waveform_ren_rejection"} <= set(table)
     assert command(*first, tmp_path / "b.lh5", "--realisations", 2).code == 0
     table = lh5.read("geds/ren", tmp_path / "b.lh5")
     assert table.realisation.nda.tolist() == [0, 1] * 20

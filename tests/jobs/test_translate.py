@@ -261,37 +261,6 @@ def test_the_options_of_a_translation_are_told(busy, tmp_path):
         assert provenance(open_pulses(out)).get("options") == said
 
 
-def test_a_column_appended_to_a_copy(run, tmp_path):
-    source = sim_file(tmp_path / "sim.lh5", **many_columns())
-    with h5py.File(source, "a") as file:
-        file["elsewhere/note"] = 5
-    before = source.read_bytes()
-    out = tmp_path / "out.lh5"
-    translate_file(
-        run,
-        InputFile(source),
-        out,
-        TranslateOptions(append_column="waveform_ren"),
-        device="cpu",
-    )
-    assert source.read_bytes() == before
-    table = lh5.read("geds/sim", out)
-    assert isinstance(table.waveform_ren, WaveformTable)
-    assert set(table) - set(lh5.read("geds/sim", source)) == {
-        "waveform_ren",
-        "waveform_ren_rejection",
-    }
-    np.testing.assert_array_equal(table.waveform.values.nda, charge())
-    translate_file(run, InputFile(source), tmp_path / "plain.lh5", device="cpu")
-    np.testing.assert_array_equal(table.waveform_ren.values.nda, values(tmp_path / "plain.lh5"))
-    with h5py.File(out) as file:
-        assert file["elsewhere/note"][()] == 5
-    again = TranslateOptions(append_column="waveform_ren")
-    with pytest.raises(CpunetError, match="has a column waveform_ren already"):
-        translate_file(run, InputFile(out), tmp_path / "again.lh5", again, device="cpu")
-    assert names(tmp_path) == ["out.lh5", "plain.lh5", "sim.lh5"]
-
-
 # --- noise and bytes
 
 
@@ -795,8 +764,6 @@ def test_adc_needs_to_be_known(network, tmp_path):
     [
         ({"realisations": 0}, "expected 1 or more"),
         ({"realisations": 2, "noise": False}, "all the same"),
-        ({"realisations": 2, "append_column": "a"}, "cannot be a further column"),
-        ({"table": "a/b", "append_column": "a"}, "leave out --out-table"),
         ({"inverse": True, "adc": Adc()}, "leave out --output adc"),
     ],
 )
@@ -840,15 +807,12 @@ def test_what_a_killed_process_left_is_removed(run, tmp_path):
     assert names(tmp_path) == [".out-2-sxgnbmrx.partial.lh5", "out.lh5", "sim.lh5"]
 
 
-@pytest.mark.parametrize("options", [{}, {"append_column": "waveform_ren"}])
-def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path, options):
+def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path):
     source, out = sim_file(tmp_path / "sim.lh5", n=400), tmp_path / "out" / "out.lh5"
     listing = r"out.lh5: cannot be written \(File too large\); nothing was left$"
     for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
         with nearly_full_disk(size), pytest.raises(CpunetError, match=listing):
-            translate_file(
-                run, InputFile(source), out, TranslateOptions(**options), device="cpu"
-            )
+            translate_file(run, InputFile(source), out, device="cpu")
         assert names(out.parent) == []
 
 

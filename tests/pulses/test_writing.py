@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from lgdo import Array, Table, VectorOfVectors, WaveformTable
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.appending import ColumnAppender
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.row_columns import RowColumns, repeated
@@ -83,20 +82,14 @@ def test_units_attributes_and_compression(tmp_path):
         assert values.chunks[1] == 20
 
 
-@pytest.mark.parametrize("column", ["waveform", "waveform_ren"])
-def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path, column):
+def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     build_dsp = pytest.importorskip("dspeed").build_dsp
     path, pulses = tmp_path / "pulses.lh5", some(20, 30)
     write_pulses(path, pulses, table="geds/raw", waveform_units="ADC", attrs={"run": "r001"})
-    if column != "waveform":
-        source, path = path, tmp_path / "more.lh5"
-        words = {"table": "geds/raw", "name": column, "waveform_units": "ADC"}
-        with ColumnAppender(path, source, **words, attrs={"run": "run"}) as writer:
-            writer.append(pulses)
     largest = {
         "function": "amax",
         "module": "numpy",
-        "args": [column, 1, "wf_max"],
+        "args": ["waveform", 1, "wf_max"],
         "kwargs": {"signature": "(n),()->()", "types": ["fi->f"]},
     }
     build_dsp(
@@ -226,17 +219,6 @@ def test_no_column_replaces_another(tmp_path):
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 
-def test_no_values_are_appended_to_a_column_that_exists(tmp_path):
-    source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
-    write_pulses(source, some(6), columns={"more_scale": (np.arange(6.0), "")})
-    with (
-        pytest.raises(CpunetError, match="has a column more_scale already; choose another"),
-        ColumnAppender(out, source, table="geds/sim", name="more") as writer,
-    ):
-        writer.append(some(6), {"scale": (np.zeros(6), "")})
-    assert not out.exists()
-
-
 def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
     def full(*_given):
         raise CpunetError("no space left")
@@ -246,25 +228,3 @@ def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match="no space left"), writer:
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_column_of_other_length_is_not_appended(tmp_path):
-    source, out = tmp_path / "pulses.lh5", tmp_path / "out.lh5"
-    write_pulses(source, some(6))
-    with (
-        pytest.raises(CpunetError, match="5 pulses beside 6 rows"),
-        ColumnAppender(out, source, table="geds/sim", name="more") as writer,
-    ):
-        writer.append(some(5))
-    for table, name, said in (
-        ("geds/sim", "energy", "has a column energy already"),
-        ("geds", "more", "no table of LH5"),
-    ):
-        with (
-            pytest.raises(CpunetError, match=said),
-            ColumnAppender(out, source, table=table, name=name),
-        ):
-            pass
-    with pytest.raises(CpunetError, match="no name of a column"):
-        ColumnAppender(out, source, table="geds/sim", name="a/b")
-    assert [path.name for path in tmp_path.iterdir()] == ["pulses.lh5"]

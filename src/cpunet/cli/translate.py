@@ -63,10 +63,6 @@ Table = Annotated[
     str | None, typer.Option(help="Table to read, if the file has several; or all.")
 ]
 OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or geds/iren.")]
-AppendColumn = Annotated[
-    str | None,
-    typer.Option(help="Copy the file, and add the pulses to its table as a column so named."),
-]
 Jobs = Annotated[
     int,
     typer.Option(
@@ -156,7 +152,6 @@ def translate(
     realisations: Realisations = None,
     table: Table = None,
     out_table: OutTable = None,
-    append_column: AppendColumn = None,
     energy: options.Energy = None,
     kev_per_adc: options.KevPerAdc = None,
     dt: options.Dt = None,
@@ -186,7 +181,7 @@ def translate(
     files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
     place = Path(out_name)
     form = TranslateOptions(
-        inverse, noise, seed, out_table, append_column, realisations, adc, remains, pile_up_khz
+        inverse, noise, seed, out_table, realisations, adc, remains, pile_up_khz
     )
     how: dict[str, Any] = {"device": device, "resume": resume, "force": force}
     how["monitor"] = monitor()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -104,11 +103,9 @@ def recorded_attributes(source: PulseSource) -> dict[str, str]:
     if told["format"] not in ("LH5", "HDF5"):
         return {}
     with opened(source.path) as file:
-        places = _places(file, told["table"])
-        found = {
-            name: next((text for place in places if (text := text_attribute(place, name))), "")
-            for name in (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
-        }
+        table = file[told["table"].rpartition("/")[0] or "/"]
+        names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
+        found = {name: text_attribute(table, name) for name in names}
         found[TRANSLATION] = text_attribute(file, TRANSLATION)
     return {name: text for name, text in found.items() if text}
 
@@ -172,12 +169,3 @@ def _turns(
     steps = np.diff(part, axis=1)
     signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
     return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
-
-
-def _places(file: h5py.File, waveforms: str) -> list[h5py.Group | h5py.Dataset]:
-    """Objects that may carry attributes of pulses: table, column and samples."""
-    column = file[waveforms]
-    places = [file[waveforms.rpartition("/")[0] or "/"], column]
-    if isinstance(column, h5py.Group) and "values" in column:
-        places.append(column["values"])
-    return places

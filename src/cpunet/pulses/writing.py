@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import h5py
 import lh5
@@ -321,15 +321,13 @@ class FileInTheMaking:
         Temporary path that is written.
     target
         Final path, for error messages.
-    mode
-        ``"w"`` for a new file, ``"r+"`` to modify an existing one.
     """
 
-    def __init__(self, aside: Path, target: Path, mode: Literal["w", "r+"] = "w") -> None:
+    def __init__(self, aside: Path, target: Path) -> None:
         self._target = target
         with write_errors(target):
-            self._held = HeldFile(aside, "w+" if mode == "w" else "r+")
-            self.h5 = h5py.File(self._held, mode)
+            self._held = HeldFile(aside, "w+")
+            self.h5 = h5py.File(self._held, "w")
 
     def __enter__(self) -> Self:
         return self

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,12 @@ from cpunet.jobs.translation.translation_record import (
     run_print,
     source_print,
 )
-from cpunet.jobs.translation.translation_writers import Writer, other_columns, writer_of
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
+from cpunet.pulses.writing import PulseWriter
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
@@ -45,6 +45,10 @@ from cpunet.translation.translator import IREN, REN, Translator
 QUIET, DEFAULTS = Monitor(), TranslateOptions()
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
+OWN_COLUMNS = frozenset(
+    {"waveform", "energy", "event_number", "rejection", "realisation", "remains_kev"}
+    | {"n_piled", "piled_kev", "piled_ns"}
+)
 
 
 class FileTranslation:
@@ -109,9 +113,16 @@ class FileTranslation:
                 return finished(out, made) | {"skipped": True}
             refuse_existing(out, force=force)
             pulses = self.opened(source)
-            others = other_columns(pulses, self.options, monitor.note)
-            attrs = {TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)}
-            writer = writer_of(pulses, out, self.form, self.options, attrs, force=force)
+            others = _other_columns(pulses, monitor.note)
+            writer = PulseWriter(
+                out,
+                table=self.options.table or f"geds/{self.kind.part}",
+                waveform_units=self.form.units,
+                t0_ns=self.form.t0_ns,
+                attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)},
+                samples=self.form.samples,
+                force=force,
+            )
             with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
                 counts = self._translate(pulses, noise_key, writer, others, advance)
                 self._require_some(source, counts)
@@ -179,7 +190,7 @@ class FileTranslation:
         self,
         pulses: PulseSource,
         noise_key: str | None,
-        writer: Writer,
+        writer: PulseWriter,
         others: RowColumns,
         advance: Advance,
     ) -> Counts:
@@ -272,3 +283,16 @@ def _read(pulses: PulseSource, advance: Advance) -> Iterator[Pulses]:
     for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
         yield block
         advance(len(block))
+
+
+def _other_columns(pulses: PulseSource, note: Callable[[str], None]) -> RowColumns:
+    """Find the columns to be copied to the output; `note` reports those left out."""
+    told = pulses.describe()
+    if told["format"] in ("LH5", "HDF5"):
+        n_pulses = pulses.n_pulses or 0
+        others = RowColumns.of_hdf5(pulses.path, told["table"], n_pulses, OWN_COLUMNS)
+    else:
+        others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
+    for column, reason in others.left_out.items():
+        note(f"warning: {pulses.path.name}: column {column} is left out: {reason}")
+    return others

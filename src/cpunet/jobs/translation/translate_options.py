@@ -30,8 +30,6 @@ class TranslateOptions:
         Whether to add noise, and its seed.
     table
         Table for the pulses in the LH5 file; ``geds/ren`` or ``geds/iren`` if None.
-    append_column
-        Copy the file and add the pulses to the table that was read, as a column of this name.
     realisations
         Number of noise draws for each pulse. Each draw is a row, numbered in the column
         ``realisation``.
@@ -50,7 +48,6 @@ class TranslateOptions:
     noise: bool = True
     seed: int = 0
     table: str | None = None
-    append_column: str | None = None
     realisations: int | None = None
     adc: Adc | None = None
     remains: str = NONE
@@ -65,15 +62,6 @@ class TranslateOptions:
             raise CpunetError("realisations without noise are all the same; give one of both")
         if self.table is not None and not self.table.strip("/ "):
             raise CpunetError("--out-table is empty; leave it out, or give a name as geds/ren")
-        if self.append_column is not None and self.realisations is not None:
-            raise CpunetError(
-                "realisations repeat rows, so they cannot be a further column; "
-                "leave out --append-column"
-            )
-        if self.append_column is not None and self.table is not None:
-            raise CpunetError(
-                "a column is appended to the table that is read; leave out --out-table"
-            )
         if self.remains != NONE and self.inverse:
             raise CpunetError("the inverse gives charge, without remains; leave out --remains")
         if self.remains != NONE and not self.noise:
