@@ -301,9 +301,10 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
 
 
 def test_files_to_write_are_not_each_other_and_not_in_vain(tmp_path, reference_data):
-    raw, out, run = reference_data / "real" / "th228.fcio", tmp_path / "out", tmp_path / "run"
-    with pytest.raises(CpunetError, match="for the page and for the traces"):
-        describe(raw, recipe=RECIPE, without_remains=out, out=tmp_path / "." / "out")
+    raw, run = reference_data / "real" / "th228.fcio", tmp_path / "run"
+    out = tmp_path / "out.png"
+    with pytest.raises(CpunetError, match="for the figure and for the traces"):
+        describe(raw, recipe=RECIPE, without_remains=out, out=tmp_path / "." / "out.png")
     run.mkdir()
     (run / "run.json").write_text("{}")
     with pytest.raises(CpunetError, match="a run has no traces; leave out --without-remains"):
@@ -320,11 +321,11 @@ def test_other_folders_are_named(tmp_path, file, words):
         describe(tmp_path)
 
 
-def test_a_page_of_traces_that_are_no_numbers(tmp_path):
+def test_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
-    told = describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "page.html")
-    assert told["n_not_finite"] == 30
-    assert "What is in pulses.npy" in (tmp_path / "page.html").read_text("utf-8")
+    assert describe(tmp_path / "pulses.npy", dt_ns=16)["n_not_finite"] == 30
+    with pytest.raises(CpunetError, match="no spectrum to draw"):
+        describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "e.png")
 
 
 def test_shares_are_percent_whatever_their_time():
@@ -344,17 +345,21 @@ def test_all_of_the_traces_are_saturated():
     assert lines["pile-up"].startswith("0.25 % ")
 
 
-def test_a_page_replaces_nothing_unasked(tmp_path):
-    path, page = tmp_path / "pulses.npy", tmp_path / "page.html"
+def test_a_figure_replaces_nothing_unasked(tmp_path):
+    path, out = tmp_path / "pulses.npy", tmp_path / "pulses.png"
     np.save(path, np.tile(np.arange(300.0), (3, 1)))
-    with pytest.raises(CpunetError, match=r"pulses\.npy"):
+    with pytest.raises(CpunetError, match="pictures are made as"):
         describe(path, dt_ns=16, out=path, force=True)
-    describe(path, dt_ns=16, out=page)
-    first = page.read_text("utf-8")
-    assert "What is in pulses.npy" in first
-    assert "Cs-137" in first
+    describe(path, dt_ns=16, out=out)
     with pytest.raises(CpunetError, match="exists already"):
-        describe(path, dt_ns=16, out=page)
+        describe(path, dt_ns=16, out=out)
+
+
+def test_a_run_has_no_spectrum(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    with pytest.raises(CpunetError, match="no spectrum to draw"):
+        describe(tmp_path / "run", out=tmp_path / "run.png")
 
 
 def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):

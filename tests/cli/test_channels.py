@@ -117,11 +117,7 @@ def test_calibrate_takes_one_channel(command, stand, raw, tmp_path):
 
 
 @pytest.mark.slow
-def test_info_of_all_tables(command, raw, tmp_path):
-    page = tmp_path / "raw.html"
-    told = command("info", raw, "--table", "all", "--out", page)
+def test_info_of_all_tables(command, raw):
+    told = command("info", raw, "--table", "all")
     assert told.code == 0
     assert told.out.count("trigger ") == 3
-    html = page.read_text("utf-8")
-    assert html.count("<h2>ch") == html.count("<img ") == 3
-    assert "http:" not in html

@@ -18,6 +18,22 @@ COLUMNS = 3
 LINEAR = 3.0
 
 
+def calibration_figures(content: Mapping[str, Any]) -> dict[str, Figure]:
+    """``pulls``; ``profiles`` and ``directions``, if any parameter was free.
+
+    Parameters
+    ----------
+    content
+        Content of ``calibration.json``.
+    """
+    found = {"pulls": pulls_figure(content)}
+    if content["profiles"]:
+        found["profiles"] = profiles_figure(content)
+    if content["directions"]:
+        found["directions"] = directions_figure(content["directions"])
+    return found
+
+
 @styled
 def profiles_figure(content: Mapping[str, Any]) -> Figure:
     """Profile chi-square of each free parameter, one panel each.

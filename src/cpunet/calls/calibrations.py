@@ -10,11 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from cpunet.analysis.calibration_figures import (
-    directions_figure,
-    profiles_figure,
-    pulls_figure,
-)
+from cpunet.analysis.calibration_figures import calibration_figures
 from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
@@ -87,12 +83,7 @@ class CalibratedRun(Run):
     @property
     def figures(self) -> dict[str, Figure]:
         """``pulls``; ``profiles`` and ``directions``, if any parameter was free."""
-        found = {"pulls": pulls_figure(self.content)}
-        if self.content["profiles"]:
-            found["profiles"] = profiles_figure(self.content)
-        if self.content["directions"]:
-            found["directions"] = directions_figure(self.content["directions"])
-        return found
+        return calibration_figures(self.content)
 
     def _repr_html_(self) -> str:
         rows = [

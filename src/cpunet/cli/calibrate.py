@@ -220,9 +220,14 @@ def result_lines(content: dict[str, Any]) -> list[str]:
         f"{told['simulated']:.5g}; ± {told['error_all']:.2g} if all physics were free)"
         for name, told in content["parameters"].items()
     ]
+    fixed = ", ".join(
+        f"{titled(name)} (chi-square would fall by {told['chi_square_would_fall_by']:.1f})"
+        for name, told in content["fixed"].items()
+    )
     return [
-        *(lines or ["the data tell none of the physics better than they are known"]),
-        f"chi-square per function {before:.2f} before, {after:.2f} after; see calibration.html",
+        *(lines or ["no parameter of the physics is determined better than it was known"]),
+        *([f"left as simulated: {fixed}"] if fixed else []),
+        f"chi-square per function {before:.2f} before, {after:.2f} after; see pulls.png",
     ]
 
 

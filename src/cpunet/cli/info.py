@@ -30,9 +30,8 @@ WithoutRemains = Annotated[
         "with the columns remains_kev and remains_error_kev.",
     ),
 ]
-Page = Annotated[
-    Path | None,
-    typer.Option("--out", help="HTML page to write: the same with the spectrum and its lines."),
+Out = Annotated[
+    Path | None, typer.Option(help="Figure of the spectrum and its lines: .png, .pdf or .svg.")
 ]
 Crystal = Annotated[
     str | None,
@@ -52,7 +51,7 @@ def info(
     detector: Crystal = None,
     length_unit: LengthUnit = None,
     energy_unit: EnergyUnit = None,
-    page: Page = None,
+    out: Out = None,
     without_remains: WithoutRemains = None,
     force: options.Force = False,
 ) -> None:
@@ -62,7 +61,7 @@ def info(
     earlier pulses have left under them. Files of hits are described, too: events, energies and
     where they lie.
 
-    Example: cpunet info raw.lh5 --out raw.html
+    Example: cpunet info raw.lh5 --out raw.png
 
     Example: cpunet info raw.lh5 --table all
 
@@ -73,7 +72,7 @@ def info(
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.training.run_schema import problem
 
-    for target in (page, without_remains):
+    for target in (out, without_remains):
         if target is not None:
             refuse_inputs(target, detector)
     told = describe(
@@ -86,7 +85,7 @@ def info(
         detector=None if detector is None else read_detector(detector),
         hit_units=(length_unit, energy_unit),
         without_remains=without_remains,
-        out=page,
+        out=out,
         force=force,
     )
     if told["kind"] == "run" and (wrong := problem(told)):
@@ -100,8 +99,8 @@ def info(
             _print([("", one)] if isinstance(one, str) else in_words(one))
     else:
         _print(in_words(told))
-    if page is not None:
-        tell(f"{page}")
+    if out is not None:
+        tell(f"{out}")
     failed = [n for n, one in told.get("channels", {}).items() if isinstance(one, str)]
     if failed:
         raise CpunetError(

@@ -43,7 +43,7 @@ RUN = FolderKind(
     known_by=INFO,
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
     r"|metrics\.json|figures\.npz"  # of an ensemble's members, and of `cpunet figure`
-    r"|calibration\.(json|html)|detector\.yaml|settings\.yaml|sim\.lh5",
+    r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
 )
 
 

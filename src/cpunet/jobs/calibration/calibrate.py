@@ -15,8 +15,7 @@ import numpy as np
 import yaml
 
 import cpunet
-from cpunet.analysis.calibration_figures import directions_figure
-from cpunet.analysis.calibration_page import calibration_page
+from cpunet.analysis.calibration_figures import calibration_figures, directions_figure
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, known_before
@@ -53,7 +52,8 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run_folder import RUN, write_run
 
 QUIET = Monitor()
-CALIBRATION, PAGE, SIM = "calibration.json", "calibration.html", "sim.lh5"
+CALIBRATION, SIM = "calibration.json", "sim.lh5"
+DPI = 110
 DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
 PLAN = FolderKind(
     name="plan",
@@ -121,7 +121,8 @@ class Calibration:
         The folder is a run like those of `cpunet.jobs.training.train.train_run`, and contains
         the calibrated ``detector.yaml`` and ``settings.yaml``, ``sim.lh5`` (all events,
         simulated again with them), ``calibration.json`` (see
-        `cpunet.calibration.result.described`) and ``calibration.html``.
+        `cpunet.calibration.result.described`) and its figures, ``profiles.png``, ``pulls.png``
+        and ``directions.png``.
 
         Parameters
         ----------
@@ -168,7 +169,8 @@ class Calibration:
             info["seconds"] = content["seconds"] = round(time.perf_counter() - clock, 1)
             content["fit"] = {k: info["fit"][k] for k in ("chi_square", "moments", "verdict")}
             (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
-            (folder / PAGE).write_text(calibration_page(content), encoding="utf-8")
+            for name, figure in calibration_figures(content).items():
+                figure.savefig(folder / f"{name}.png", dpi=DPI)
             write_run(folder, model, recipe, info | {"calibration": CALIBRATION})
         return content
 
@@ -200,7 +202,7 @@ class Calibration:
             content = self._planned(folder, monitor)
             (folder / "plan.json").write_text(json.dumps(content, indent=1) + "\n")
             figure = directions_figure(content["directions"][str(PLANNED[1])])
-            figure.savefig(folder / "plan.png", dpi=110)
+            figure.savefig(folder / "plan.png", dpi=DPI)
         return content
 
     def _planned(self, folder: Path, monitor: Monitor) -> dict[str, Any]:

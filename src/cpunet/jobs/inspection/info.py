@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 import cpunet
-from cpunet.analysis.spectrum_figure import Spectrum
+from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
+from cpunet.files import written_aside
 from cpunet.jobs.common.channels import ALL, channels_of
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
-from cpunet.jobs.inspection.info_page import Spectra, write_info_page
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
-from cpunet.outputs import refuse_existing, resolved
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, resolved
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
@@ -43,6 +43,7 @@ _NO_RUNS = {
     "stand.json": "a virtual test stand, whose sim.lh5 and data.lh5 can be given; ",
     "report.html": "a report, to be opened in a browser (report.html); ",
 }
+DPI = 150
 LOOKED_AT, REMAINS_BLOCK = 256, 4096  # traces read at a time
 
 
@@ -80,7 +81,7 @@ def describe(
         LH5 file to write: the traces after subtraction of their remains, with columns
         ``remains_kev`` and ``remains_error_kev``.
     out
-        HTML page to write.
+        Figure of the spectrum to write: ``.png``, ``.pdf`` or ``.svg``.
     force
         Whether to replace these files.
 
@@ -98,7 +99,8 @@ def describe(
         For a file, ``kind`` (``"pulses"``), ``path``, the result of `PulseSource.describe`,
         and: ``n_pulses``; ``energy_kev`` (lowest and highest, None if unknown) and
         ``n_without_energy``; ``peaks`` (number of pulses by line); ``amplitudes``, a
-        suggested calibration if no energy is known; ``samples`` (lowest and highest of the
+        suggested calibration if no energy is known, or else ``found``, the source whose lines
+        are there, and at which share of their energies; ``samples`` (lowest and highest of the
         finite traces); the numbers ``n_not_finite`` and ``n_constant`` of traces;
         ``provenance``, if the file records it; for measured traces with a `recipe`,
         ``traces``, the result of `trace_properties`, and ``remains``, that of
@@ -107,8 +109,8 @@ def describe(
     Raises
     ------
     CpunetError
-        If the file does not exist or cannot be read, a file to be written exists, or remains
-        are to be subtracted but cannot be estimated.
+        If the file does not exist or cannot be read, a file to be written exists, remains
+        are to be subtracted but cannot be estimated, or there is not one spectrum to draw.
 
     Examples
     --------
@@ -120,6 +122,8 @@ def describe(
     (3, 8, 3)
     """
     path = Path(path)
+    if out is not None and out.suffix.lower() not in PICTURE_FORMATS:
+        raise CpunetError(f"{out}: pictures are made as {', '.join(PICTURE_FORMATS)}")
     for target in (without_remains, out):
         if target is not None:
             refuse_existing(target, path, energy, force=force)
@@ -129,45 +133,49 @@ def describe(
         and resolved(out) == resolved(without_remains)
     ):
         raise CpunetError(
-            f"{out}: is given for the page and for the traces; choose another --out"
+            f"{out}: is given for the figure and for the traces; choose another --out"
         )
+    spectrum: Spectrum | None = None
     if path.is_dir():
         if without_remains is not None:
             raise CpunetError(f"{path}: a run has no traces; leave out --without-remains")
         told = _run(path) | {"kind": "run", "path": str(path)}
-        spectra: Spectra = {}
     elif holds_hits(path) and without_remains is None:
         chosen = None if table == ALL else table
         peaks = recipe.peaks if recipe else {}
         told = describe_hits(path, chosen, peaks, detector, hit_units)
-        spectra = {}
     else:
         file = InputFile(path, table, energy, kev_per_adc, dt_ns)
-        told, spectra = _of_file(file, recipe, without_remains, force=force)
+        told, spectrum = _of_file(file, recipe, without_remains, force=force)
     if out is not None:
-        write_info_page(out, told, spectra)
+        if spectrum is None or not np.isfinite(spectrum.values).any():
+            raise CpunetError(
+                f"{path}: no spectrum to draw; give the --table of one detector's pulses, or "
+                "leave out --out"
+            )
+        figure = spectrum_figure(spectrum)
+        with written_aside(out) as aside:
+            figure.savefig(aside, format=out.suffix[1:].lower(), dpi=DPI)
     return told
 
 
 def _of_file(
     file: InputFile, recipe: Recipe | None, without_remains: Path | None, *, force: bool
-) -> tuple[dict[str, Any], Spectra]:
-    """Describe a file of pulses; also return the spectrum of each table that was read."""
+) -> tuple[dict[str, Any], Spectrum | None]:
+    """Describe a file of pulses; also return its spectrum if one table was read."""
     if file.table == ALL and without_remains is None:
         channels: dict[str, Any] = {}
-        spectra: Spectra = {}
         for name, one in channels_of(file).items():
             try:
-                channels[name], spectra[name] = _of_pulses(one, recipe)
+                channels[name], _ = _of_pulses(one, recipe)
             except CpunetError as error:
                 channels[name] = str(error).removeprefix(f"{file.path}: ")
-        return {"kind": "channels", "path": str(file.path), "channels": channels}, spectra
+        return {"kind": "channels", "path": str(file.path), "channels": channels}, None
     tables = table_sizes(file.path) if file.table is None else {}
     if len(tables) > 1 and without_remains is None:
         told = {"tables": _told_of(file.path, tables, file.dt_ns)}
-        return {"kind": "tables", "path": str(file.path), **told}, {}
-    described, spectrum = _of_pulses(file, recipe, without_remains, force=force)
-    return described, {"": spectrum}
+        return {"kind": "tables", "path": str(file.path), **told}, None
+    return _of_pulses(file, recipe, without_remains, force=force)
 
 
 def _of_pulses(
@@ -295,13 +303,18 @@ class _Counts:
 
     def summary(self, spectrum: Spectrum) -> dict[str, Any]:
         found = spectrum.found
-        amplitudes = "no lines that stand out" if found is None else f"like {found}"
+        lines = {} if spectrum.in_kev else {"amplitudes": "no lines that stand out"}
+        if found is not None and spectrum.in_kev:
+            place = 1 / found.kev_per_adc
+            lines = {"found": f"lines of {found.source}, at {place:.4f} of their energies"}
+        elif found is not None:
+            lines = {"amplitudes": f"like {found}"}
         return {
             "n_pulses": self.n_pulses,
             "energy_kev": self.energy_kev or None,
             "n_without_energy": self.n_without_energy,
             "peaks": self.peaks,
-            **({} if spectrum.in_kev else {"amplitudes": amplitudes}),
+            **lines,
             "samples": self.samples or None,
             "n_not_finite": self.n_not_finite,
             "n_constant": self.n_constant,

@@ -1,4 +1,4 @@
-"""Names and texts of the results of `describe`, for a screen or a page."""
+"""Names and texts of the results of `describe`."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ def _pulses(told: Mapping[str, Any]) -> Lines:
         *((name, text) for name, text in told.get("provenance", {}).items()),
         ("energy", _energy(told)),
         ("lines", _counts(told["peaks"])),
+        ("source", told.get("found", "")),
         ("amplitudes", told.get("amplitudes", "")),
         ("samples", f"values {_span(told['samples'])}{_odd(told)}"),
     ]
