@@ -39,7 +39,7 @@ VectorOfVectors(flattened_data=np.ones(3, np.uint8), cumulative_length=ends).to_
 OWN = (
     "stand --preset legend200 --events FEP=400 --out stand"
     "; train --sim stand/sim.lh5 --data stand/data.lh5 --out run"
-    "; explore run --detector icpc --points 20 --out places.html",
+    "; validate run --sim stand/sim.lh5 --data stand/data.lh5 --no-baselines --out report",
     "simulate --detector ppc --hits hits.npz --library --out library.lh5"
     "; fields ppc --out fields.png",
 )

@@ -34,7 +34,7 @@ PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Seconds of simulation or training each, or files that it would take: their imports are tried
 # only.
-TOO_LONG = {"simulation.md", "explorer.md", "legend.md", "python.md"}
+TOO_LONG = {"simulation.md", "legend.md", "python.md"}
 MADE_BY_THE_SITE = ("reference/", "../reference/")
 KEV = 2614.511
 

@@ -54,7 +54,6 @@ SLOW_COMMANDS = {
     "library merge": ("library merge psl.lh5 --out", "out.lh5"),
     "validate": ("validate RUN --sim sim.lh5 --data data.lh5 --no-rivals --out", "out"),
     "check": ("check --sim sim.lh5 --data data.lh5 --out", "out.png"),
-    "explore": ("explore LEARNED --detector detector.yaml --points 4 --out", "out.html"),
     "export parameters": ("export LEARNED --to legend-pars --out", "out"),
 }
 # Those that draw or trace before they write.

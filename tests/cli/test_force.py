@@ -77,12 +77,6 @@ COMMANDS = {
     "summary": [("REPORT", "REPORT/report.html")],
     "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
     "figure": [("RUN losses", "RUN")],
-    "explore": [
-        ("RUN --detector icpc --data D/data.lh5", "D/data.lh5"),
-        ("RUN --detector D/my.yaml", "D/my.yaml"),
-        ("RUN --detector icpc --crystal D/my.yaml", "D/my.yaml"),
-        ("RUN --detector icpc", "RUN/page.html"),
-    ],
     "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
     "library make": [
         ("--detector D/my.yaml", "D/my.yaml"),

@@ -16,7 +16,6 @@ from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.ensemble import ensemble
 from cpunet.cli.environment import drop_nonsense, share_the_machine
-from cpunet.cli.explore import explore
 from cpunet.cli.export import export
 from cpunet.cli.fields import fields
 from cpunet.cli.figure import figure
@@ -82,7 +81,6 @@ for command in (
     summary,
     response,
     figure,
-    explore,
     export,
     info,
 ):

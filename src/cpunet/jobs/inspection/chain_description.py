@@ -120,7 +120,7 @@ def describe_responses(
     if not learned:
         raise CpunetError("no run was given; give the folder of one")
     first = learned[0]
-    require_alike([(run.path, run.dt_ns, run.preparation) for run in learned], "describe")
+    require_alike([(run.path, run.dt_ns, run.preparation) for run in learned])
     _require_sampling(first, truth)
     told: dict[str, Any] = {
         "cpunet": cpunet.__version__,
@@ -324,21 +324,19 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
-def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]], do: str) -> None:
-    """Raise a `CpunetError` unless all runs have the period (ns) and preparation of the first.
-
-    `do` is the verb of what can be done with each of them instead.
-    """
+def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]]) -> None:
+    """Raise a `CpunetError` unless all runs have the first one's period (ns) and preparation."""
     (first, first_ns, preparation), *others = runs
     for run, dt_ns, other in others:
         if not np.isclose(dt_ns, first_ns):
             raise CpunetError(
                 f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
-                f"{first_ns:g} ns; {do} them one by one"
+                f"{first_ns:g} ns; describe them one by one"
             )
         if other != preparation:
             raise CpunetError(
-                f"{run}: trained with another preparation than {first}; {do} them one by one"
+                f"{run}: trained with another preparation than {first}; describe them one by "
+                "one"
             )
 
 
