@@ -64,16 +64,10 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
     @wraps(make_figure)
     def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
         from matplotlib import style
-        from matplotlib.figure import Figure
-
-        from cpunet.analysis.layout import MeasuredLayout
 
         # based on matplotlib's defaults, so that user settings do not change a report
         with style.context(["default", _STYLE]):
-            made = make_figure(*args, **kwargs)
-            if isinstance(made, Figure):
-                made.set_layout_engine(MeasuredLayout())
-            return made
+            return make_figure(*args, **kwargs)
 
     return in_style
 

@@ -325,7 +325,7 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
 
 
 def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]]) -> None:
-    """Raise a `CpunetError` unless all runs have the first one's period (ns) and preparation."""
+    """Raise a `CpunetError` unless all runs have the first's period (ns) and preparation."""
     (first, first_ns, preparation), *others = runs
     for run, dt_ns, other in others:
         if not np.isclose(dt_ns, first_ns):
