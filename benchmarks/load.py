@@ -1,9 +1,9 @@
-"""Time and memory of a summary of a thousand reports, and of a validation of many pulses.
+"""Time and memory of a comparison of a thousand reports, and of a validation of many pulses.
 
-Run with ``python benchmarks/load.py summary --reports 1000 --report REPORT`` for copies of a
+Run with ``python benchmarks/load.py compare --reports 1000 --report REPORT`` for copies of a
 report, or with ``validate --run RUN --sim SIM --data DATA --pulses 1000000``, which repeats the
 pulses of two files until each side has that many.  Prints wall-clock time, processor time and
-peak memory of the process, and the size of the summary or the rejections of the validation.
+peak memory of the process, and the size of the page or the rejections of the validation.
 The chain from steps to raw traces has a benchmark of its own, ``chain.py``.
 """
 
@@ -56,7 +56,7 @@ def many_reports(report: Path, folder: Path, n: int) -> list[Path]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="what", required=True)
-    one = commands.add_parser("summary")
+    one = commands.add_parser("compare")
     one.add_argument("--report", type=Path, required=True)
     one.add_argument("--reports", type=int, default=1000)
     two = commands.add_parser("validate")
@@ -67,9 +67,9 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if given.what == "summary":
+        if given.what == "compare":
             reports = many_reports(given.report, folder, given.reports)
-            call("summary", *reports, "--out", folder / "all.html")
+            call("compare", *reports, "--out", folder / "all.html")
             print(f"{(folder / 'all.html').stat().st_size / 1e6:.1f} MB")
             return
         for side, noise in (("sim", 0.0), ("data", 1.0)):

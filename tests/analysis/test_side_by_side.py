@@ -129,13 +129,17 @@ def test_nonsense_is_no_score(peaks):
         side_by_side({"a": {"peaks": peaks, "ae_survival": [1], "rejections": 3}})
 
 
+def page_of(runs: dict[str, Any]) -> str:
+    return side_by_side_page(side_by_side(runs), runs)
+
+
 def circles(panel: ET.Element) -> list[float]:
     return [float(c.get("cx", "nan")) for c in panel.iter("circle")]
 
 
 def test_the_page_is_whole_and_alone():
     name = 'a<b>&"c"'
-    page = side_by_side_page(side_by_side({name: metrics(), "other": metrics(85.0)}))
+    page = page_of({name: metrics(), "other": metrics(85.0)})
     assert "<b>&" not in page
     assert re.search(r"https?:|src=|href=|url\(|<script", page) is None
     assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in page
@@ -149,7 +153,7 @@ def test_the_page_is_whole_and_alone():
 
 
 def test_dots_and_bars_stand_where_their_scores_are():
-    page = side_by_side_page(side_by_side({"a": metrics(80.0), "b": metrics(84.0)}))
+    page = page_of({"a": metrics(80.0), "b": metrics(84.0)})
     panel = ET.fromstring(re.findall(r"<svg.*?</svg>", page, re.DOTALL)[0])
     left, right = circles(panel)
     per_percent = (right - left) / 4
@@ -172,6 +176,6 @@ def test_dots_and_bars_stand_where_their_scores_are():
 def test_a_run_without_a_score_has_an_empty_line():
     old = metrics()
     del old["peaks"]["SEP"]["two_sample"]
-    page = side_by_side_page(side_by_side({"old": old, "new": metrics()}))
+    page = page_of({"old": old, "new": metrics()})
     panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
     assert [len(circles(panel)) for panel in panels] == [2, 2, 1, 2, 2]

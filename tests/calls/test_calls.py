@@ -183,7 +183,7 @@ def test_a_report_again(report):
     for method in drawn:
         same = before[{"method": method}].values(), after[{"method": method}].values()
         assert np.array_equal(*same)
-    assert set(again.figures) == set(report.figures)
+    assert (again.folder / "FEP_mean_pulse.png").is_file()
 
 
 def test_nothing_is_written_without_a_folder(home, run, tmp_path, monkeypatch):

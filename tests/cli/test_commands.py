@@ -240,8 +240,8 @@ def test_the_report_is_complete(report):
     pictures = {name for name in names if name.endswith(".png")}
     assert set(names) - pictures == {
         ".cpunet.json",
-        "figures.npz",
         "metrics.json",
+        "parameters.npz",
         "report.html",
     }
     expected = {f"{peak}_{p}.png" for peak in ("SEP", "DEP", "FEP") for p in PARAMETERS}
@@ -327,59 +327,3 @@ def test_existing_output_is_refused_and_with_force_replaced(
     else:
         assert "old" in listing(out)  # the program did not write it
         assert (out / marker).stat().st_size > 0
-
-
-@pytest.fixture
-def unscorable(monkeypatch):
-    """Call it, and nothing can be scored any more."""
-
-    def evaluate(*_args, **_options):
-        raise AssertionError("scored")
-
-    return lambda: monkeypatch.setattr("cpunet.jobs.validation.figure_files.evaluate", evaluate)
-
-
-@pytest.mark.thorough
-def test_figures_one_by_one(command, run, stand, tmp_path, unscorable):
-    out = tmp_path / "figures"
-    words = ("figure", run, *stand.inputs, "--no-baselines", "--out", out, "--format")
-    outcome = command(*words, "svg", "spectrum", "SEP single_pulse")
-    assert outcome.code == 0
-    assert listing(out) == ["SEP_single_pulse.svg", "spectrum.svg"]
-    unscorable()
-    again = command(*words, "svg", "spectrum")
-    assert again.code == 2
-    assert "exists already" in again.err
-    # what was scored once is drawn again, also without the pulses
-    assert command(*words, "svg", "SEP mean pulse").code == 0
-    assert command("figure", run, "DEP noise", "--out", out).code == 0
-    assert "DEP_noise.png" in listing(out)
-    # but not of other pulses, or scored otherwise
-    other = command(*words, "svg", "FEP mean pulse", "--seed", 1)
-    assert other.code == 70
-    assert "(AssertionError: scored)" in other.err
-
-
-def test_figures_of_a_report(command, trained, stand, tmp_path, undrawn, unscorable):
-    report, out = tmp_path / "report", tmp_path / "figures"
-    words = ("validate", trained, *stand.inputs, "--no-baselines", "--out", report)
-    assert command(*words).code == 0
-    unscorable()
-    assert command("figure", report, "SEP mean pulse", "--out", out).code == 0
-    assert (out / "SEP_mean_pulse.png").read_bytes()[:4] == b"\x89PNG"
-    given = command("figure", report, "spectrum", *stand.inputs, "--out", out)
-    assert "leave out --sim and --data" in given.err
-    assert "no figure 'nonsense'" in command("figure", report, "nonsense", "--out", out).err
-    (report / "figures.npz").unlink()
-    assert "stores no results" in command("figure", report, "spectrum", "--out", out).err
-
-
-def test_figures_that_there_are_not(command, trained, stand, tmp_path, unscorable):
-    unscorable()  # nobody waits for an answer to a slip
-    assert command("figure", trained, "losses", "--out", tmp_path).code == 0
-    outcome = command("figure", trained, "spectrum", "--out", tmp_path)
-    assert "give --sim and --data" in outcome.err
-    for given in ((), stand.inputs):
-        outcome = command("figure", trained, "nonsense", *given, "--out", tmp_path)
-        assert "no figure 'nonsense'; there are: spectrum, " in " ".join(outcome.err.split())
-    assert command("figure", trained, "losses", "--format", "bmp").code == 2

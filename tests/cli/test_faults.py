@@ -35,9 +35,7 @@ COMMANDS = {
     "stand": ("stand --preset legend200 --detector detector.yaml --events FEP=2 --out", "out"),
     "translate": ("translate RUN sim.lh5 --insist --out", "out.lh5"),
     "compare": ("compare REPORT REPORT2 --out", "out.html"),
-    "summary": ("summary REPORT --out", "out.html"),
     "response": ("response LEARNED --out", "out"),
-    "figure": ("figure RUN losses --out", "out"),
     "export": ("export RUN --format torchscript --out", "out.pt"),
     "library make": (
         "library make --detector detector.yaml --grid-mm 12 --dt-ns 16 --length-ns 3600 --out",
@@ -57,7 +55,7 @@ SLOW_COMMANDS = {
     "export parameters": ("export LEARNED --to legend-pars --out", "out"),
 }
 # Those that draw or trace before they write.
-SECONDS = ("fields", "figure", "response", "export")
+SECONDS = ("fields", "response", "export")
 ALL_COMMANDS = [
     *(
         pytest.param(name, marks=[pytest.mark.thorough] if name in SECONDS else [])
@@ -170,7 +168,7 @@ def test_a_fault_leaves_one_line_and_nothing_else(
     words = ready_words(command, name, tiny)
     is_folder = not Path(words[-1]).suffix
     what, instead = (FOLDER_FAULTS if is_folder else {}).get(fault, FAULTS[fault])
-    if name in ("train", "figure") and fault == "read-only":
+    if name == "train" and fault == "read-only":
         pytest.skip("makes its folder first")
     before = listing(home)
     with monkeypatch.context() as patched:

@@ -74,9 +74,7 @@ COMMANDS = {
         ("sim.lh5 --detector D/my.yaml", "D/my.yaml"),
     ],
     "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
-    "summary": [("REPORT", "REPORT/report.html")],
     "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
-    "figure": [("RUN losses", "RUN")],
     "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
     "library make": [
         ("--detector D/my.yaml", "D/my.yaml"),

@@ -16,10 +16,9 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.validation.drawings import Drawing, drawings, figure_names
+from cpunet.jobs.validation.drawings import drawings
 from cpunet.jobs.validation.energy_ranges import validation_selection
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, _compared, evaluate
-from cpunet.jobs.validation.figure_store import made_of, read_drawings, write_drawings
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
@@ -140,64 +139,19 @@ def test_slices_and_axes_say_which_time_they_mean(whole) -> None:
         whole.details["FEP"].slices["data"].edges, slice_edges(data["rise_01_90"])
     )
     made = drawings(whole)
-    slices, amplitude = made["FEP superpulses"].draw(), made["FEP A over E"].draw()
+    slices, amplitude = made["FEP superpulses"](), made["FEP A over E"]()
     assert "slices of rise time 1–90 %" in slices.legends[0].get_title().get_text()
     labels = [axes.get_xlabel() for axes in amplitude.axes]
     assert "Drift time, 1 % to maximum [ns]" in labels
-    assert made["FEP drift_time"].draw().axes[0].get_xlabel() in labels
+    assert made["FEP drift_time"]().axes[0].get_xlabel() in labels
 
 
 @pytest.mark.thorough
 def test_every_figure_can_be_drawn(whole) -> None:
     made = drawings(whole)
     assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(made)
-    assert set(made) <= set(figure_names(["FEP", "SEP", "DEP"]))
     for drawing in made.values():
-        assert drawing.draw().axes
-
-
-@pytest.mark.thorough
-def test_figures_are_the_same_when_they_were_stored(whole, tmp_path) -> None:
-    # those of one peak, and of none: the others' are of the same kinds
-    made = {n: d for n, d in drawings(whole).items() if not n.startswith(("SEP", "DEP"))}
-    write_drawings(tmp_path / "figures.npz", made, {"seed": 1})
-    found, of = read_drawings(tmp_path / "figures.npz")
-    assert of == {"seed": 1}
-    assert list(found) == list(made)
-    for name, drawing in made.items():
-        ours, theirs = drawing.draw(), found[name].draw()
-        for axes, others in zip(ours.axes, theirs.axes, strict=True):
-            assert (axes.get_title(), axes.get_ylim()) == (
-                others.get_title(),
-                others.get_ylim(),
-            )
-            assert len(axes.lines) == len(others.lines)
-            for line, other in zip(axes.lines, others.lines, strict=True):
-                np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
-
-
-def test_figures_of_other_choices_are_not_those_stored(run, files) -> None:
-    choices = [
-        ValidateOptions(),
-        ValidateOptions(most=7),
-        ValidateOptions(ae_range_kev=(9, 20)),
-    ]
-    made = [made_of(run, files["sim"], files["data"], how) for how in choices]
-    assert made[0] not in made[1:]
-    assert json.loads(json.dumps(made)) == made
-
-
-@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04"])
-def test_a_damaged_store_is_one_line(tmp_path, content) -> None:
-    (tmp_path / "figures.npz").write_bytes(content)
-    with pytest.raises(CpunetError, match=r"cannot be read .* score the run again"):
-        read_drawings(tmp_path / "figures.npz")
-
-
-def test_a_store_with_figures_of_an_unknown_kind_is_one_line(tmp_path) -> None:
-    write_drawings(tmp_path / "figures.npz", {"SEP halo": Drawing("halo", {})}, {"seed": 1})
-    with pytest.raises(CpunetError, match=r"no figures of kind halo.* score the run again"):
-        read_drawings(tmp_path / "figures.npz")
+        assert drawing().axes
 
 
 def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole) -> None:

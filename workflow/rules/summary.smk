@@ -17,7 +17,7 @@ rule summary:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
         runtime=10,
     shell:
-        "cpunet summary {input:q} --out {output:q} --force > {log:q} 2>&1"
+        "cpunet compare {input:q} --out {output:q} --force > {log:q} 2>&1"
 
 
 # for whoever asks: the reports that are there, the page says which are not
@@ -26,4 +26,4 @@ rule so_far:
         reports=REPORTS,
         page=f"{RESULTS}/so_far.html",
     shell:
-        "cpunet summary {params.reports:q} --missing-ok --out {params.page:q} --force"
+        "cpunet compare {params.reports:q} --missing-ok --out {params.page:q} --force"

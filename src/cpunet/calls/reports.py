@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import hist
 import numpy as np
@@ -14,22 +15,21 @@ from matplotlib.figure import Figure
 from cpunet.analysis.chart_data import scored_axis
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
-from cpunet.analysis.report_folder import METRICS
+from cpunet.analysis.report_folder import METRICS, VALUES
 from cpunet.calls.given import File, as_input
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
+from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.compare import read_metrics
 from cpunet.jobs.validation.drawings import Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
-from cpunet.jobs.validation.figure_store import STORE, read_drawings
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
-_HISTOGRAMS = "histograms"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,7 +47,7 @@ class Report:
     notes
         Notes of the job.
     drawn
-        Data of the figures, by name.
+        Functions that draw the figures, by name; none for a report that was opened.
     """
 
     metrics: Mapping[str, Any]
@@ -58,7 +58,7 @@ class Report:
 
     @classmethod
     def load(cls, folder: str | Path) -> Report:
-        """Open the folder of a report; `values` are those of its histograms.
+        """Open the folder of a report; its figures are the PNG files beside it.
 
         Raises
         ------
@@ -67,14 +67,17 @@ class Report:
         """
         remedy = "give the folder of a report, or make one with cpunet.validate"
         metrics = read_metrics(Path(folder) / METRICS, remedy)
-        drawn, _ = read_drawings(Path(folder) / STORE)
         values: dict[str, ByMethod] = {}
-        for one in drawn.values():
-            if one.kind == _HISTOGRAMS:
-                of_peak = values.setdefault(one.values["peak"], {})
-                for method, of_method in one.values["values"].items():
-                    of_peak.setdefault(method, {})[one.values["parameter"]] = of_method
-        return cls(metrics, values, Path(folder), (), drawn)
+        try:
+            with np.load(Path(folder) / VALUES, allow_pickle=False) as stored:
+                for key in stored:
+                    peak, method, name = key.rsplit("/", 2)
+                    values.setdefault(peak, {}).setdefault(method, {})[name] = stored[key]
+        except (OSError, ValueError, BadZipFile) as error:
+            raise CpunetError(
+                f"{Path(folder) / VALUES}: cannot be read ({error}); validate again"
+            ) from error
+        return cls(metrics, values, Path(folder), (), {})
 
     @property
     def scores(self) -> list[dict[str, Any]]:
@@ -103,7 +106,7 @@ class Report:
     @property
     def figures(self) -> Mapping[str, Figure]:
         """Figures by name, drawn on every access."""
-        return WhenAsked({name: one.draw for name, one in self.drawn.items()})
+        return WhenAsked(self.drawn)
 
     def hist(
         self,

@@ -20,6 +20,9 @@ Reports = Annotated[
     list[Path], typer.Argument(help="Folders of cpunet validate or demo, or metrics.json.")
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="Page to write, such as compare.html.")]
+MissingOk = Annotated[
+    bool, typer.Option("--missing-ok", help="List reports that are not there; no error.")
+]
 Method = Annotated[
     str, typer.Option(help="Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.")
 ]
@@ -29,19 +32,30 @@ def compare(
     reports: Reports,
     out_file: Out = None,
     method: Method = "ren",
+    missing_ok: MissingOk = False,
     force: options.Force = False,
 ) -> None:
     """Put the scores of several validations beside each other, best in bold.
 
+    The page also has links to the reports, and room for many detectors and periods.
+
     Example: cpunet compare report1 report2 --out compare.html
+
+    Example: cpunet compare results/*/*/report --out results/index.html
     """
+    from cpunet.analysis.side_by_side_page import FEW
     from cpunet.jobs.validation.compare import compare_reports
 
-    compared = compare_reports(reports, method=method, out=out_file, force=force)
+    table, missing = compare_reports(
+        reports, method=method, out=out_file, missing_ok=missing_ok, force=force
+    )
     say = show if out_file is None else tell
-    say(comparison_table(compared))
-    for note in compared.notes:
-        say(f"note: {note}")
+    if out_file is None or len(table.names) <= FEW:
+        say(comparison_table(table))
+        for note in table.notes:
+            say(f"note: {note}")
+    for name in missing:
+        say(f"no report: {name}")
     if out_file is not None:
         tell(str(out_file))
 

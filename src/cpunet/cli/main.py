@@ -18,7 +18,6 @@ from cpunet.cli.ensemble import ensemble
 from cpunet.cli.environment import drop_nonsense, share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.fields import fields
-from cpunet.cli.figure import figure
 from cpunet.cli.import_weights import import_
 from cpunet.cli.info import info
 from cpunet.cli.library import library
@@ -27,7 +26,6 @@ from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
 from cpunet.cli.streams import finish_streams, prepare_streams
-from cpunet.cli.summary import summary
 from cpunet.cli.train import train
 from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
@@ -78,9 +76,7 @@ for command in (
     translate,
     validate,
     compare,
-    summary,
     response,
-    figure,
     export,
     info,
 ):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.side_by_side import SideBySide, side_by_side
@@ -16,6 +18,14 @@ from cpunet.regular_files import read_text
 from cpunet.yaml_files import MAX_BYTES, plain_json
 
 REPORT = "report"  # folder of a demonstration that contains the metrics
+PAGE = "report.html"
+
+
+class Compared(NamedTuple):
+    """Scores of several runs, and the names of the reports that are missing."""
+
+    table: SideBySide
+    missing: tuple[str, ...]
 
 
 def compare_reports(
@@ -23,9 +33,11 @@ def compare_reports(
     *,
     method: str = "ren",
     out: Path | None = None,
+    failed: Collection[Path] = (),
+    missing_ok: bool = False,
     force: bool = False,
-) -> SideBySide:
-    """Compare the scores of several validations.
+) -> Compared:
+    """Compare the scores of several validations, of one detector or of many.
 
     Parameters
     ----------
@@ -34,32 +46,52 @@ def compare_reports(
     method
         Method that is scored.
     out
-        HTML page to write; None for none.
+        HTML page to write, with links to the reports; None for none.
+    failed
+        Reports to list as missing: what is in their folders is of an earlier validation.
+    missing_ok
+        Whether to list missing or unfinished reports instead of raising.
     force
         Whether to replace an existing page.
 
     Returns
     -------
-    SideBySide
-        Scores of the runs, which have the names of their folders, made unique.
+    Compared
+        Scores of the runs, which have the names of their folders, made unique, such as
+        ``DETECTOR/PERIOD``.
 
     Raises
     ------
     CpunetError
-        If a report cannot be read, none has a score of `method`, or `out` exists or
-        is not writable.
+        If a report is missing or cannot be read, none has a score of `method`, or `out`
+        exists or is not writable.
     """
     if out is not None:
         if out.is_dir():
             raise CpunetError(f"{out}: is a folder; give the name of a page, as compare.html")
         refuse_existing(out, *reports, force=force)
-    files = [_metrics_file(report) for report in reports]
-    runs = dict(zip(_names(reports), map(read_metrics, files), strict=True))
+    found = [
+        None if report in failed else _metrics_file(report, missing_ok=missing_ok)
+        for report in reports
+    ]
+    names = _names(reports)
+    files = {n: file for n, file in zip(names, found, strict=True) if file is not None}
+    if not files:
+        raise CpunetError(f"none of the {len(reports)} reports is there yet")
+    missing = tuple(name for name in names if name not in files)
+    runs = {name: read_metrics(file) for name, file in files.items()}
     table = side_by_side(runs, method)
     if out is not None:
+        pages = {name: file.parent / PAGE for name, file in files.items()}
+        links = {
+            name: quote(os.path.relpath(page, out.parent))
+            for name, page in pages.items()
+            if page.is_file()
+        }
         with written_aside(out) as aside:
-            aside.write_text(side_by_side_page(table), encoding="utf-8")
-    return table
+            page = side_by_side_page(table, runs, links, missing)
+            aside.write_text(page, encoding="utf-8")
+    return Compared(table, missing)
 
 
 def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str, Any]:
@@ -80,16 +112,21 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
     return content
 
 
-def _metrics_file(report: Path) -> Path:
-    """Path of the metrics of a report, given as folder or file."""
+def _metrics_file(report: Path, *, missing_ok: bool) -> Path | None:
+    """Path of the metrics of a report, given as folder or file; None if it may be missing."""
     if report.is_dir():
         for file in (report / METRICS, report / REPORT / METRICS):
             if file.is_file():
                 return file
+        if missing_ok:
+            return None
         raise CpunetError(
-            f"{report}: no {METRICS} in it; give a folder of cpunet validate or cpunet demo"
+            f"{report}: no {METRICS} in it; give a folder of cpunet validate or cpunet demo, "
+            "or --missing-ok"
         )
     if not report.exists():
+        if missing_ok:
+            return None
         raise CpunetError(f"{report}: no such folder or file; give a folder of cpunet validate")
     return report
 
@@ -100,7 +137,7 @@ def _names(reports: Sequence[Path]) -> list[str]:
     Folders at the end that all reports share, such as ``report``, are left out.
     """
     given = [report.resolve() for report in reports]
-    parts = [(path if path.is_dir() else path.parent).parts for path in given]
+    parts = [(path.parent if path.is_file() else path).parts for path in given]
     while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
         parts = [part[:-1] for part in parts]
     longest = max(map(len, parts), default=1)

@@ -7,12 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cpunet.analysis.report_folder import REPORT
+import numpy as np
+
+from cpunet.analysis.report_folder import REPORT, VALUES
 from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.pulses.parameters import PARAMETERS
 from cpunet.training.run_folder import read_info
 
 if TYPE_CHECKING:
@@ -45,8 +48,8 @@ def validate_run(
     sim, data
         Simulated and measured pulses.
     out
-        Report folder: ``metrics.json``, figures, ``report.html``, and ``figures.npz``, from
-        which `cpunet.jobs.validation.figure_files.draw_figures` redraws the figures.
+        Report folder: ``metrics.json``, figures, ``report.html``, and ``parameters.npz``, the
+        parameters of each pulse under ``PEAK/METHOD/PARAMETER``.
 
     Returns
     -------
@@ -71,7 +74,7 @@ def validated(
     force: bool = False,
     monitor: Monitor = QUIET,
 ) -> tuple[Evaluation, dict[str, Drawing]]:
-    """Like `validate_run`; return all results, and figures by name. `out` can be None."""
+    """Like `validate_run`, also without `out`; return results, and functions that draw."""
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     if out is None:
@@ -83,10 +86,16 @@ def validated(
         to_draw = drawings(found)
         found.forget_noisy()
         from cpunet.analysis.report import write_report
-        from cpunet.jobs.validation.figure_store import STORE, made_of, write_drawings
         from cpunet.jobs.validation.report_charts import report_views
 
-        write_drawings(folder / STORE, to_draw, made_of(run, sim, data, how))
+        parameters = {
+            f"{peak}/{method}/{name}": of_method[name]
+            for peak, of_peak in found.values.items()
+            for method, of_method in of_peak.items()
+            for name in PARAMETERS
+            if name in of_method
+        }
+        np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         with monitor.stage("Drawing", len(to_draw)) as advance:
             notes = _notes(found.info, how.truth)
             figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
@@ -95,7 +104,7 @@ def validated(
 
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
-    """All figures of a validation by name."""
+    """Functions that draw the figures of a validation, by name."""
     # imported late: matplotlib is not needed while the pulses take most memory
     from cpunet.jobs.validation import drawings as figures
 
@@ -121,7 +130,7 @@ def _of_remains(info: Mapping[str, Any]) -> list[str]:
 
 def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
     """Draw a figure and report progress."""
-    figure = drawing.draw()
+    figure = drawing()
     advance(1)
     return figure
 

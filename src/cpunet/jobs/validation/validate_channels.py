@@ -1,4 +1,4 @@
-"""Validate the run of each channel of a data file, with a summary page."""
+"""Validate the run of each channel of a data file, with a page of all."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.validation.evaluation import ValidateOptions, period_of
-from cpunet.jobs.validation.summary_page import summarise_reports
+from cpunet.jobs.validation.compare import compare_reports
+from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.training.run_folder import INFO
 
@@ -59,11 +59,7 @@ def validate_channels(
     outcome = one_by_one(channels, out, validate, monitor.note)
     if outcome.done:
         folders = [out / name for name in channels]
-        period = period_of(data.path) or data.path.stem
-        names = [(name, period) for name in channels]
         # without force, a channel with a report fails and keeps it
         failed = [out / name for name in outcome.failed if force]
-        summarise_reports(
-            folders, out / INDEX, names=names, failed=failed, missing_ok=True, force=True
-        )
+        compare_reports(folders, out=out / INDEX, failed=failed, missing_ok=True, force=True)
     return outcome
