@@ -15,6 +15,7 @@ from cpunet.analysis.paired import align_half_maximum
 from cpunet.analysis.style import SPARE_COLOURS, colours, label
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.recipes import load_recipe
 from synthetic import require_drawn
 
@@ -39,6 +40,20 @@ def histogram_figure(values: dict[str, np.ndarray]) -> Figure:
 def pulses(n: int, centre: float = 350.0) -> np.ndarray:
     time = np.arange(800) - centre - np.linspace(0, 5, n)[:, np.newaxis]
     return ndtr(time / 5).astype(np.float32)
+
+
+def test_further_parameters_have_a_panel_each():
+    rng = np.random.default_rng(0)
+    names = ("rise_10_90", "late_charge", "overshoot", "current_width", "baseline_rms")
+    values = {
+        name: {method: rng.normal(100, 5, 300) for method in ("data", "ren")} for name in names
+    }
+    figure = run_figures.further_histograms(values, 40, "SEP")
+    require_drawn(figure)
+    shown = [axes for axes in figure.axes if axes.axison]
+    assert len(shown) == len(names)
+    assert shown[0].get_xlabel() == SHAPE_PARAMETERS["rise_10_90"].axis_label
+    assert [patch.get_gid() for patch in shown[-1].patches] == ["method-data", "method-ren"]
 
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():

@@ -170,7 +170,9 @@ def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
     assert merged.offsets.tolist() == [0, 3, 3]
 
 
-def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(ppc, tmp_path: Path):
+def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
+    ppc, tmp_path: Path
+):
     out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
     simulate_file(ppc, gammas(events=(10, 0, 5)), out, SETTINGS, cluster_mm=0)
     simulate_file(ppc, gammas(events=(10, 0, 5)), merged, SETTINGS, cluster_mm=0.05)

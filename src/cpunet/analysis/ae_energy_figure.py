@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cpunet.analysis.ae_energy import REFERENCE_KEV
 from cpunet.analysis.html_pages import joined, part
 from cpunet.analysis.nested_tables import html_table, with_std
-from cpunet.analysis.style import colours, label, styled
+from cpunet.analysis.style import GROUP, colours, group, label, styled
 
 FIGURE = "A over E and energy"
 
@@ -37,14 +37,18 @@ def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
         )
         scale, line, law = found["scale"], found["mean"], found["resolution"]
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
-        above.errorbar(energy, 100 * (mean / scale - 1), 100 * error / scale, **look)
-        below.errorbar(energy, 100 * sigma / mean, 100 * sigma_error / mean, **look)
+        for axes, value, spread in (
+            (above, mean / scale - 1, error / scale),
+            (below, sigma / mean, sigma_error / mean),
+        ):
+            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
         along = np.linspace(energy.min(), energy.max(), 100)
         told = f"{label(method)}: {line['per_mev_percent']:+.3f} ± "
         told += f"{line['per_mev_error_percent']:.3f} % per MeV"
-        above.plot(along, 100 * (line["a"] * along + line["b"] - 1), color=colour, label=told)
+        fit = {"color": colour, "gid": GROUP + method}
+        above.plot(along, 100 * (line["a"] * along + line["b"] - 1), label=told, **fit)
         width = np.sqrt(law["a"] + (law["b"] / along) ** law["c"])
-        below.plot(along, 100 * width, color=colour)
+        below.plot(along, 100 * width, **fit)
     above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
     below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
     above.legend()

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpunet.analysis.style import colours, label, line_look, linear_within, styled
+from cpunet.analysis.style import GROUP, colours, group, label, line_look, linear_within, styled
 from cpunet.pulses.parameters import PARAMETERS
 
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
@@ -50,13 +50,13 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
             for key in ("time_ns", "median", "q16", "q84", "median_error")
         )
         look = {"color": palette[method], "marker": "o", "markersize": 3.5}
-        above.errorbar(time, median, error, label=label(method), **look)
+        group(above.errorbar(time, median, error, label=label(method), **look), method)
         # with one point these lines would be invisible, but widen the range of the axis
         for edge in (low, high) if len(known) > 1 else ():
-            above.plot(time, edge, color=palette[method], linestyle=":", linewidth=1.1)
+            above.plot(time, edge, ":", color=palette[method], lw=1.1, gid=GROUP + method)
         if method != "data":
             points = _ratio(rows, methods["data"])
-            below.errorbar(*points, **look)
+            group(below.errorbar(*points, **look), method)
             ratios += points[1]
     below.axhline(0, color="black", linewidth=0.8)
     above.set(ylabel=AMPLITUDE)
@@ -142,7 +142,9 @@ def two_dimensional_figure(table: Mapping[str, Any], peak: str) -> Figure:
             cmap="viridis_r",
             vmin=0,
             vmax=top,
+            rasterized=True,
         )
+        axes.set_gid(GROUP + method)
         axes.grid(visible=False)
         outside = 100 - share.sum()
         if not share.any():

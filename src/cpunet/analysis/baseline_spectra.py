@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.analysis.style import colours, label, styled
+from cpunet.analysis.style import colours, group, label, styled
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
@@ -124,17 +124,15 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     data = np.asarray(found["data"]["power"])
     for method in methods:
         power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))
-        look = {"color": palette[method], "label": label(method)}
-        above.errorbar(frequency, power, error, marker="o", markersize=3, **look)
+        look = {"color": palette[method], "marker": "o", "markersize": 3}
+        group(above.errorbar(frequency, power, error, label=label(method), **look), method)
         if method != "data":
             # bands without noise in the data have no ratio
             ratio, spread = (
                 np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
                 for values in (power, error)
             )
-            below.errorbar(
-                frequency, ratio, spread, marker="o", markersize=3, color=palette[method]
-            )
+            group(below.errorbar(frequency, ratio, spread, **look), method)
     below.axhline(1, color="black", linewidth=0.8)
     silent = not any(np.any(found[method]["power"]) for method in methods)
     above.set(

@@ -10,14 +10,16 @@ from markupsafe import Markup
 
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.side_by_side import Cell, Row
-from cpunet.analysis.style import COLOURS
+from cpunet.analysis.style import colours
 
 WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: panel, names, right margin
 LINE, TOP, BOTTOM = 14, 6, 24
 LONGEST = 23  # maximum characters of a name
 
 
-def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> Markup:
+def forest_plot(
+    row: Row, names: Sequence[str], starts: Sequence[int] = (), methods: Sequence[str] = ()
+) -> Markup:
     """Draw a forest plot of a score with errors, and its expectation by chance in grey.
 
     Parameters
@@ -28,6 +30,8 @@ def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> M
         Names of the validations.
     starts
         Indices at which groups of validations begin; a line is drawn above each.
+    methods
+        Methods of the lines, if they differ; otherwise all are REN translations.
 
     Returns
     -------
@@ -43,15 +47,20 @@ def forest_plot(row: Row, names: Sequence[str], starts: Sequence[int] = ()) -> M
 
     box = {
         "left": NAMES, "right": WIDTH - RIGHT, "bottom": bottom, "width": WIDTH,
-        "height": bottom + BOTTOM, "colour": COLOURS["ren"],
+        "height": bottom + BOTTOM,
     }  # fmt: skip
+    methods = methods or ["ren"] * len(names)
+    palette = colours(methods)
     return part(
         "forest",
         f"{row.peak}, {row.score}",
         [
             {"title": f"{name}: {cell.text}", "name": _short(name), "y": TOP + LINE * (i + 0.5)}
+            | {"method": method, "colour": palette[method]}
             | _marks(cell, at)
-            for i, (name, cell) in enumerate(zip(names, row.cells, strict=True))
+            for i, (name, method, cell) in enumerate(
+                zip(names, methods, row.cells, strict=True)
+            )
         ],
         [TOP + LINE * start for start in starts],
         [(at(value), f"{value:g}") for value in ticks(low, high)],

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.nearest import nearest_pulses
 from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.style import DATA_FILL, colours, label, linear_within, styled
+from cpunet.analysis.style import DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -73,6 +73,7 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
             linewidth=0.5 if is_data else 1.0,
             label=f"{label(method)}, n = {len(values)}"
             + (f", {unknown} without energy" if unknown else ""),
+            gid=GROUP + method,
         )
     axes.set(yscale="log", xlabel="Energy [keV]", ylabel="Fraction of events per keV")
     _mark_peaks(axes, peaks, (float(edges[0]), float(edges[-1])))
@@ -275,7 +276,7 @@ def _draw(panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float) -
         if method == "truth":  # on top of methods that agree with it
             look["linestyle"] = "--"
         for axes in panels:
-            axes.plot(time_ns, pulse, label=label(method), **look)
+            axes.plot(time_ns, pulse, label=label(method), gid=GROUP + method, **look)
 
 
 def _draw_differences(
@@ -288,7 +289,9 @@ def _draw_differences(
             continue
         difference = 100 * (_aligned(method, window, dt_ns)[1] - data)
         for axes in panels:
-            axes.plot(time_ns, difference, color=palette[method], linewidth=1.0)
+            axes.plot(
+                time_ns, difference, color=palette[method], linewidth=1.0, gid=GROUP + method
+            )
     for axes in panels:
         axes.axhline(0, color="black", linewidth=0.8)
     linear_within(panels[0], LINEAR)

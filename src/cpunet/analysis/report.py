@@ -1,7 +1,7 @@
 """Results of a validation as files: ``metrics.json``, figures and an HTML page.
 
-The page is self-contained: figures, data and script are embedded, and its content security
-policy blocks all requests.
+The page is self-contained: figures and script are embedded, and its content security policy
+blocks all requests.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ from matplotlib.figure import Figure
 from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.analysis.ae_energy_figure import ae_energy_html
 from cpunet.analysis.html_pages import (
+    asset,
     figure_html,
     figure_png,
     joined,
     part,
     rendered,
-    script,
 )
 from cpunet.analysis.nested_tables import nested_html, number
 from cpunet.analysis.report_folder import METRICS
@@ -35,6 +35,7 @@ from cpunet.analysis.report_tables import (
     survival_html,
     verdicts_html,
 )
+from cpunet.analysis.style import colours, label
 from cpunet.pulses.parameters import PARAMETERS
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
@@ -46,38 +47,12 @@ PLACES = {
     "mean pulse": "first",
     "superpulses": "slices",
     "noise": "noise",
+    "single pulse": "pulses",
+    "further parameters": "further",
     **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
 }
 MANY = 4  # a larger number of figures is collapsed
 
-SCRIPTS = ("marks", "plot", "legend", "distributions", "pulses", "scatter", "start")
-
-# titles and descriptions of the interactive views
-VIEWS = {
-    "distributions": (
-        "Parameter distributions",
-        "In the bins in which they are scored, with the data's statistical errors; below, the "
-        "pull of each bin: method minus data, divided by the error of the difference. Pulls of "
-        "the raw simulation do not set the scale. The IoU of the data is the ceiling.",
-    ),
-    "slices": (
-        "Mean pulses by rise time",
-        "Pulses aligned at half maximum and averaged within slices of rise time, 1 to 90 %; "
-        "below, the differences from the data, with the standard error of each mean as a band "
-        "and that of the data in grey about zero. Errors of neighbouring samples are "
-        "correlated.",
-    ),
-    "pulses": (
-        "Single pulses by every method",
-        "The same simulated event by every method, without noise, aligned at half maximum.",
-    ),
-    "scatter": (
-        "Current amplitude and drift time",
-        "One point per pulse, the data in grey and one method beside them; of larger sets, a "
-        "random sample. The drift time ends at the maximum, which on a flat top is that of the "
-        "noise.",
-    ),
-}
 # parts of the metrics that are shown as nested tables
 DETAILS = {
     "ae_details": "A/E in detail",
@@ -92,7 +67,6 @@ def write_report(
     metrics: Mapping[str, Any],
     figures: Mapping[str, Figure],
     notes: Sequence[str],
-    views: Mapping[str, Any] | None = None,
 ) -> None:
     """Write ``metrics.json``, a PNG per figure and ``report.html`` into a folder.
 
@@ -115,23 +89,21 @@ def write_report(
         Figures by name; the names become file names and captions.
     notes
         Paragraphs of plain text for the top of the page.
-    views
-        Data of the interactive charts from `chart_data`: ``methods`` (see its `method_looks`),
-        ``distributions``, ``slices``, ``pulses``, ``scatter``; any of them can be missing.
-        Without views the page has only its figures.
     """
     metrics = _json_ready(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
     (folder / METRICS).write_text(text + "\n", encoding="utf-8")
     drawn = {}
     for name, figure in figures.items():
-        png = figure_png(figure)
-        (folder / f"{_file_stem(name)}.png").write_bytes(png)
-        drawn[name] = figure_html(name.replace("_", " "), figure, png)
+        (folder / f"{_file_stem(name)}.png").write_bytes(figure_png(figure))
+        drawn[name] = figure_html(name.replace("_", " "), figure)
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
     judged = metrics.get("verdicts", {}).get("table", {})
-    views = _json_ready(views or {})
+    scores = joined(
+        peak_html(name, scores, judged.get(name))
+        for name, scores in metrics.get("peaks", {}).items()
+    )
     html = rendered(
         "report.html",
         title="CPU-Net validation",
@@ -139,23 +111,18 @@ def write_report(
         first=_gallery(placed["first"]),
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts")),
-        scores=joined(
-            peak_html(name, scores, judged.get(name))
-            for name, scores in metrics.get("peaks", {}).items()
-        )
-        or part("gap", "no peak was scored"),
-        shapes=joined(
-            [
-                _views_html(views, ("distributions",), placed["distributions"]),
-                _of_all_peaks("Distributions", placed["distributions"]),
-                _views_html(views, ("slices",), placed["slices"]),
-                _of_all_peaks("Mean pulses by rise time", placed["slices"]),
-            ]
-        ),
-        pulses=_views_html(views, ("pulses", "scatter")),
+        methods=_methods([*drawn.values(), scores]),
+        scores=scores or part("gap", "no peak was scored"),
+        distributions=part("grid", "figures", placed["distributions"]),
+        further=_folded("Further parameters of every peak", placed["further"], screen=True),
+        slices=part("grid", "figures", placed["slices"]),
+        pulses=part("grid", "single", placed["pulses"]),
         survival=survival_html(metrics.get("ae_survival", {})),
         ae=joined(
-            [_gallery(placed["ae"]), _of_all_peaks("A/E and drift time", placed["ae_drift"])]
+            [
+                _gallery(placed["ae"]),
+                _folded("A/E and drift time of every peak, as figures", placed["ae_drift"]),
+            ]
         ),
         ae_energy=ae_energy,
         noise=_gallery(placed["noise"]),
@@ -163,7 +130,7 @@ def write_report(
         figures=_gallery(placed["others"]) or part("gap", "no figures were drawn"),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
-        script=script(views, SCRIPTS) if _drawn(views) else "",
+        script=Markup(asset("report.js")),
     )
     (folder / "report.html").write_text(html, encoding="utf-8")
 
@@ -187,28 +154,15 @@ def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, li
     return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
 
 
-def _of_all_peaks(title: str, drawn: Sequence[Markup]) -> Markup:
-    if not drawn:
-        return Markup()
-    return part("folded", f"{title} of every peak, as figures", part("grid", "figures", drawn))
+def _methods(drawn: Iterable[str]) -> list[dict[str, str]]:
+    """Name, label and colour of each method that is drawn, for the page's legend."""
+    names = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn)))
+    return [{"name": m, "label": label(m), "colour": c} for m, c in colours(names).items()]
 
 
-def _drawn(views: Mapping[str, Any]) -> bool:
-    return any(views.get(name) for name in VIEWS)
-
-
-def _views_html(
-    views: Mapping[str, Any], names: Sequence[str], figures: Sequence[Markup] = ()
-) -> Markup:
-    """Elements in which the script draws, or the reason why it does not.
-
-    In print the figures replace them, if there are any.
-    """
-    if not _drawn(views):
-        return part("gap", "this report was written without the data of the interactive views")
-    return joined(
-        part("view", name, *VIEWS[name], bool(views.get(name)), bool(figures)) for name in names
-    )
+def _folded(title: str, drawn: Sequence[Markup], *, screen: bool = False) -> Markup:
+    figures = part("grid", "figures", drawn)
+    return part("folded", title, figures, screen=screen) if drawn else Markup()
 
 
 def _details_html(metrics: Mapping[str, Any]) -> Markup:

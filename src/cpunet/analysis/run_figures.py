@@ -16,11 +16,12 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpunet.analysis.comparisons import Comparison, histogram
+from cpunet.analysis.comparisons import Comparison, data_axis, histogram
 from cpunet.analysis.mean_pulse import MeanPulse
 from cpunet.analysis.style import (
     COLOURS,
     DATA_FILL,
+    GROUP,
     colours,
     label,
     line_look,
@@ -30,11 +31,13 @@ from cpunet.analysis.style import (
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 
 Values = npt.NDArray[np.float64]
 
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 AVERAGED = 10  # records in the moving average
+COLUMNS = 4  # panels of further parameters in a row
 # Panels of the loss figure: losses with their label and colour.
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Cycle and identity": {
@@ -137,7 +140,7 @@ def cycle_figure(
     shades = colormaps["viridis"](np.linspace(0, 0.9, len(start)))
     for axes, waveforms, title in zip(panels, (start, middle, end), titles, strict=True):
         for waveform, shade in zip(waveforms, shades, strict=True):
-            axes.plot(time_us, waveform, color=shade, linewidth=1.0)
+            axes.plot(time_us, waveform, color=shade, linewidth=1.0, rasterized=True)
         axes.set(title=title, xlabel="Time [µs]")
     panels[0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
     return figure
@@ -175,17 +178,8 @@ def parameter_histograms(
     figure = Figure(figsize=(5.6, 4.2))
     axes = figure.subplots()
     for method, heights in fractions.items():
-        is_data = method == "data"
-        axes.stairs(
-            heights,
-            edges,
-            fill=is_data,
-            facecolor=DATA_FILL if is_data else None,
-            edgecolor=palette[method],
-            linewidth=0.8 if is_data else 1.5,
-            label=f"{label(method)}{_score(method, comparison)}, {_size(values[method])}",
-            zorder=1 if is_data else 2,
-        )
+        text = f"{label(method)}{_score(method, comparison)}, {_size(values[method])}"
+        _steps(axes, heights, edges, method, palette[method], text)
     # the outermost bars can be as high as 1 and would flatten everything in between
     top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
     axes.set(
@@ -197,6 +191,46 @@ def parameter_histograms(
     _mark_flow(axes, edges, fractions, palette)
     title = f"{peak}: bars beyond the dotted lines hold all events outside"
     figure.legend(loc="outside upper left", title=title, alignment="left")
+    return figure
+
+
+@styled
+def further_histograms(
+    values: Mapping[str, Mapping[str, Values]], max_bins: int, peak: str
+) -> Figure:
+    """Distributions of the further parameters, a small panel for each.
+
+    Parameters
+    ----------
+    values
+        Values by parameter and method, the measured ones under ``"data"``; of each parameter
+        some measured values are finite.
+    max_bins
+        Maximum number of bins, see `comparisons.data_axis`.
+    peak
+        Name of the gamma line, for the title.
+    """
+    rows = -(-len(values) // COLUMNS)
+    figure = Figure(figsize=(10.5, 2.1 * rows + 0.5))
+    panels = figure.subplots(rows, COLUMNS, squeeze=False).flat
+    for name, by_method in values.items():
+        axes, axis = next(panels), data_axis(by_method["data"], max_bins)
+        palette = colours(by_method)
+        for method, own in by_method.items():
+            shares = histogram(own, axis)[1:-2] / max(len(own), 1)
+            _steps(axes, shares, axis.edges, method, palette[method], label(method))
+        axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[], ylim=(0, None))
+        axes.locator_params(axis="x", nbins=4)
+        axes.grid(visible=False)
+    for empty in panels:
+        empty.set_axis_off()
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=len(by_method),
+        title=f"{peak}: further parameters, fraction of events per bin, in the data's range",
+        alignment="left",
+    )
     return figure
 
 
@@ -228,7 +262,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         if method == "raw":
             # its different height would dominate the difference
             mean, look["linestyle"] = mean * data.mean[-1] / mean[-1], "dashed"
-            above.plot(time_ns, mean, label="the same, at the data's height", **look)
+            above.plot(time_ns, mean, label=f"{label(method)}, at the data's height", **look)
         if method != "data":
             below.plot(time_ns, 100 * (mean - means["data"]), **look)
     below.axhline(0, color="black", linewidth=0.8)
@@ -241,6 +275,23 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     )
     linear_within(below, 1.0)
     return figure
+
+
+def _steps(
+    axes: Axes, heights: Values, edges: Values, method: str, colour: str, text: str
+) -> None:
+    is_data = method == "data"
+    axes.stairs(
+        heights,
+        edges,
+        fill=is_data,
+        facecolor=DATA_FILL if is_data else None,
+        edgecolor=colour,
+        linewidth=0.8 if is_data else 1.5,
+        label=text,
+        zorder=1 if is_data else 2,
+        gid=GROUP + method,
+    )
 
 
 def _edges_with_flow(axis: hist.axis.Regular) -> Values:
@@ -279,4 +330,5 @@ def _mark_flow(
                 va="top",
                 color=palette[method],
                 fontsize=8.5,
+                gid=GROUP + method,
             )

@@ -31,7 +31,14 @@ def score_panels(peak: str, scores: Mapping[str, Any]) -> Markup:
     Markup
         Empty if the peak is not scored.
     """
-    return part("grid", "panels", [forest_plot(*row) for row in _rows(peak, scores)])
+    return part(
+        "grid",
+        "panels",
+        [
+            forest_plot(row, list(map(label, methods)), methods=methods)
+            for row, methods in _rows(peak, scores)
+        ],
+    )
 
 
 def _rows(peak: str, scores: Mapping[str, Any]) -> Iterator[tuple[Row, list[str]]]:
@@ -57,7 +64,7 @@ def _rows(peak: str, scores: Mapping[str, Any]) -> Iterator[tuple[Row, list[str]
 def _row(peak: str, score: str, cells: Mapping[str, Cell]) -> Iterator[tuple[Row, list[str]]]:
     if any(cell.value is not None for cell in cells.values()):
         row = Row(peak, score, tuple(cells.values()), frozenset())
-        yield row, [label(method) for method in cells]
+        yield row, list(cells)
 
 
 def _in_order(found: Mapping[str, Any]) -> list[tuple[str, Any]]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.analysis.drift_slices import Slices, Values, slice_residuals
-from cpunet.analysis.style import colours, label, line_look, linear_within, styled
+from cpunet.analysis.style import GROUP, colours, label, line_look, linear_within, styled
 
 LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
 
@@ -52,21 +53,22 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
         axes.text(0.97, 0.03, f"n = {counts}", ha="right", transform=axes.transAxes, size=8)
     for method, slices in sets.items():
         if method != "data":
-            _bands(list(grid[1]), time_ns, data, slices, palette[method])
+            _bands(list(grid[1]), data, slices, time_ns, palette[method], GROUP + method)
     _label(figure, grid[0, 0], list(grid[1]), peak)
     grid[0, 0].set_xlim(time_ns[0], time_ns[-1])
     return figure
 
 
-def _bands(panels: list[Axes], time_ns: Values, data: Slices, own: Slices, colour: str) -> None:
+def _bands(
+    panels: list[Axes], data: Slices, own: Slices, time_ns: Values, colour: str, group: str
+) -> None:
     for axes, residual in zip(panels, slice_residuals(data, own), strict=True):
         if residual is None:
             continue
         middle, error = 100 * residual.difference, 100 * residual.error
-        axes.plot(time_ns, middle, color=colour, linewidth=1.0)
-        axes.fill_between(
-            time_ns, middle - error, middle + error, color=colour, alpha=0.3, linewidth=0
-        )
+        look: dict[str, Any] = {"color": colour, "gid": group}
+        axes.plot(time_ns, middle, linewidth=1.0, **look)
+        axes.fill_between(time_ns, middle - error, middle + error, alpha=0.3, lw=0, **look)
 
 
 def _label(figure: Figure, first: Axes, below: list[Axes], peak: str) -> None:

@@ -1,4 +1,4 @@
-"""Common style of all figures: fonts, and a fixed colour and label for each method."""
+"""Common style of all figures: fonts, and a fixed colour, label and group for each method."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.container import Container
+    from matplotlib.figure import Figure
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -27,6 +29,7 @@ COLOURS = {
 SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
 DATA_FILL = "0.80"
 
+GROUP = "method-"  # begins the group id of what a figure draws of a method
 # suffix of the name of a method without noise
 NO_NOISE = "_no_noise"
 
@@ -64,10 +67,14 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
     @wraps(make_figure)
     def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
         from matplotlib import style
+        from matplotlib.figure import Figure
 
         # based on matplotlib's defaults, so that user settings do not change a report
         with style.context(["default", _STYLE]):
-            return make_figure(*args, **kwargs)
+            made = make_figure(*args, **kwargs)
+            if isinstance(made, Figure):
+                _group_legends(made)
+            return made
 
     return in_style
 
@@ -88,7 +95,14 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
 
 def line_look(method: str, colour: str) -> dict[str, Any]:
     """Look of a line; that of the data is broad and grey, so that it shows below others."""
-    return {"color": "0.65", "linewidth": 4.0} if method == "data" else {"color": colour}
+    look = {"color": "0.65", "linewidth": 4.0} if method == "data" else {"color": colour}
+    return look | {"gid": GROUP + method}
+
+
+def group(drawn: Container, method: str) -> None:
+    """Mark points with errors as those of a method, by which a page hides them."""
+    for artist in drawn.get_children():
+        artist.set_gid(GROUP + method)
 
 
 def linear_within(axes: Axes, limit: float) -> None:
@@ -104,3 +118,19 @@ def label(method: str) -> str:
     """Label of a method in legends."""
     name = method.removesuffix(NO_NOISE)
     return LABELS.get(name, name) + (", no noise" if name != method else "")
+
+
+def _group_legends(figure: Figure) -> None:
+    """Mark the entries of legends, which begin with the label of a method, as its own."""
+    from matplotlib.legend import Legend
+    from matplotlib.offsetbox import HPacker, TextArea
+
+    ids = {artist.get_gid() or "" for artist in figure.findobj()}
+    by_label = {label(i.removeprefix(GROUP)): i for i in sorted(ids) if i.startswith(GROUP)}
+    for legend in figure.findobj(Legend):
+        for entry in legend.findobj(HPacker):
+            for text in entry.get_children():
+                if isinstance(text, TextArea):
+                    begins = [name for name in by_label if text.get_text().startswith(name)]
+                    for artist in entry.findobj() if begins else ():
+                        artist.set_gid(by_label[max(begins, key=len)])

@@ -12,7 +12,6 @@ import hist
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.analysis.chart_data import scored_axis
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS, VALUES
@@ -138,10 +137,11 @@ class Report:
         there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
         methods = hist.axis.StrCategory(list(there), name="method")
         compared = self.metrics["peaks"][peak]["parameters"].get(parameter, {})
+        told = compared.get("axis", {})
         axis = (
-            scored_axis(data, compared.get("axis", {}), MAX_BINS)
-            if max_bins is None
-            else data_axis(data, max_bins)
+            hist.axis.Regular(int(told["bins"]), told["low"], told["high"])
+            if max_bins is None and told.get("bins")
+            else data_axis(data, max_bins or MAX_BINS)
         )
         axis = named_axis(axis, parameter)
         made: hist.Hist[Any] = hist.Hist(methods, axis)

@@ -19,6 +19,7 @@ from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectr
 from cpunet.analysis.remains_figure import sizes_figure
 from cpunet.analysis.run_figures import (
     cycle_figure,
+    further_histograms,
     loss_curves,
     mean_pulses,
     parameter_histograms,
@@ -27,6 +28,7 @@ from cpunet.analysis.slice_figure import slice_figure
 from cpunet.jobs.validation.evaluation import Evaluation
 from cpunet.jobs.validation.peak_details import PeakDetails
 from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.pulses.parameters import PARAMETERS
 from cpunet.translation.translator import IREN, REN
 
 # methods in the figures; more lines could not be distinguished
@@ -79,6 +81,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         for parameter in scores["parameters"]
         if np.isfinite(found.values[name]["data"][parameter]).any()
     }
+    made |= _further(name, found)
     made["mean pulse"] = _mean_pulse(details, peak)
     row = _drawable(peak)
     if row is not None:
@@ -102,6 +105,18 @@ def _histograms(
     values = {m: v[parameter] for m, v in found.values[peak].items() if m in DRAWN}
     axis = data_axis(values["data"], found.ren.recipe.scores.max_bins)
     return partial(parameter_histograms, values, axis, parameter, peak, comparison)
+
+
+def _further(peak: str, found: Evaluation) -> dict[str, Drawing]:
+    by_method = {m: v for m, v in found.values[peak].items() if m in DRAWN}
+    values = {
+        name: {method: of_method[name] for method, of_method in by_method.items()}
+        for name, data in by_method["data"].items()
+        if name not in PARAMETERS and np.isfinite(data).any()
+    }
+    bins = found.ren.recipe.scores.max_bins
+    drawing = partial(further_histograms, values, bins, peak)
+    return {"further parameters": drawing} if values else {}
 
 
 def _mean_pulse(details: PeakDetails, peak: PeakSets) -> Drawing:

@@ -86,7 +86,6 @@ def validated(
         to_draw = drawings(found)
         found.forget_noisy()
         from cpunet.analysis.report import write_report
-        from cpunet.jobs.validation.report_charts import report_views
 
         parameters = {
             f"{peak}/{method}/{name}": of_method[name]
@@ -99,7 +98,7 @@ def validated(
         with monitor.stage("Drawing", len(to_draw)) as advance:
             notes = _notes(found.info, how.truth)
             figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
-            write_report(folder, found.metrics, WhenAsked(figures), notes, report_views(found))
+            write_report(folder, found.metrics, WhenAsked(figures), notes)
     return found, to_draw
 
 
