@@ -33,28 +33,34 @@ def compare(
 ) -> None:
     """Put the scores of several validations beside each other, best in bold.
 
+    A second table tells how the scores of runs scatter that differ in their seed only.
+
     Example: cpunet compare report1 report2 --out compare.html
     """
     from cpunet.jobs.validation.compare import compare_reports
 
     compared = compare_reports(reports, method=method, out=out_file, force=force)
     say = show if out_file is None else tell
-    say(comparison_table(compared))
+    say(comparison_table(compared, f"Scores of {escape(compared.method)}"))
+    if compared.over_runs is not None:
+        title = "Over runs: median ± standard deviation (lowest – highest)"
+        say(comparison_table(compared.over_runs, title))
     for note in compared.notes:
         say(f"note: {note}")
     if out_file is not None:
         tell(str(out_file))
 
 
-def comparison_table(compared: SideBySide) -> Table:
+def comparison_table(compared: SideBySide, title: str) -> Table:
     """Draw a row per peak and score, a column per run.
 
     Parameters
     ----------
     compared
         See `cpunet.analysis.side_by_side.side_by_side`.
+    title
+        Title of the table.
     """
-    title = f"Scores of {escape(compared.method)}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("peak", "score"):
         table.add_column(column)

@@ -42,7 +42,7 @@ RUN = FolderKind(
     command="cpunet train",
     known_by=INFO,
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors|tensorboard(/events\.out\..*)?"
-    r"|metrics\.json|figures\.npz"  # of an ensemble's members, and of `cpunet figure`
+    r"|figures\.npz"  # of `cpunet figure`
     r"|calibration\.(json|html)|detector\.yaml|settings\.yaml|sim\.lh5",
 )
 
