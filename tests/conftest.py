@@ -8,10 +8,9 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import ModuleType
 
 import pytest
 import torch
@@ -85,35 +84,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def held() -> ModuleType:
     """The program whose trainings wait for a signal, see there."""
     return beside("held")
-
-
-def work_here(patch: pytest.MonkeyPatch) -> None:
-    from cpunet.errors import CpunetError
-    from cpunet.jobs.common.pool import Link, Outcome
-
-    def work_off(begin: Any, items: Any, **_options: Any) -> Iterator[Outcome]:
-        work = begin(Link(SimpleNamespace(send=lambda _message: None)))  # type: ignore[arg-type]
-        for item in items:
-            try:
-                outcome = Outcome(item, work(item))
-            except (CpunetError, OSError) as error:
-                outcome = Outcome(item, failure=str(error))
-            yield outcome
-
-    patch.setattr("cpunet.jobs.studies.ensemble.work_off", work_off)
-    patch.setattr("cpunet.jobs.studies.tune.work_off", work_off)
-
-
-@pytest.fixture
-def no_pool(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do in this process what others would be started for, which takes each of them seconds."""
-    work_here(monkeypatch)
-
-
-@pytest.fixture(scope="session")
-def pool_of_none() -> Callable[[pytest.MonkeyPatch], None]:
-    """As above, as long as a patch holds."""
-    return work_here
 
 
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:

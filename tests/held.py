@@ -1,4 +1,4 @@
-"""The program, whose trainings wait after two iterations, or trials before any, for a signal.
+"""The program, whose trainings wait after two iterations for a signal.
 
 So a test can stop or kill a training that is neither too young nor done, on any machine.  A
 file to be run: processes that the program starts are held in the same way.
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.cli.main import main
-from cpunet.jobs.studies.trial_score import HeldOut
 from cpunet.training.unfinished import UnfinishedRun
 
 AFTER = 2  # iterations
@@ -77,23 +76,18 @@ def _is_running(pid: int) -> bool:
 
 
 def hold() -> None:
-    """Have trainings and trials of this process wait."""
+    """Have trainings of this process wait."""
     heard, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told)  # written to when a signal comes, be it before the wait
-    save, train = UnfinishedRun.save, HeldOut.train
+    save = UnfinishedRun.save
 
     def held(self: UnfinishedRun, state: Any) -> None:
         save(self, state)
         if state["iteration"] == AFTER:
             os.read(heard, 1)
 
-    def held_trial(self: HeldOut, *words: Any) -> Any:
-        os.read(heard, 1)
-        return train(self, *words)
-
     UnfinishedRun.save = held  # type: ignore[method-assign]
-    HeldOut.train = held_trial  # type: ignore[method-assign]
 
 
 if __name__ in ("__main__", "__mp_main__"):  # the second in processes that the first starts

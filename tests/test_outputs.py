@@ -14,7 +14,6 @@ from cpunet.outputs import (
     MARKER,
     FolderKind,
     copy_own,
-    mark,
     refuse_existing,
     refuse_inputs,
     remove_own,
@@ -208,15 +207,6 @@ def test_remove_own(tmp_path):
     assert tree(run) == {"mine/log/a": "mine"}
     make(run, run_json="new")  # it is still a folder that the program may fill
     assert tree(run) == {"mine/log/a": "mine", "run.json": "new"}
-
-
-def test_files_in_use_stay(tmp_path):
-    mark(tmp_path, RUN, listed=False)
-    (tmp_path / "run.json").touch()
-    (tmp_path / "log").mkdir()
-    (tmp_path / "log" / "a").touch()
-    assert remove_own(tmp_path, RUN, leave=("log/a",)) == []
-    assert tree(tmp_path) == {"log/a": ""}
 
 
 def test_copy_own(tmp_path):

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -173,15 +173,8 @@ def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
             shutil.copy2(path, place)
 
 
-def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -> list[str]:
+def remove_own(folder: Path, kind: FolderKind) -> list[str]:
     """Remove the program's files from a folder, and the folder if nothing else is in it.
-
-    Parameters
-    ----------
-    folder, kind
-        Folder, and its kind.
-    leave
-        Names of the program's own files that are in use and must not be removed.
 
     Returns
     -------
@@ -191,7 +184,6 @@ def remove_own(folder: Path, kind: FolderKind, *, leave: Collection[str] = ()) -
     folder = folder.resolve()  # a link stays
     others = list(_others(folder, kind))
     staying = {above for path in others for above in (path, *path.parents)}
-    staying |= {folder / name for name in leave}
     for path in list(_leaves(folder)):
         if path not in staying:
             path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()

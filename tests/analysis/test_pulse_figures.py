@@ -1,4 +1,4 @@
-"""Figures of energies, of single pulses and of seeds show what they are given."""
+"""Figures of energies and of single pulses show what they are given."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from cpunet.analysis.pulse_figures import (
     single_pulse_figure,
     spectrum_figure,
 )
-from cpunet.analysis.seed_figure import seed_distributions, seed_figure
 from cpunet.analysis.sides_figure import sides_figure
 from cpunet.errors import CpunetError
 from synthetic import require_drawn
@@ -132,40 +131,3 @@ def test_the_counts_of_pulses_are_those_of_the_files():
 def test_spectra_without_energies_are_refused():
     with pytest.raises(CpunetError, match="no pulse has an energy"):
         spectrum_figure({"data": np.full(3, np.nan)}, {})
-
-
-def run(ren, ceiling=85.0, peak="SEP"):
-    scores = {"iou": {"ren": ren, "ceiling": ceiling}, "iou_std": {"ceiling": 2.0}}
-    return {"peaks": {peak: {"parameters": {"drift_time": scores}}}}
-
-
-def test_seeds_are_summed_up():
-    runs = [run(80.0), run(84.0), run(None), {"peaks": {"SEP": {"parameters": {}}}}, run(85.0)]
-    found = seed_distributions(runs)
-    row = found["SEP"]["drift_time"]
-    assert row["iou"] == [80, 84, 85]
-    assert row["missing"] == 2
-    assert row["median"] == 84
-    assert (row["ceiling"], row["ceiling_std"]) == (85, 2)
-    require_drawn(seed_figure(found))
-
-
-def test_no_seed_has_no_scores():
-    nothing = seed_distributions([run(None, ceiling=None)])["SEP"]["drift_time"]
-    assert nothing["median"] is None
-    assert nothing["ceiling"] is None
-    figure = seed_figure({"SEP": {"drift_time": nothing}})
-    require_drawn(figure)
-    assert figure.axes[0].texts[0].get_text() == "no scores"
-
-
-def test_peaks_may_differ_between_trainings():
-    found = seed_distributions([run(80.0), run(81.0, peak="DEP")])
-    assert [found[p]["drift_time"]["missing"] for p in ("SEP", "DEP")] == [1, 1]
-    require_drawn(seed_figure(found))
-
-
-@pytest.mark.parametrize("runs", [[], [{"peaks": {"SEP": {"parameters": {}}}}]])
-def test_without_scores_seeds_are_refused(runs):
-    with pytest.raises(CpunetError, match="train"):
-        seed_distributions(runs)

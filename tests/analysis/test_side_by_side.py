@@ -137,6 +137,29 @@ def circles(panel: ET.Element) -> list[float]:
     return [float(c.get("cx", "nan")) for c in panel.iter("circle")]
 
 
+def seed(iou: float, **training: Any) -> dict[str, Any]:
+    return metrics(iou) | {"training": {"recipe": "fast", "peak": "FEP"} | training}
+
+
+def test_scores_scatter_over_runs_of_one_recipe():
+    runs = {"0": seed(80.0), "1": seed(84.0), "2": seed(81.0), "other": seed(9, recipe="paper")}
+    del runs["2"]["peaks"]["SEP"]["two_sample"]
+    over = side_by_side(runs).over_runs
+    assert over.names == ("3 runs of fast, FEP",)
+    assert [row.cells[0].text for row in over.rows] == [
+        "81.0 ± 2.1 (80.0 – 84.0)",
+        "81.0 ± 2.1 (80.0 – 84.0)",
+        "0.520 ± 0.000 (0.520 – 0.520), 1 missing",
+        "0.600 ± 0.00 (0.600 – 0.600)",
+        "+1.00 ± 0.00 (+1.00 – +1.00)",
+    ]
+    assert "<td>81.0\u00a0±\u00a02.1 (80.0 – 84.0)</td>" in side_by_side_page(
+        side_by_side(runs)
+    )
+    apart = {"0": seed(80.0), "1": seed(80.0, peak="SEP")}
+    assert side_by_side(apart).over_runs is None
+
+
 def test_the_page_is_whole_and_alone():
     name = 'a<b>&"c"'
     page = page_of({name: metrics(), "other": metrics(85.0)})

@@ -52,8 +52,6 @@ COMMANDS = {
         (f"{TRAINING} --settings D/my.yaml", "D/my.yaml"),
         ("--sim sim.lh5 --detector icpc --crystal D/my.yaml --data data.lh5", "D"),
     ],
-    "ensemble": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
-    "tune": [(TRAINING, "D"), (f"{TRAINING} --recipe D/my.yaml", "D")],
     "translate": [
         ("RUN D/sim.lh5", "D/sim.lh5"),
         ("RUN D/link.lh5", "D/hits.lh5"),
@@ -124,7 +122,7 @@ def home(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         for name in names.split():
             Path(folder, name).write_text(f"the user's {name}")
     # all that would make a folder one to be replaced
-    for name in ("run.json", "metrics.json", "stand.json", "tune.json", "ensemble.json"):
+    for name in ("run.json", "metrics.json", "stand.json"):
         Path("D", name).write_text("{}")
     for name in ("sim.lh5", "data.lh5"):
         Path(name).touch()
@@ -159,25 +157,3 @@ def test_a_thesis_survives_a_training(command, stand, tiny, tmp_path):
     assert f"{tmp_path / 'run'}: kept what cpunet did not write: thesis.tex" in outcome.err
     assert (tmp_path / "run" / "thesis.tex").read_text() == "mine"
     assert (tmp_path / "run" / "run.json").exists()
-
-
-def test_a_thesis_survives_beside_seeds(tmp_path):
-    from cpunet.training.ensemble_folder import ENSEMBLE_KIND, working_folder
-
-    notes: list[str] = []
-    out = tmp_path / "ens"
-    with working_folder(out, ENSEMBLE_KIND) as folder:
-        (folder / "ensemble.json").write_text("{}")
-        for name in ("seed_000", "seed_001.unfinished"):
-            (folder / name).mkdir()
-            (folder / name / "weights.safetensors").touch()
-        (folder / "seed_001.unfinished" / "checkpoint.safetensors").touch()
-        (folder / "seed_000" / "thesis.tex").touch()
-        (folder / "seed_notes.txt").touch()
-    with working_folder(out, ENSEMBLE_KIND, force=True, note=notes.append):
-        pass
-    left = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
-    assert left == [".cpunet.json", ".lock", "seed_000/thesis.tex", "seed_notes.txt"]
-    assert notes == [
-        f"{out}: kept what cpunet did not write: seed_000/thesis.tex, seed_notes.txt"
-    ]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from cpunet.cli import compare, ensemble, messages, response, scores, tune
+from cpunet.cli import compare, messages, response, scores
 
 WIDTHS = [20, 60, 80, 200]
 METHODS = ("raw", "rc", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
@@ -75,7 +75,7 @@ def test_other_tables(screen, capsys):
             one["iou_std"] = dict.fromkeys(METHODS, 1.5)
         peak |= {"n_sim": 100, "n_data": 100}
     table = side_by_side(dict.fromkeys(names, full), "ren")
-    messages.show(compare.comparison_table(table))
+    messages.show(compare.comparison_table(table, "Scores"))
     cells = [cell.text for row in table.rows for cell in row.cells]
     require_whole(capsys.readouterr().out, cells)
 
@@ -86,26 +86,6 @@ def test_other_tables(screen, capsys):
     told = {"runs": runs, "mean": values, "spread": spread, "truth": truth}
     messages.show(response.response_table(told))
     require_whole(capsys.readouterr().out, ["38.12", "55.43 ± 0.012", "1.953", "+55.4"])
-
-    rows = [
-        {
-            "peak": "SEP",
-            "score": s,
-            "median": 88.1,
-            "worst": 12.3,
-            "failures": 2,
-            "ceiling": 99.9,
-        }
-        for s in PARAMETERS
-    ]
-    messages.show(ensemble._table({"table": rows}))
-    require_whole(capsys.readouterr().out, ["88.1", "12.3", "2", "99.9"])
-
-    found = {f"training.a_long_setting_{i}": 1.234e-5 * (i + 1) for i in range(9)}
-    trial = {"number": 12, "state": "complete", "score": 1.234, "values": found}
-    messages.show(tune._table({"trials": [trial] * 3, "best": trial}))
-    shown = [f"{value:.3g}" for value in found.values()]
-    require_whole(capsys.readouterr().out, ["12", "1.234", *shown])
 
 
 def test_markup_and_empty_tables(screen, capsys):

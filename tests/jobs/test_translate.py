@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import awkward as ak
@@ -27,12 +27,11 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.output_lock import only_writer
-from cpunet.jobs.common.pool import work_off
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_channels import translate_channels
-from cpunet.jobs.translation.translate_files import expanded, translate_files
+from cpunet.jobs.translation.translate_files import _in_processes, expanded, translate_files
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.jobs.translation.translation_blocks import noise_seed, regrouped
 from cpunet.networks.positional_unet import PositionalUNet
@@ -43,7 +42,6 @@ from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
-from cpunet.translation.ensemble import EnsembleREN
 from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
 from synthetic import Listening, decay, edges, in_traces, nearly_full_disk
@@ -707,17 +705,6 @@ def test_options_that_cannot_be(busy, tmp_path, options, said):
         )
 
 
-def test_an_ensemble_has_the_remains_of_its_members(busy):
-    ensemble = EnsembleREN([REN.load(busy), REN.load(busy)])
-    assert ensemble.remains is not None
-    options = {"energy_kev": 2000.0, "seed": 1}
-    none = ensemble.translate(charge(20), **options)
-    left = ensemble.translate(charge(20), remains_kev=100.0, **options)
-    # a baseline on 100 keV falls from 4.5 % of the height to 0.9 of that in 200 samples
-    fall = (left - none)[:, :20].mean(axis=1) - (left - none)[:, 180:200].mean(axis=1)
-    assert fall.mean() == pytest.approx(0.9 * 0.05 * (1 - np.exp(-2.9 / 50)), rel=0.5)
-
-
 def test_runs_that_tell_of_no_remains(run, network, tmp_path):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
@@ -837,28 +824,18 @@ def test_targets_that_cannot_be_written(run, tmp_path):
         translate_files(run, [source, source], source.path, device="cpu")
 
 
-def _ends(code, _link):
-    os._exit(code)
+class _Killed:
+    """Work that the system ends, as for lack of memory."""
 
-
-def _telling(link):
-    def work(item):
-        link.advance(1)
-        return item == "a"
-
-    return work
+    def work(self, _monitor):
+        return lambda _task: os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.thorough
-def test_a_process_that_is_killed_costs_its_task():
-    options = {"threads": 1, "monitor": Monitor()}
-    found = list(work_off(partial(_ends, 3), ["a"], jobs=1, **options))
-    assert [one.failure for one in found] == ["its process ended with status 3"]
-    options |= {"jobs": 2}
-    found = list(work_off(_telling, ["a", "b", "c"], **options))
-    assert sum(one for one in found if isinstance(one, int)) == 3  # no step is lost
-    done = {one.item: one.result for one in found if not isinstance(one, int)}
-    assert done == {"a": True, "b": False, "c": False}
+def test_a_process_that_is_killed_is_told():
+    with pytest.raises(CpunetError, match="a process was ended, perhaps for lack of memory"):
+        list(_in_processes(_Killed(), ["a", "b"], 1, print, Monitor()))
+    assert multiprocessing.active_children() == []
 
 
 def test_names(run, many, tmp_path):

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
 import sys
-import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,24 +14,18 @@ from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.studies.fingerprints import fingerprints
-from cpunet.jobs.studies.trial_score import HeldOut
-from cpunet.jobs.studies.tune import tune_recipe
-from cpunet.jobs.studies.tuning_study import (
-    _is_gone,
-    counted,
-    found,
-    lose,
-    open_study,
-    queue_first,
-    suggested,
-    this_worker,
+from cpunet.jobs.tune import (
+    JOURNAL,
+    UNCHANGED,
+    HeldOut,
+    search_space,
+    tune_recipe,
+    value_of,
+    with_values,
 )
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.training.loop import train
-from cpunet.training.search_space import search_space, value_of, with_values
 from cpunet.translation.translator import REN
 from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, write_files
 
@@ -47,12 +37,10 @@ TINY = [
     *SMALL_NETWORK,
     *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
-    "training.iterations=8",
-    "training.checkpoint_interval=2",
+    "training.iterations=4",
     "scores.bootstraps=10",
     SPACE,
 ]
-N = 100
 
 
 def tiny(*more: str) -> Recipe:
@@ -114,30 +102,6 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         parts.score(Giving(lost, recipe))
 
 
-def test_energies_that_one_side_lacks_end_a_study_before_its_trials(files, tmp_path):
-    measured = write_files(tmp_path, np.repeat(KEV[:1], 90)).data
-    with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of SEP can be used"):
-        fingerprints(files.sim, measured, tiny(), "FEP,SEP", Monitor())
-
-
-@pytest.mark.slow
-def test_scores_on_the_way_do_not_change_the_training(files):
-    recipe = tiny("training.iterations=6")
-    parts, told = held_out(files, recipe), []
-    ren = parts.train(recipe, 3, "cpu", lambda *at: told.append(at))
-    plain = train(parts.fit.sim.waveforms, parts.fit.data.waveforms, recipe, seed=3)
-    for name, weights in plain.ren.state_dict().items():
-        torch.testing.assert_close(ren.backend.network.state_dict()[name], weights)
-    assert [iteration for iteration, _ in told] == [2, 4]
-    assert np.isfinite([score for _, score in told]).all()
-
-    def enough(_iteration: int, _score: float) -> None:
-        raise KeyError
-
-    with pytest.raises(KeyError):
-        parts.train(recipe, 3, "cpu", enough)
-
-
 @pytest.mark.parametrize(
     ("space", "words"),
     [
@@ -162,31 +126,6 @@ def test_what_cannot_be_searched_is_told_by_its_key(space, words):
     assert "\n" not in str(told.value)
 
 
-def test_whole_numbers_can_be_choices_of_a_real_setting(tmp_path):
-    space = "search={training.clip: {choices: [7, 4]}, training.ridge: {low: 0.01, high: 0.2}}"
-    recipe = load_recipe("fast", [space, "training.clip=4"])
-    study = open_study(tmp_path, recipe)
-    queue_first(study, recipe, search_space(recipe))
-    trial = study.ask()
-    for key, config in search_space(recipe).items():
-        assert suggested(trial, key, recipe, config) == value_of(recipe, key)
-    study.tell(trial, 1.5)
-    told = found(study, recipe, search_space(recipe))
-    assert told["first"] == 1.5
-    assert told["importances"] == {}  # one trial says nothing of them
-
-
-def test_a_trial_that_was_lost_before_its_first_value_is_queued_again(tmp_path):
-    recipe = tiny()
-    study = open_study(tmp_path, recipe)
-    queue_first(study, recipe, search_space(recipe))
-    lose(study, study.ask())
-    again = study.ask()
-    for key, config in search_space(recipe).items():
-        assert suggested(again, key, recipe, config) == value_of(recipe, key)
-    assert len(counted(study)) == 1
-
-
 @pytest.mark.parametrize("name", ["fast", "small", "paper"])
 def test_the_recipes_own_spaces_can_be_searched(name):
     recipe = load_recipe(name)
@@ -205,74 +144,116 @@ def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_process_is_gone_before_anyone_asks_how_it_ended():
-    ended = subprocess.Popen(["true"])
-    os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
-    host = this_worker().rpartition(":")[0]
-    assert _is_gone(f"{host}:{ended.pid}")
-    ended.wait()
-    assert _is_gone(f"{host}:{ended.pid}")
-    assert not _is_gone(this_worker())
-    assert not _is_gone(f"another host:{ended.pid}")
+class Scored:
+    """Trainings that cost nothing: the score is near the setting that is best."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.tried: list[Any] = []
+        monkeypatch.setattr(HeldOut, "train", lambda _self, recipe, *_: recipe)
+        monkeypatch.setattr(HeldOut, "score", lambda _self, recipe: self.score(recipe))
+
+    def score(self, recipe: Any) -> float:
+        self.tried.append(recipe.training.ridge)
+        return 1 + abs(recipe.training.ridge - 0.1)
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda lines: [*lines, b'{"op_code": 4, "wor', *lines[-1:]],  # by a full disk
-        lambda lines: [lines[0].replace(b"cpunet", b"\xff")],
-        lambda lines: [lines[0], b"[]\n"],
-        lambda lines: [lines[0], b'{"op_code": 99}\n'],
-    ],
-)
-def test_a_damaged_journal_is_one_line(tmp_path, damage):
-    optuna = pytest.importorskip("optuna")
-    study = open_study(tmp_path, tiny())
-    trial = study.ask({"x": optuna.distributions.FloatDistribution(0, 1)})
-    study.tell(trial, 1.0)
-    journal = tmp_path / "journal.log"
-    journal.write_bytes(b"".join(damage(journal.read_bytes().splitlines(keepends=True))))
-    with pytest.raises(CpunetError, match=r"journal.log: is damaged .* begin again with --fo"):
-        open_study(tmp_path, tiny())
+RIDGE = "training.ridge: {low: 0.01, high: 0.2, log: true}"
+FIT = f"search={{{RIDGE}, training.clip: {{choices: [7, 4]}}}}"
+
+
+@pytest.fixture
+def scored(monkeypatch) -> Scored:
+    pytest.importorskip("optuna")
+    return Scored(monkeypatch)
+
+
+def states(study: Any) -> list[str]:
+    return [trial.state.name for trial in study.trials]
+
+
+def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
+    files, scored, tmp_path
+):
+    recipe = load_recipe("fast", [FIT, "training.clip=4"])
+    study = tune_recipe(*files, tmp_path / "tune", recipe, trials=2)
+    assert study.trials[0].user_attrs == {UNCHANGED: True}
+    own = {"training.ridge": recipe.training.ridge, "training.clip": "4"}
+    assert study.trials[0].params == own
+    tune_recipe(*files, tmp_path / "tune", recipe, trials=10)
+    assert len(scored.tried) == 10
+    again = tune_recipe(*files, tmp_path / "tune", recipe, trials=10)
+    assert len(scored.tried) == 10
+    assert states(again) == ["COMPLETE"] * 10
+    tune_recipe(*files, tmp_path / "other", recipe, trials=4)
+    assert scored.tried[10:] == scored.tried[:4]
+
+    with (tmp_path / "tune" / "trials.csv").open() as stream:
+        rows = [*csv.DictReader(stream)]
+    best = min(rows, key=lambda row: float(row["value"]))
+    tuned = load_recipe(str(tmp_path / "tune" / "best.yaml"))
+    assert tuned.search is None
+    assert tuned.training.ridge == float(best["params_training.ridge"])
+    assert tuned.training.clip == float(best["params_training.clip"])
+    assert tuned.scores == recipe.scores
+
+    with pytest.raises(CpunetError, match="begun with other settings or pulses: "):
+        tune_recipe(*files, tmp_path / "tune", recipe, trials=12, seed=1)
+
+
+def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
+    recipe, out, score = load_recipe("fast", [FIT]), tmp_path / "tune", scored.score
+
+    def joined(changed: Any) -> float:
+        monkeypatch.setattr(scored, "score", score)
+        tune_recipe(*files, out, recipe, trials=3)  # while the first trial of another runs
+        return score(changed)
+
+    monkeypatch.setattr(scored, "score", joined)
+    study = tune_recipe(*files, out, recipe, trials=3)
+    assert states(study) == ["COMPLETE"] * 4
+    assert len(set(scored.tried)) == 4
+
+
+@pytest.mark.parametrize("error", [CpunetError("the chain is lost"), SystemExit(130)])
+def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
+    files, scored, monkeypatch, tmp_path, error
+):
+    recipe, out = load_recipe("fast", [FIT]), tmp_path / "tune"
+
+    def fail(*_: Any) -> float:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scored, "score", fail)
+        with pytest.raises(type(error), match=r"no trial has a score; the first: the|130"):
+            tune_recipe(*files, out, recipe, trials=1)
+    study = tune_recipe(*files, out, recipe, trials=2)
+    assert states(study) == (
+        ["FAIL", "COMPLETE"]
+        if isinstance(error, CpunetError)
+        else ["RUNNING", "COMPLETE", "COMPLETE"]
+    )
+    assert len(scored.tried) == len(study.trials) - 1
+
+
+def test_a_folder_of_something_else_is_left_alone(files, scored, tmp_path):
+    with pytest.raises(CpunetError, match="exists already and holds no search"):
+        tune_recipe(*files, tmp_path, load_recipe("fast", [FIT]))
+    assert not (tmp_path / JOURNAL).exists()
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_search_that_was_killed_goes_on(files, held, tmp_path, monkeypatch, capsys, no_pool):
+def test_networks_are_searched_on_the_command_line(files, tmp_path, monkeypatch, capsys):
     pytest.importorskip("optuna")
     folder = tmp_path / "tune"
-    short = [*TINY, "training.iterations=4"]
-    values = [word for value in short for word in ("--set", value)]
+    values = [word for value in TINY for word in ("--set", value)]
     inputs = ["--sim", files.sim.path, "--data", files.data.path, "--out", folder]
-    words = ["tune", *inputs, "--recipe", "small", *values, "--trials", 2, "--jobs", 1]
-    words = [*map(str, words), "--threads", "1"]
-    given = {"words": words, "errors": str(tmp_path / "errors")}
-    job, journal = held.forked(held.__file__, {"GIVEN": given}), folder / "journal.log"
-    try:
-        while not (journal.exists() and '"worker"' in journal.read_text()):
-            assert job.is_alive(), "no trial was begun"
-            time.sleep(0.02)
-        started = held.children(job.pid)
-    finally:
-        job.kill()
-        job.join()
-    held.wait_until_gone(started)
-    monkeypatch.setattr(sys, "argv", ["cpunet", *words, "--resume"])
+    words = ["cpunet", "tune", *inputs, "--recipe", "small", *values, "--trials", 2]
+    monkeypatch.setattr(sys, "argv", [*map(str, words)])
     with pytest.raises(SystemExit) as stop:
         main()
-    told = capsys.readouterr()
-    assert stop.value.code == 0, told.err
-    rows = [*csv.DictReader((folder / "trials.csv").read_text().splitlines())]
-    assert [row["state"] for row in rows] == ["complete", "complete"]
-    best = min(rows, key=lambda row: float(row["score"]))
-    tuned = load_recipe(str(folder / "best.yaml"))
-    assert tuned.search is None
-    assert tuned.generator.width == int(best["generator.width"])
-    assert tuned.training.rate_generators == float(best["training.rate_generators"])
-    assert tuned.scores == tiny().scores
-    # the recipe as it is was the one that was cut off
-    own = {(row["generator.width"], row["training.rate_generators"]) for row in rows}
-    assert ("2", str(tiny().cyclegan.training.rate_generators)) in own
-    assert f"best: trial {best['number']}" in told.out
-    assert "the recipe as it is has" in told.out
+    shown = capsys.readouterr()
+    assert stop.value.code == 0, shown.err
+    assert "best: trial " in shown.out
+    assert "the recipe as it is has" in shown.out
+    assert shown.out.splitlines()[-1] == str(folder / "best.yaml")

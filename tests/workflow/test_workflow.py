@@ -144,6 +144,21 @@ def test_dry_run(place):
     assert not (place.folder / "all results").exists()
 
 
+def test_a_dry_run_of_seeds(place):
+    place.configure(two_detectors() | {"seeds": [0, 7]})
+    done = place.run("--dry-run", "--printshellcmds", "seeds")
+    assert done.returncode == 0, done.stdout
+    jobs = counts(done.stdout)
+    assert jobs["train_seed"] == jobs["validate_seed"] == 2 * 2
+    assert jobs["compare_seeds"] == 2  # one for each detector
+    assert "train" not in jobs
+    told = " ".join(done.stdout.split())
+    seeds = "'all results/V01/p03/seeds/"
+    assert re.search(rf"--seed=7 [^|]*--threads \d --out {seeds}7/run'", told)
+    assert f"cpunet validate {seeds}7/run'" in told
+    assert f"cpunet compare {seeds}0/report' {seeds}7/report' --out" in told
+
+
 def whole_chain() -> dict[str, Any]:
     """Calibration, libraries and events of two detectors, one of them in one period."""
     config: Any = two_detectors()

@@ -156,6 +156,7 @@ wildcard_constraints:
     period="|".join(map(re.escape, config["periods"])),
     part="[^/]+",
     events="[^/]+",
+    seed="[0-9]+",
 
 
 # numba takes all cores of a node unless told

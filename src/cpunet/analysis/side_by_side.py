@@ -6,12 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from cpunet.analysis.verdicts import number, part
 from cpunet.errors import CpunetError
 
 Metrics = Mapping[str, Any]
 
 NO_VALUE = "–"
+CEILING = " (ceiling)"
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,8 @@ class Cell:
         Score as displayed, with error and ceiling.
     value
         Score; None where a run has none.
+    digits
+        Format of the score.
     """
 
     text: str = NO_VALUE
@@ -31,6 +36,7 @@ class Cell:
     error: float | None = None
     expected: float | None = None
     expected_std: float | None = None
+    digits: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ class SideBySide:
     compared
         Inputs and origin of the runs (files, detector, period, quality of the fit) by name;
         texts in the order of the runs.
+    over_runs
+        If several runs differ in the seed only: their median, standard deviation, lowest and
+        highest score, with a name and a cell for all of them.
     """
 
     names: tuple[str, ...]
@@ -77,6 +86,7 @@ class SideBySide:
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
     compared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    over_runs: SideBySide | None = None
 
 
 def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide:
@@ -122,7 +132,45 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
         )
     told = [part(metrics, "compared") for metrics in runs.values()]
     compared = {n: tuple(str(one.get(n, NO_VALUE)) for one in told) for n in _union(told)}
-    return SideBySide(tuple(runs), method, tuple(rows), tuple(_notes(runs)), compared)
+    over_runs = _over_runs(list(runs.values()), method, rows)
+    return SideBySide(
+        tuple(runs), method, tuple(rows), tuple(_notes(runs)), compared, over_runs
+    )
+
+
+def _over_runs(runs: Sequence[Metrics], method: str, rows: Sequence[Row]) -> SideBySide | None:
+    """Scores over the runs of the same recipe, energies and files; None without such runs."""
+    alike: dict[str, list[int]] = {}
+    for i, metrics in enumerate(runs):
+        training, compared = part(metrics, "training"), part(metrics, "compared")
+        origin = [training.get(key) for key in ("recipe", "peak")]
+        origin += [compared.get(key) for key in ("simulation", "data")]
+        if training:
+            alike.setdefault(", ".join(map(str, filter(None, origin))), []).append(i)
+    alike = {origin: members for origin, members in alike.items() if len(members) > 1}
+    if not alike:
+        return None
+    names = tuple(f"{len(members)} runs of {origin}" for origin, members in alike.items())
+    over = []
+    for row in rows:
+        cells = [_over([row.cells[i] for i in members]) for members in alike.values()]
+        name = row.score.removesuffix(CEILING)
+        over.append(Row(row.peak, name, tuple(cells), frozenset()))
+    return SideBySide(names, method, tuple(over), ())
+
+
+def _over(cells: Sequence[Cell]) -> Cell:
+    """Median, standard deviation, lowest and highest of a score, and how many runs lack it."""
+    known = [cell for cell in cells if cell.value is not None]
+    if len(known) < 2:
+        return Cell()
+    values, digits = np.array([cell.value for cell in known], float), known[0].digits
+    median, spread = float(np.median(values)), float(np.std(values, ddof=1))
+    text = f"{median:{digits}} ± {spread:{digits.lstrip('+')}}"
+    text += f" ({values.min():{digits}} – {values.max():{digits}})"
+    if missing := len(cells) - len(known):
+        text += f", {missing} missing"
+    return Cell(text, median, spread, digits=digits)
 
 
 def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
@@ -131,7 +179,7 @@ def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
     rows = []
     for name in _union(part(s, "parameters") for s in scores):
         cells = [_overlap(part(s, "parameters", name), method) for s in scores]
-        title = f"{name.replace('_', ' ')}: IoU [%] (ceiling)"
+        title = f"{name.replace('_', ' ')}: IoU [%]{CEILING}"
         rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
     cells = [_auc(part(s, "two_sample", method)) for s in scores]
     rows.append(_row(peak, "classifier: AUC", cells, _off))
@@ -187,7 +235,8 @@ def _cell(
     if value is None:
         return Cell()
     of_error = f" ± {error:{digits.lstrip('+')}}" if error is not None else ""
-    return Cell(f"{value:{digits}}{of_error}{appended}", value, error, expected, expected_std)
+    text = f"{value:{digits}}{of_error}{appended}"
+    return Cell(text, value, error, expected, expected_std, digits)
 
 
 def _notes(runs: Mapping[str, Metrics]) -> list[str]:

@@ -37,7 +37,8 @@ def compare(
 ) -> None:
     """Put the scores of several validations beside each other, best in bold.
 
-    The page also has links to the reports, and room for many detectors and periods.
+    The page also has links to the reports, and room for many detectors and periods. A second
+    table tells how the scores of runs scatter that differ in their seed only.
 
     Example: cpunet compare report1 report2 --out compare.html
 
@@ -51,24 +52,28 @@ def compare(
     )
     say = show if out_file is None else tell
     if out_file is None or len(table.names) <= FEW:
-        say(comparison_table(table))
+        say(comparison_table(table, f"Scores of {escape(table.method)}"))
         for note in table.notes:
             say(f"note: {note}")
+    if table.over_runs is not None:
+        title = "Over runs: median ± standard deviation (lowest – highest)"
+        say(comparison_table(table.over_runs, title))
     for name in missing:
         say(f"no report: {name}")
     if out_file is not None:
         tell(str(out_file))
 
 
-def comparison_table(compared: SideBySide) -> Table:
+def comparison_table(compared: SideBySide, title: str) -> Table:
     """Draw a row per peak and score, a column per run.
 
     Parameters
     ----------
     compared
         See `cpunet.analysis.side_by_side.side_by_side`.
+    title
+        Title of the table.
     """
-    title = f"Scores of {escape(compared.method)}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("peak", "score"):
         table.add_column(column)

@@ -14,7 +14,6 @@ from cpunet.cli.calibrate import calibrate
 from cpunet.cli.check import check
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
-from cpunet.cli.ensemble import ensemble
 from cpunet.cli.environment import drop_nonsense, share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.fields import fields
@@ -71,7 +70,6 @@ for command in (
     check,
     train,
     calibrate,
-    ensemble,
     tune,
     translate,
     validate,

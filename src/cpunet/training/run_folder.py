@@ -42,7 +42,6 @@ RUN = FolderKind(
     command="cpunet train",
     known_by=INFO,
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
-    r"|metrics\.json"  # of an ensemble's members
     r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.pool import cores
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
@@ -236,7 +236,9 @@ class GammaSource:
         Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
-        workers = min(cores(), _MAX_WORKERS, rounds)
+        has_affinity = hasattr(os, "sched_getaffinity")
+        cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+        workers = min(cores, _MAX_WORKERS, rounds)
         waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0

@@ -33,8 +33,6 @@ _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 class CycleGanTrainer:
     """Trains a CycleGAN; see `cpunet.jobs.training.trainers.Trainer`."""
 
-    resumable = True
-
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.config = recipe.cyclegan.training

@@ -22,9 +22,6 @@ from cpunet.training.run_folder import RUN, append_losses
 class ResponseTrainer:
     """Fits a readout chain; see `cpunet.jobs.training.trainers.Trainer`."""
 
-    steps = 1  # the number of steps is not known beforehand
-    resumable = False
-
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
 

@@ -16,18 +16,7 @@ from cpunet.training.process_group import ProcessGroup
 
 
 class Trainer(Protocol):
-    """A training method for a recipe.
-
-    Attributes
-    ----------
-    steps
-        Number of steps of a training, 1 if it is unknown beforehand.
-    resumable
-        Whether an interrupted training can be resumed.
-    """
-
-    steps: int
-    resumable: bool
+    """A training method for a recipe."""
 
     def require_shareable(self, group: ProcessGroup) -> None:
         """Raise a `CpunetError` if several processes cannot train the recipe together."""

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import glob
+import multiprocessing
+import os
+import signal
+import sys
+import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -15,16 +25,18 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor, Relay
-from cpunet.jobs.common.pool import Link, Outcome, work_off
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import TranslateOptions
+from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
 
 QUIET = Monitor()
 DEFAULTS = TranslateOptions()
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
+TELL_EVERY_S = 0.5  # interval of the progress of several processes
 
 Told = dict[str, Any]
+_Outcomes = Generator[tuple["_Task", Told | str]]
 
 
 @dataclass(frozen=True)
@@ -96,14 +108,12 @@ def translate_files(
         monitor.stage("Translating", _rows(sources)) as advance,
         closing(_outcomes(make, tasks, jobs, advance, monitor)) as outcomes,
     ):
-        for outcome in outcomes:
-            if isinstance(outcome, int):
-                advance(outcome)
-            elif outcome.failure is not None:
-                failed.append(_naming(outcome.item, outcome.failure))
+        for task, outcome in outcomes:
+            if isinstance(outcome, str):
+                failed.append(_naming(task, outcome))
                 monitor.note(f"error: {failed[-1]}")
             else:
-                told.append(outcome.result)
+                told.append(outcome)
     if failed:
         done = f"; {len(told)} are in {out}" if told else ""
         raise CpunetError(
@@ -143,9 +153,6 @@ class _Maker:
     resume: bool
     force: bool
 
-    def __call__(self, link: Link) -> Callable[[_Task], Told]:
-        return self.work(Relay(link.advance, link.note))
-
     def work(self, monitor: Monitor) -> Callable[[_Task], Told]:
         """Return a function that translates a file."""
         # the last bits of a network depend on the number of threads, and processes share cores
@@ -167,17 +174,89 @@ class _Maker:
 
 def _outcomes(
     make: _Maker, tasks: Sequence[_Task], jobs: int, advance: Advance, monitor: Monitor
-) -> Generator[Outcome | int]:
+) -> _Outcomes:
+    """Yield the result of each task, or the reason why it failed."""
     if (jobs := min(jobs, len(tasks))) > 1:
-        yield from work_off(make, tasks, jobs=jobs, threads=1, monitor=monitor)
+        yield from _in_processes(make, tasks, jobs, advance, monitor)
         return
     with _threads_kept():
         work = make.work(Relay(advance, monitor.note))
         for task in tasks:
-            try:
-                yield Outcome(task, work(task))
-            except CpunetError as error:
-                yield Outcome(task, failure=str(error))
+            yield task, _outcome(partial(work, task))
+
+
+def _outcome(result: Callable[[], Told]) -> Told | str:
+    try:
+        return result()
+    except (CpunetError, OSError) as error:
+        return str(error)
+
+
+def _in_processes(
+    make: _Maker, tasks: Sequence[_Task], jobs: int, advance: Advance, monitor: Monitor
+) -> _Outcomes:
+    """Yield outcomes as they arrive; the processes end when the iterator is closed."""
+    context = multiprocessing.get_context("spawn")  # torch does not survive a fork
+    others = {*multiprocessing.active_children()}
+    told: SimpleQueue[int | str] = context.SimpleQueue()
+    noted: set[int | str] = set()
+    left: dict[Future[Told], _Task] = {}
+    with ProcessPoolExecutor(jobs, context, _begin, (make, told)) as pool:
+        try:
+            left |= {pool.submit(_work, task): task for task in tasks}
+            while left:
+                done, _ = wait(left, TELL_EVERY_S, FIRST_COMPLETED)
+                while not told.empty():
+                    if isinstance(message := told.get(), int):
+                        advance(message)
+                    elif message not in noted:
+                        monitor.note(message)
+                        noted.add(message)
+                for future in done:
+                    yield left.pop(future), _outcome(future.result)
+        except BrokenProcessPool as error:
+            raise CpunetError(
+                "a process was ended, perhaps for lack of memory; try fewer --jobs, and "
+                "continue with --resume"
+            ) from error
+        finally:
+            if left:
+                for process in {*multiprocessing.active_children()} - others:
+                    process.terminate()
+                pool.shutdown(cancel_futures=True)
+
+
+_translate: Callable[[_Task], Told]  # in a process of the pool
+
+
+def _begin(make: _Maker, told: SimpleQueue[int | str]) -> None:
+    """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    use_threads(1)
+    global _translate
+    _translate = make.work(Relay(told.put, told.put))
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    """End in a way that removes the file being written."""
+    signal.signal(number, signal.SIG_IGN)  # the pool repeats it
+    sys.exit(128 + number)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _work(task: _Task) -> Told:
+    try:
+        return _translate(task)
+    except SystemExit:  # which the pool would take for an outcome
+        os._exit(1)
 
 
 @contextmanager

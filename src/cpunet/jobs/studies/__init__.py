@@ -1,1 +1,0 @@
-"""Studies with many runs: ensembles over seeds and searches over settings."""

@@ -1,0 +1,384 @@
+"""Search for settings of a recipe, scored on held-out pulses of the training's energies.
+
+Optuna proposes settings with Gaussian processes and keeps the trials in a journal in the
+output folder.  Every process that is given the same folder works on the same search.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import yaml
+from torch import nn
+
+from cpunet.analysis.distances import null_distances, wasserstein
+from cpunet.analysis.resampling import resampled_twice
+from cpunet.errors import CpunetError
+from cpunet.files import written_aside
+from cpunet.jobs.common.devices import resolve_device
+from cpunet.jobs.common.inputs import (
+    InputFile,
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_both_sides,
+    require_same_sampling,
+)
+from cpunet.jobs.common.monitor import Monitor
+from cpunet.jobs.training.chain_and_inverse import Sides, match
+from cpunet.jobs.training.network_start import network_start
+from cpunet.outputs import refuse_inputs
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import Values, pulse_parameters
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes import recipe_from
+from cpunet.recipes.schema import Recipe, SearchConfig
+from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.training.checkpoints import differences
+from cpunet.training.loop import train
+from cpunet.training.run_folder import write_run
+from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.output_form import drawn_kev
+from cpunet.translation.translator import REN
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+
+QUIET = Monitor()
+TRIALS = 30
+JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
+STARTS = 8  # random trials before the first Gaussian process
+SHARE = 0.3  # share of the pulses of each side that is held out
+MIN_N = 20  # minimum per side for a distribution
+MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
+# pulses and their comparison must be the same for all trials, so only these may be tuned
+TUNED = ("generator", "discriminator", "training")
+UNCHANGED, REASON, BEGUN = "unchanged recipe", "reason", "begun with"  # user attributes
+
+
+def tune_recipe(
+    sim: InputFile,
+    data: InputFile,
+    out: Path,
+    recipe: Recipe,
+    *,
+    trials: int = TRIALS,
+    peak: str = "FEP",
+    seed: int = 0,
+    device: str = "auto",
+    monitor: Monitor = QUIET,
+) -> Study:
+    """Search for the settings that translate held-out pulses of the training's energies best.
+
+    Parameters
+    ----------
+    sim, data, peak, device
+        See `cpunet.jobs.training.train.train_run`.
+    out
+        Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe),
+        ``trials.csv``, and ``journal.log`` with all that Optuna knows.
+    recipe
+        Recipe with its search space; its own values are the first trial.
+    trials
+        Total number of trials, including completed and failed ones.
+    seed
+        Seed of the split into fitted and held-out pulses, of all trainings, and of the search.
+    monitor
+        Receiver of the progress.
+
+    Returns
+    -------
+    optuna.Study
+        Choices of a search space are JSON texts in its trials.
+
+    Raises
+    ------
+    CpunetError
+        If optuna is missing, the search space or the input cannot be used, the folder is not
+        that of a search with the same settings and pulses, or no trial has a score.
+    """
+    try:
+        import optuna
+        from optuna.storages.journal import JournalFileBackend
+    except ImportError as error:
+        raise CpunetError(
+            "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
+        ) from error
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    device, space = resolve_device(device), search_space(recipe)
+    refuse_inputs(out, *sim.files, *data.files)
+    if out.exists() and not (out / JOURNAL).exists():
+        raise CpunetError(f"{out}: exists already and holds no search; choose another name")
+    selection = parse_selection(peak, recipe.peaks)
+    simulated = load_simulated(sim, recipe, selection, monitor)
+    measured = load_measured(data, recipe, selection, monitor)
+    require_same_sampling(simulated, measured)
+    require_both_sides(simulated, measured, selection)
+    held_out = HeldOut.of(simulated, measured, data, recipe, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    study = optuna.create_study(
+        study_name="cpunet",
+        storage=optuna.storages.JournalStorage(JournalFileBackend(str(out / JOURNAL))),
+        load_if_exists=True,
+    )
+    begun = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
+    begun |= {"simulation": simulated.fingerprint(), "data": measured.fingerprint()}
+    for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
+        raise CpunetError(
+            f"{out}: was begun with other settings or pulses: {difference}; give the same, or "
+            "choose another name"
+        )
+    study.set_user_attr(BEGUN, begun)
+    own = {key: value_of(recipe, key) for key in space}
+    if not study.trials and all(_holds(space[key], own[key]) for key in space):
+        study.enqueue_trial(_labelled(own, space), {UNCHANGED: True})
+    states = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
+
+    def objective(trial: Trial) -> float:
+        # trials have numbers of their own, so processes do not draw the same random ones
+        study.sampler = optuna.samplers.GPSampler(
+            seed=(seed + trial.number) % 2**32,
+            n_startup_trials=STARTS,
+            warn_independent_sampling=False,
+        )
+        values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
+        try:
+            return held_out.score(held_out.train(with_values(recipe, values), seed, device))
+        except CpunetError as error:
+            trial.set_user_attr(REASON, str(error))
+            monitor.note(f"trial {trial.number} failed: {error}")
+            raise
+
+    done = len(study.get_trials(states=states))
+    with monitor.stage("Trials", trials) as advance:
+        advance(done)
+        if done < trials:
+            study.optimize(
+                objective,
+                catch=CpunetError,
+                callbacks=[
+                    optuna.study.MaxTrialsCallback(trials, states),
+                    lambda *_: advance(1),
+                ],
+            )
+    _write(out, study, recipe, space)
+    return study
+
+
+def _write(out: Path, study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> None:
+    with written_aside(out / TABLE) as aside:
+        columns = ("number", "state", "value", "duration", "params", "user_attrs")
+        study.trials_dataframe(columns).to_csv(aside, index=False)
+    try:
+        best = study.best_trial
+    except ValueError as error:
+        reasons = [t.user_attrs[REASON] for t in study.trials if REASON in t.user_attrs]
+        first = next(iter(reasons), "interrupted")
+        raise CpunetError(f"{out}: no trial has a score; the first: {first}") from error
+    chosen = {k: json.loads(v) for k, v in best.params.items() if space[k].choices is not None}
+    description = f"{recipe.description}; tuned, trial {best.number}"
+    tuned = with_values(recipe, best.params | chosen).model_copy(
+        update={"name": f"{recipe.name}-tuned", "description": description}
+    )
+    with written_aside(out / BEST) as aside:
+        aside.write_text(yaml.safe_dump(tuned.model_dump(mode="json"), sort_keys=False))
+
+
+def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
+    """The search space of a recipe, after checking its keys and values.
+
+    Raises
+    ------
+    CpunetError
+        If there is none, or a key or value is not allowed; the message names the key.
+    """
+    if not recipe.search:
+        raise CpunetError(
+            f"recipe {recipe.name}: has no search space; add one, as "
+            "search: {training.ridge: {low: 0.01, high: 0.2, log: true}}"
+        )
+    for key, config in recipe.search.items():
+        if key.split(".")[0] not in TUNED:
+            raise CpunetError(
+                f"recipe {recipe.name}: search.{key}: only settings of {', '.join(TUNED)} "
+                "can be tuned"
+            )
+        value_of(recipe, key)
+        for value in config.choices or (config.low, config.high):
+            with_values(recipe, {key: value})
+    return dict(recipe.search)
+
+
+def value_of(recipe: Recipe, key: str) -> Any:
+    """The value of a setting.
+
+    Raises
+    ------
+    CpunetError
+        If the recipe has none of that name.
+    """
+    node: Any = recipe.model_dump(mode="json")
+    for part in key.split("."):
+        if not isinstance(node, dict) or part not in node:
+            raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
+        node = node[part]
+    return node
+
+
+def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
+    """A recipe with other values, and no search space.
+
+    Raises
+    ------
+    CpunetError
+        If a value is not allowed.
+    """
+    settings = recipe.model_dump(mode="json") | {"search": None}
+    for key, value in values.items():
+        *parents, last = key.split(".")
+        node = settings
+        for parent in parents:
+            node = node[parent]
+        node[last] = value
+    source = ", ".join(f"{key} = {value}" for key, value in values.items())
+    return recipe_from(settings, source=f"recipe {recipe.name}, search, {source}")
+
+
+def _holds(config: SearchConfig, value: Any) -> bool:
+    """Whether a search space contains a value of a setting."""
+    if config.low is None or config.high is None:
+        return value in (config.choices or ())
+    return isinstance(value, int | float) and config.low <= value <= config.high
+
+
+def _labelled(values: dict[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
+    """Values in the form of the journal: choices as JSON, since they can be lists."""
+    chosen = {key: config.choices for key, config in space.items() if config.choices}
+    # a setting of 4.0 is the choice 4 of the search space
+    return values | {k: json.dumps(c[c.index(values[k])]) for k, c in chosen.items()}
+
+
+def _suggested(trial: Trial, key: str, own: Any, config: SearchConfig) -> Any:
+    """The value of a setting proposed for a trial; an integer if all that is given is."""
+    low, high = config.low, config.high
+    if low is None or high is None:
+        labels = [json.dumps(choice) for choice in config.choices or ()]
+        return json.loads(str(trial.suggest_categorical(key, labels)))
+    if all(type(number) is int for number in (own, low, high)):
+        return trial.suggest_int(key, int(low), int(high), log=config.log)
+    return trial.suggest_float(key, low, high, log=config.log)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Prepared pulses of both sides, split into pulses to fit and held-out ones.
+
+    Parameters
+    ----------
+    fit
+        Pulses for the training.
+    sim, data
+        Held-out pulses.
+    values, nulls
+        Parameters of the held-out data, and the null distance of each.
+    """
+
+    fit: Sides
+    sim: Pulses
+    data: Pulses
+    values: dict[str, Values]
+    nulls: dict[str, float]
+    seed: int
+
+    @classmethod
+    def of(
+        cls, sim: InputSet, data: InputSet, data_file: InputFile, recipe: Recipe, seed: int
+    ) -> Self:
+        """Split both sides at random.
+
+        Raises
+        ------
+        CpunetError
+            If too few pulses would be held out.
+        """
+        rng = np.random.default_rng(seed)
+        fit_sim, held_sim = _split(sim, rng)
+        fit_data, held_data = _split(data, rng)
+        values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
+        n_sim, n_data = len(held_sim), len(held_data)
+        draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
+        nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
+        fit = Sides(fit_sim, fit_data, data_file, data)
+        return cls(fit, held_sim, held_data, values, nulls, seed)
+
+    def score(self, ren: REN) -> float:
+        r"""Distance of translated held-out pulses from data; 1 for two samples of the data.
+
+        .. math:: \frac{1}{n} \sum_{p=1}^{n} \frac{W_1(p)}{\langle W_1(p) \rangle_0}
+
+        over the pulse-shape parameters :math:`p`, with the mean of the null in the
+        denominator.
+
+        Raises
+        ------
+        CpunetError
+            If pulses cannot be translated.
+        """
+        generator = ren.seeded(self.seed)
+        remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+        windows = ren.apply(
+            self.sim.waveforms,
+            energy_kev=self.sim.energy_kev,
+            generator=generator,
+            remains_kev=drawn_kev(remains, len(self.sim), generator),
+        )
+        whole = np.isfinite(windows).all(axis=1)
+        if (lost := 1 - whole.mean()) > MAX_LOST:
+            raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
+        pulses = Pulses.of(windows[whole], dt_ns=self.sim.dt_ns)
+        values = pulse_parameters(pulses, ren.recipe.preparation, ren.recipe.scores)
+        ratios = [wasserstein(self.values[k], values[k]) / self.nulls[k] for k in values]
+        score = float(np.mean(ratios))
+        if not np.isfinite(score):
+            raise CpunetError("a parameter of the held-out pulses has no value")
+        return score
+
+    def train(self, recipe: Recipe, seed: int, device: str) -> REN:
+        """Train on the pulses that are not held out; see `cpunet.jobs.training.train`.
+
+        Raises
+        ------
+        CpunetError
+            If the training fails.
+        """
+        model: nn.Module
+        if isinstance(recipe.training, MatchingConfig):
+            model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, QUIET)
+        else:
+            begun = network_start(self.fit, recipe, seed, None, QUIET)
+            recipe, around = begun.recipe, begun.surroundings
+            sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
+            model = train(*sides, recipe, seed=seed, device=device, surroundings=around)
+        info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}
+        with TemporaryDirectory(prefix="cpunet-tune-") as folder:
+            how = {"seconds": 0, "device": device, "seed": seed}
+            write_run(Path(folder), model, recipe, info | how)
+            return REN.load(folder, device)
+
+
+def _split(side: InputSet, rng: np.random.Generator) -> tuple[Pulses, Pulses]:
+    """The pulses of a side to fit, and those held out."""
+    pulses = side.prepared.pulses
+    rows, n = rng.permutation(len(pulses)), int(SHARE * len(pulses))
+    if n < MIN_N:
+        raise CpunetError(
+            f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
+            f"and {MIN_N} are needed; select more energies (--peak) or give more"
+        )
+    return pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]
