@@ -148,36 +148,3 @@ def test_no_input_is_replaced(command, home, name, words, out):
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err
     assert contents(home) == before
-
-
-def test_a_thesis_survives_a_training(command, stand, tiny, tmp_path):
-    words = ("train", *stand.inputs, "--out", tmp_path / "run", *tiny)
-    assert command(*words).code == 0
-    (tmp_path / "run" / "thesis.tex").write_text("mine")
-    outcome = command(*words, "--force")
-    assert outcome.code == 0
-    assert f"{tmp_path / 'run'}: kept what cpunet did not write: thesis.tex" in outcome.err
-    assert (tmp_path / "run" / "thesis.tex").read_text() == "mine"
-    assert (tmp_path / "run" / "run.json").exists()
-
-
-def test_a_thesis_survives_beside_seeds(tmp_path):
-    from cpunet.training.ensemble_folder import ENSEMBLE_KIND, working_folder
-
-    notes: list[str] = []
-    out = tmp_path / "ens"
-    with working_folder(out, ENSEMBLE_KIND) as folder:
-        (folder / "ensemble.json").write_text("{}")
-        for name in ("seed_000", "seed_001.unfinished"):
-            (folder / name).mkdir()
-            (folder / name / "weights.safetensors").touch()
-        (folder / "seed_001.unfinished" / "checkpoint.safetensors").touch()
-        (folder / "seed_000" / "thesis.tex").touch()
-        (folder / "seed_notes.txt").touch()
-    with working_folder(out, ENSEMBLE_KIND, force=True, note=notes.append):
-        pass
-    left = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
-    assert left == [".cpunet.json", ".lock", "seed_000/thesis.tex", "seed_notes.txt"]
-    assert notes == [
-        f"{out}: kept what cpunet did not write: seed_000/thesis.tex, seed_notes.txt"
-    ]

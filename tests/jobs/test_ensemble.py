@@ -161,7 +161,7 @@ def test_no_folder_is_overwritten_by_mistake(files, made, tmp_path):
     mine.mkdir()
     (mine / "thesis.tex").write_text("")
     for how in ({"force": True}, {"resume": True}):
-        with pytest.raises(CpunetError, match=r"no folder with a ensemble\.json"):
+        with pytest.raises(CpunetError, match=r"no folder that cpunet ensemble made"):
             train_ensemble(*files, mine, RECIPE, device="cpu", **how)
     bad = InputFile(files.sim.path, table="none")
     with pytest.raises(CpunetError, match="none"):

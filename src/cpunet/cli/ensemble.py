@@ -10,7 +10,6 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.environment import MAX_THREADS
 from cpunet.cli.messages import monitor, note, tell
 from cpunet.cli.scores import PARAMETERS
 from cpunet.outputs import refuse_inputs
@@ -21,13 +20,15 @@ Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
-        max=MAX_THREADS,
+        max=options.MAX_THREADS,
         help="Processes at a time; as many as cores by default, 1 on a GPU.",
     ),
 ]
 Threads = Annotated[
     int | None,
-    typer.Option(min=1, max=MAX_THREADS, help="CPU threads of each; its share of the cores."),
+    typer.Option(
+        min=1, max=options.MAX_THREADS, help="CPU threads of each; its share of the cores."
+    ),
 ]
 Validate = Annotated[
     bool, typer.Option("--validate/--no-validate", help="Score each seed, or not.")

@@ -23,17 +23,17 @@ from pydantic import BaseModel, Field, ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.file_locks import locked
-from cpunet.files import not_written, written_aside
 from cpunet.outputs import (
     MARKER,
     FolderKind,
     Given,
-    Note,
     mark,
+    not_written,
     refuse_inputs,
     remove_own,
+    require_kind,
     require_replaceable,
-    told_kept,
+    written_aside,
 )
 from cpunet.regular_files import read_text
 from cpunet.training.checkpoints import require_same
@@ -88,7 +88,7 @@ def require_usable(
         )
     left = {path.name for path in out.iterdir()} if out.is_dir() else set()
     if left != {_LOCK}:  # left by a process that was stopped before it began
-        require_replaceable(out, kind)
+        (require_kind if resume else require_replaceable)(out, kind)
 
 
 @contextmanager
@@ -99,7 +99,6 @@ def working_folder(
     resume: bool = False,
     force: bool = False,
     alone: bool = True,
-    note: Note = lambda _message: None,
 ) -> Iterator[Path]:
     """Provide a working folder that is kept, whatever happens.
 
@@ -115,8 +114,6 @@ def working_folder(
         Without `resume`, remove what the program wrote in an existing folder.
     alone
         Lock out other processes.
-    note
-        Called with messages on what is kept of an old folder.
 
     Raises
     ------
@@ -129,13 +126,13 @@ def working_folder(
         out.mkdir(parents=True, exist_ok=True)
         with _locked(out) if alone else nullcontext():
             if not resume:
-                told_kept(out, remove_own(out, kind, leave=(_LOCK,)), note)
+                remove_own(out, kind)
                 out.mkdir(exist_ok=True)
             mark(out, kind, listed=False)
             yield out
     except OSError as error:
         raise CpunetError(
-            f"{not_written(error, out)}; what is finished is kept, continue with --resume"
+            f"{not_written(error, out, out)}; what is finished is kept, continue with --resume"
         ) from error
 
 

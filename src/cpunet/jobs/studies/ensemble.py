@@ -12,7 +12,6 @@ from typing import Any
 
 from cpunet.analysis.seed_scores import failed_seeds, seed_table
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Advance, Monitor
@@ -21,6 +20,7 @@ from cpunet.jobs.studies.fingerprints import fingerprints
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.outputs import written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.training.ensemble_folder import (
     ENSEMBLE,
@@ -104,9 +104,7 @@ def train_ensemble(
     )
     begun_with = {"recipe": recipe.model_dump(mode="json"), "peak": peak}
     begun_with |= fingerprints(sim, data, recipe, peak, monitor)
-    with working_folder(
-        out, ENSEMBLE_KIND, resume=resume, force=force, note=monitor.note
-    ) as folder:
+    with working_folder(out, ENSEMBLE_KIND, resume=resume, force=force) as folder:
         ensemble = _Ensemble(folder, begun_with)
         member = _Member(sim, data, folder, recipe, peak, validate, truth, device)
         left = [seed for seed in range(seeds) if not member.is_done(seed)]

@@ -18,7 +18,6 @@ import numpy as np
 import yaml
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.monitor import Monitor
@@ -38,7 +37,7 @@ from cpunet.jobs.studies.tuning_study import (
     suggested,
     this_worker,
 )
-from cpunet.outputs import FolderKind
+from cpunet.outputs import FolderKind, written_aside
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.ensemble_folder import (
@@ -122,9 +121,7 @@ def tune_recipe(
     require_usable(out, TUNE_KIND, *sim.files, *data.files, resume=resume, force=force)
     begun_with = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
     begun_with |= fingerprints(sim, data, recipe, peak, monitor)
-    with working_folder(
-        out, TUNE_KIND, resume=resume, force=force, alone=False, note=monitor.note
-    ) as folder:
+    with working_folder(out, TUNE_KIND, resume=resume, force=force, alone=False) as folder:
         known = read_study(folder / TUNE, begun_with)
         write_json(folder / TUNE, known or {"begun_with": begun_with})
         study = open_study(folder, recipe)
