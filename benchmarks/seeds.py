@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
+from cpunet.outputs import written_aside
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9

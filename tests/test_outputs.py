@@ -1,47 +1,145 @@
-"""An output replaces no input, and of a folder only what the program wrote."""
+"""Outputs appear whole or not at all; no input and no file of the user is replaced."""
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.outputs import (
     MARKER,
     FolderKind,
     copy_own,
+    folder_written_aside,
+    mark,
     refuse_existing,
     refuse_inputs,
     remove_own,
     require_replaceable,
+    written_aside,
 )
+from cpunet.training.unfinished import unfinished_folder
 
-RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]", older=r".*\.png")
+RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]")
 REPORT = FolderKind("report", "cpunet validate", "metrics.json", r"metrics\.json")
 
 
-def tree(folder: Path) -> dict[str, str | None]:
-    """Every path below a folder but the markers, and what files hold."""
+def tree(folder: Path) -> dict[str, str]:
+    """What the files below a folder hold, but for the markers."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {
-        str(path.relative_to(folder)): path.read_text() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-        if path.name != MARKER
-        and (path.is_symlink() or not path.is_dir() or not any(path.iterdir()))
+        str(path.relative_to(folder)): path.read_text() for path in files if path.name != MARKER
     }
 
 
-def make(folder: Path, kind: FolderKind = RUN, notes: list[str] | None = None, **files: str):
+def make(folder: Path, kind: FolderKind = RUN, **files: str) -> None:
     """Have the program make a folder, over an old one."""
-    said = [] if notes is None else notes
-    with folder_written_aside(folder, kind, force=True, note=said.append) as aside:
+    with folder_written_aside(folder, kind, force=True) as aside:
         for name, text in files.items():
             path = aside / name.replace("__", "/").replace("_", ".")
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)
+
+
+def run_folder_aside(target: Path):
+    return folder_written_aside(target, RUN, force=True)
+
+
+@pytest.mark.parametrize("old", [None, "old"])
+def test_a_file_appears_at_the_end(tmp_path, old):
+    target = tmp_path / "new" / "out.lh5"
+    if old is not None:
+        target.parent.mkdir()
+        target.write_text(old)
+    with written_aside(target) as aside:
+        aside.write_text("content")
+        assert (aside.parent, aside.suffix) == (target.parent, ".lh5")
+        assert target.exists() == (old is not None)
+    assert tree(tmp_path) == {"new/out.lh5": "content"}
+
+
+@pytest.mark.parametrize("error", [ValueError, CpunetError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("writer", [written_aside, run_folder_aside])
+def test_what_failed_leaves_what_was_there(tmp_path, error, old, writer):
+    target = tmp_path / "out"
+    if old and writer is written_aside:
+        target.write_text("old")
+    elif old:
+        make(target, run_json="old")
+    before = tree(tmp_path)
+
+    def fail():
+        with writer(target) as aside:
+            (aside if aside.is_file() else aside / "half").write_text("half")
+            raise error("stop")
+
+    with pytest.raises(error, match="stop"):
+        fail()
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("writer", [written_aside, run_folder_aside])
+def test_a_place_that_cannot_be_written_to(tmp_path, writer):
+    (tmp_path / "file").touch()
+    target = tmp_path / "file" / "out"
+    told = (
+        rf"^{target}: cannot be written \([^\n]*\); make room there, or choose another place$"
+    )
+    with pytest.raises(CpunetError, match=told), writer(target):
+        pass
+
+
+@pytest.mark.parametrize("writer", [written_aside, run_folder_aside, unfinished_folder])
+def test_another_file_that_failed_is_named(tmp_path, writer):
+    missing = tmp_path / "sim.lh5"
+    with pytest.raises(CpunetError, match=rf"\(No such file or directory, {missing}\)"):  # noqa: SIM117
+        with writer(tmp_path / "out"):
+            missing.read_bytes()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    target = tmp_path / "out.lh5"
+    with pytest.raises(CpunetError) as error, written_aside(target):
+        raise OSError(28, "No space left on device")
+    assert str(error.value) == (
+        f"{target}: cannot be written (No space left on device); make room there, or choose "
+        "another place"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_move_that_fails_brings_the_old_folder_back(tmp_path, monkeypatch):
+    make(tmp_path / "run", run_json="old")
+    replace = Path.replace
+
+    def fail(path, to):
+        if to == tmp_path / "run" and not path.name.endswith("-old"):
+            raise OSError(5, "Input/output error")
+        return replace(path, to)
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(CpunetError, match="Input/output error"):
+        make(tmp_path / "run", run_json="new")
+    assert tree(tmp_path) == {"run/run.json": "old"}
+
+
+NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)
+
+
+@given(name=NAME.filter(lambda n: n not in (".", "..") and len(n.encode()) < 200))
+def test_any_name_that_a_file_may_have(name):
+    with TemporaryDirectory() as folder:
+        with written_aside(Path(folder) / name) as aside:
+            aside.write_bytes(name.encode())
+        assert (Path(folder) / name).read_bytes() == name.encode()
+        assert os.listdir(folder) == [name]  # noqa: PTH208
 
 
 @pytest.mark.parametrize(
@@ -53,9 +151,7 @@ def make(folder: Path, kind: FolderKind = RUN, notes: list[str] | None = None, *
         ("linked.lh5", "data/raw.lh5", "is the input"),
         ("hard.lh5", "data/raw.lh5", "is the input"),
         ("data/raw.lh5", "data/raw.lh5:ch1/raw", "is the input"),
-        ("data/raw.lh5", "data/*.lh5", "is the input"),
         ("data/raw.lh5", "**/*.lh5", "is the input"),
-        ("data", "data/raw.lh5", "holds the input"),
         (".", "data/raw.lh5", "holds the input"),
         ("elsewhere", "data/raw.lh5", "holds the input"),  # a link to the folder
         ("data", "data/raw.lh5:ch1/raw", "holds the input"),
@@ -71,9 +167,7 @@ def test_an_input_is_refused(tmp_path, monkeypatch, out, given, told):
     os.link("data/raw.lh5", "hard.lh5")
     (tmp_path / "elsewhere").symlink_to("data")
     with pytest.raises(CpunetError, match=f"^{out}: {told}.*; choose another --out$"):
-        refuse_inputs(Path(out), None, given)
-    with pytest.raises(CpunetError, match=told):
-        refuse_existing(Path(out), given, force=True)
+        refuse_existing(Path(out), None, given, force=True)
 
 
 @pytest.mark.parametrize("given", [None, "", "icpc", "none.lh5", "data/raw.lh5:x", "*.none"])
@@ -86,70 +180,37 @@ def test_what_is_no_input_is_free(tmp_path, monkeypatch, given):
     refuse_inputs(Path("raw.lh5"), "raw", given)
 
 
-def test_refuse_existing(tmp_path):
-    refuse_existing(tmp_path / "none")
-    refuse_existing(tmp_path, force=True)
-    with pytest.raises(CpunetError, match="--force"):
-        refuse_existing(tmp_path)
-
-
-def test_what_others_wrote_is_kept_and_told(tmp_path):
-    run, notes = tmp_path / "run", []
-    make(run, run_json="old", log__a="old", plot_png="old")
-    (run / "thesis").mkdir()
-    (run / "thesis" / "chapter.tex").write_text("mine")
-    (run / "photo.png").write_text("mine")
-    (run / "link").symlink_to("thesis")
-    (run / "empty").mkdir()
-    make(run, notes=notes, run_json="new")
-    assert tree(run) == {
-        "empty": None,
-        "link": None,
-        "photo.png": "mine",
-        "run.json": "new",
-        "thesis/chapter.tex": "mine",
-    }
-    assert (run / "link").is_symlink()
-    assert notes == [
-        f"{run}: kept what cpunet did not write: empty, link, photo.png, thesis/chapter.tex"
-    ]
-    make(run, run_json="newer")  # what was kept once stays the user's
-    assert tree(run)["photo.png"] == "mine"
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_a_name_that_is_the_programs_now(tmp_path):
-    run = tmp_path / "run"
-    make(run, run_json="old")
-    (run / "spectrum.png").write_text("mine")
-    (run / "spectrum.png.kept").write_text("mine, too")
-    make(run, run_json="new", spectrum_png="new")
-    assert tree(run) == {
-        "run.json": "new",
-        "spectrum.png": "new",
-        "spectrum.png.kept": "mine, too",
-        "spectrum.png.kept.kept": "mine",
-    }
-
-
-def test_files_of_the_programs_own_folders(tmp_path):
+def test_a_folder_is_replaced_only_with_force(tmp_path):
     run = tmp_path / "run"
     make(run, run_json="old", log__a="old")
-    (run / "log" / "notes.txt").write_text("mine")
+    with (
+        pytest.raises(CpunetError, match="exists already; choose another name or give --force"),
+        folder_written_aside(run, RUN),
+    ):
+        pytest.fail("entered")
     make(run, run_json="new", log__b="new")
-    assert tree(run) == {"log/b": "new", "log/notes.txt": "mine", "run.json": "new"}
+    assert tree(tmp_path) == {"run/run.json": "new", "run/log/b": "new"}
 
 
-def test_an_older_folder_is_known_by_its_file(tmp_path):
+@pytest.mark.parametrize("mine", ["thesis.tex", "log/notes.txt", "link"])
+def test_a_folder_that_holds_a_file_of_the_user_is_not_replaced(tmp_path, mine):
     run = tmp_path / "run"
-    run.mkdir()
-    for name in ("run.json", "loss.png", "thesis.tex"):
-        (run / name).write_text("old")
-    make(run, run_json="new")
-    assert tree(run) == {"run.json": "new", "thesis.tex": "old"}
-    marker = json.loads((run / MARKER).read_text())
-    assert (marker["program"], marker["command"]) == ("cpunet", "cpunet train")
-    assert marker["files"] == ["run.json"]
+    make(run, run_json="old", log__a="old")
+    (run / mine).symlink_to("run.json") if mine == "link" else (run / mine).touch()
+    before = tree(run)
+    with pytest.raises(
+        CpunetError, match=f"run: holds {mine}, which cpunet did not write; move"
+    ):
+        make(run, run_json="new")
+    assert tree(run) == before
+
+
+def test_a_file_that_comes_meanwhile_is_not_lost(tmp_path):
+    run = tmp_path / "run"
+    make(run, run_json="old")
+    with pytest.raises(CpunetError, match=r"holds thesis\.tex"), run_folder_aside(run):
+        (run / "thesis.tex").touch()
+    assert tree(run) == {"run.json": "old", "thesis.tex": ""}
 
 
 def test_other_folders_are_not_replaced(tmp_path):
@@ -158,59 +219,33 @@ def test_other_folders_are_not_replaced(tmp_path):
     target.mkdir()
     require_replaceable(target, RUN)
     (target / "thesis.tex").touch()
-    with pytest.raises(CpunetError, match=r"is no folder with a run\.json that cpunet train"):
-        make(target, run_json="new")
     make(tmp_path / "report", REPORT, metrics_json="{}")
-    (tmp_path / "report" / "run.json").touch()
-    with pytest.raises(CpunetError, match="is no folder"):
-        require_replaceable(tmp_path / "report", RUN)
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign" / MARKER).write_text('{"kind": "run", "program": "other"}')
-    with pytest.raises(CpunetError, match="is no folder"):
-        require_replaceable(tmp_path / "foreign", RUN)
+    (tmp_path / "file").touch()
+    for other in (target, tmp_path / "report", tmp_path / "file"):
+        with pytest.raises(
+            CpunetError, match="is no folder that cpunet train made, so --force"
+        ):
+            make(other, run_json="new")
     assert tree(target) == {"thesis.tex": ""}
 
 
 def test_a_linked_folder_is_replaced_in_its_place(tmp_path):
     make(tmp_path / "disk" / "run", run_json="old")
-    (tmp_path / "disk" / "run" / "mine").write_text("mine")
     (tmp_path / "run").symlink_to("disk/run")
     make(tmp_path / "run", run_json="new")
     assert (tmp_path / "run").is_symlink()
-    assert tree(tmp_path / "disk") == {"run/mine": "mine", "run/run.json": "new"}
+    assert tree(tmp_path / "disk") == {"run/run.json": "new"}
 
 
-def test_what_failed_changes_nothing(tmp_path):
+def test_own_files_are_removed_and_copied_alone(tmp_path):
     run = tmp_path / "run"
-    make(run, run_json="old")
+    make(run, run_json="a", log__b="b")
     (run / "mine").write_text("mine")
-
-    def fail():
-        with folder_written_aside(run, RUN, force=True) as aside:
-            (aside / "run.json").write_text("new")
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert tree(tmp_path) == {"run/mine": "mine", "run/run.json": "old"}
-
-
-def test_remove_own(tmp_path):
-    run = tmp_path / "run"
-    make(run, run_json="old", log__a="old")
-    assert remove_own(run, RUN) == []
-    assert not run.exists()
-    make(run, run_json="old", log__a="old")
-    (run / "mine" / "log").mkdir(parents=True)
-    (run / "mine" / "log" / "a").write_text("mine")
-    assert remove_own(run, RUN) == ["mine/log/a"]
-    assert tree(run) == {"mine/log/a": "mine"}
-    make(run, run_json="new")  # it is still a folder that the program may fill
-    assert tree(run) == {"mine/log/a": "mine", "run.json": "new"}
-
-
-def test_copy_own(tmp_path):
-    make(tmp_path / "run", run_json="a", log__b="b")
-    (tmp_path / "run" / "mine").touch()
-    copy_own(tmp_path / "run", tmp_path / "copy", RUN)
+    copy_own(run, tmp_path / "copy", RUN)
     assert tree(tmp_path / "copy") == {"log/b": "b", "run.json": "a"}
+    remove_own(run, RUN)
+    assert tree(run) == {"mine": "mine"}
+    (run / "mine").unlink()
+    mark(run, RUN, listed=False)
+    remove_own(run, RUN)
+    assert not run.exists()

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
-QUOTED = re.findall(r"^### `(.+)`$", PAGE.read_text(), re.MULTILINE)
+QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE.read_text(), re.MULTILINE)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,5 @@ from __future__ import annotations
 class CpunetError(Exception):
     """Bad input, described in one line: which file, which event, what to do.
 
-    The command line prints the message and exits with status 2.  Any other exception is a
-    bug and keeps its traceback.
+    The command line prints the message and exits with status 2.
     """

@@ -1,7 +1,8 @@
-"""Rules for replacing outputs: never an input, and in a folder only what this program wrote.
+"""Outputs appear whole or not at all, and replace nothing that the user did not mean.
 
-Every output folder contains `MARKER`, which lists the program, the command and the files that
-it wrote.  With ``--force`` these files are replaced; all others are kept.
+A file or folder is written under a hidden name beside its destination, and moved there when it
+is complete.  No output is an input.  What exists is replaced only with ``--force``, a folder
+only if this program made it and nothing else is in it: `MARKER` lists its files.
 """
 
 from __future__ import annotations
@@ -10,21 +11,20 @@ import glob
 import json
 import os
 import re
+import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.yaml_files import plain_json
 
 MARKER = ".cpunet.json"
-PROGRAM = "cpunet"
-
-Note = Callable[[str], None]
-Given = Path | str | None
-
 PICTURE_FORMATS = (".png", ".pdf", ".svg")
+
+Given = Path | str | None
 
 
 @dataclass(frozen=True)
@@ -38,19 +38,16 @@ class FolderKind:
     command
         Command that creates the folder.
     known_by
-        Name of a file in every such folder, which identifies folders without a marker.
+        Name of a file in every finished folder.
     own
-        Regular expression of file names, relative to the folder, that always belong to the
-        program.
-    older
-        Regular expression of further such names in folders without a list of their files.
+        Regular expression of names of the program's files, relative to the folder, that may
+        come into it later.
     """
 
     name: str
     command: str
     known_by: str
     own: str
-    older: str = "(?!)"  # none
 
 
 def refuse_inputs(out: Path, *inputs: Given) -> None:
@@ -64,9 +61,9 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
         Files and folders as given by the user, including ``FILE:table`` and patterns; values
         that are not file names (a preset, None) are ignored.
     """
-    place = resolved(Path(out))
+    place = Path(out).resolve()
     for source in (found for given in inputs for found in _named(given)):
-        real = resolved(source)
+        real = source.resolve()
         if _same(place, real):
             raise CpunetError(f"{out}: is the input; choose another --out")
         if any(_same(place, above) for above in real.parents):
@@ -75,145 +72,175 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
             raise CpunetError(f"{out}: lies in the input {source}; choose another --out")
 
 
-def resolved(path: Path) -> Path:
-    """A path with all links resolved.
-
-    Raises
-    ------
-    CpunetError
-        If the links form a loop.
-    """
-    try:
-        return path.resolve()
-    except (OSError, RuntimeError) as error:  # before Python 3.13, the latter
-        raise CpunetError(f"{path}: is a link that leads in a circle; remove it") from error
-
-
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
-    """Raise a `CpunetError` if `target` exists and `force` is off, or like `refuse_inputs`.
-
-    A dangling link is neither written through nor replaced.
-    """
+    """Raise a `CpunetError` if `target` exists and `force` is off, or like `refuse_inputs`."""
     refuse_inputs(target, *inputs)
-    if target.is_symlink() and not target.exists():
-        raise CpunetError(f"{target}: is a link that leads nowhere; remove it")
     if target.exists() and not force:
         raise CpunetError(f"{target}: exists already; choose another name or give --force")
 
 
-def require_replaceable(target: Path, kind: FolderKind) -> None:
-    """Raise a `CpunetError` if `target` exists but must not be replaced.
-
-    Only an empty folder, or one of the same kind made by this program, can be replaced.
-    """
-    if not target.exists():
-        return
-    if not (target.is_dir() and (made_here(target, kind) or not any(target.iterdir()))):
+def require_kind(target: Path, kind: FolderKind) -> None:
+    """Raise a `CpunetError` if `target` is neither missing, empty nor a folder of this kind."""
+    empty = target.is_dir() and not any(target.iterdir())
+    if target.exists() and not (empty or made_here(target, kind)):
         raise CpunetError(
-            f"{target}: is no folder with a {kind.known_by} that {kind.command} made, so "
-            "--force does not replace it; choose another name"
+            f"{target}: is no folder that {kind.command} made, so --force does not replace it; "
+            "choose another name"
         )
+
+
+def require_replaceable(target: Path, kind: FolderKind) -> None:
+    """Raise a `CpunetError` like `require_kind`, or if files of the user are in the folder."""
+    require_kind(target, kind)
+    listed = {MARKER, *_marker(target).get("files", ())}
+    for name in _names(target):
+        if name not in listed and not re.fullmatch(kind.own, name):
+            raise CpunetError(
+                f"{target}: holds {name}, which cpunet did not write; move it elsewhere, or "
+                "choose another name"
+            )
 
 
 def made_here(folder: Path, kind: FolderKind) -> bool:
     """Whether a folder was made by this program and is of the given kind."""
-    if (folder / MARKER).is_file():
-        return _marker(folder).get("kind") == kind.name
-    return (folder / kind.known_by).is_file()
+    return _marker(folder).get("kind") == kind.name
 
 
 def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
     """Write the marker into a folder; if `listed`, with all present files as its own."""
-    content: dict[str, object] = {
-        "program": PROGRAM,
-        "command": kind.command,
-        "kind": kind.name,
-    }
-    if listed:
-        content["files"] = sorted(_relative(path, folder) for path in _leaves(folder))
+    content = {"kind": kind.name, "files": _names(folder) if listed else []}
     (folder / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def keep_others(old: Path, new: Path, kind: FolderKind) -> list[str]:
-    """Transfer files that are not the program's own from a folder to its replacement.
-
-    They are linked, or copied where links are impossible, so that nothing is ever lost.  If
-    the name of a new file is taken, the old file gets the suffix ``.kept``.
-
-    Returns
-    -------
-    list of str
-        Names of the kept files, relative to the folder.
-    """
-    kept = []
-    # first the files that keep their names
-    for path in sorted(_others(old, kind), key=lambda p: (new / p.relative_to(old)).exists()):
-        place = new / path.relative_to(old)
-        while os.path.lexists(place):
-            place = place.with_name(f"{place.name}.kept")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir() and not path.is_symlink():
-            place.mkdir()
-        else:
-            try:
-                os.link(path, place, follow_symlinks=False)
-            except OSError:
-                shutil.copy2(path, place, follow_symlinks=False)
-        kept.append(_relative(place, new))
-    return kept
 
 
 def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
     """Copy the files whose names match ``own`` of the kind from one folder to another."""
-    own = re.compile(kind.own)
-    for path in _leaves(folder):
-        if own.fullmatch(_relative(path, folder)) and path.is_file():
-            place = to / path.relative_to(folder)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, place)
+    for name in _names(folder):
+        if re.fullmatch(kind.own, name):
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(folder / name, to / name)
 
 
-def remove_own(folder: Path, kind: FolderKind) -> list[str]:
-    """Remove the program's files from a folder, and the folder if nothing else is in it.
-
-    Returns
-    -------
-    list of str
-        Names of the kept files, relative to the folder; if any are kept, so is the marker.
-    """
-    folder = folder.resolve()  # a link stays
-    others = list(_others(folder, kind))
-    staying = {above for path in others for above in (path, *path.parents)}
-    for path in list(_leaves(folder)):
-        if path not in staying:
-            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
-            for above in path.parents:
-                if above == folder or above in staying or any(above.iterdir()):
-                    break
-                above.rmdir()
-    if others:
-        (folder / MARKER).unlink(missing_ok=True)
-        mark(folder, kind, listed=False)
-    elif not any(folder.iterdir()):
+def remove_own(folder: Path, kind: FolderKind) -> None:
+    """Remove the program's files from a folder, and the folder if nothing else is in it."""
+    own = re.compile(f"{kind.own}|{re.escape(MARKER)}")
+    for path in sorted(folder.rglob("*"), reverse=True):  # what is in a folder before it
+        if path.is_dir() and not path.is_symlink():
+            with suppress(OSError):  # somebody's files are in it
+                path.rmdir()
+        elif own.fullmatch(path.relative_to(folder).as_posix()):
+            path.unlink()
+    with suppress(OSError):
         folder.rmdir()
-    return [_relative(path, folder) for path in others]
 
 
-def told_kept(folder: Path, kept: list[str], note: Note) -> None:
-    """Report the files of a folder that were kept, if any."""
-    if kept:
-        shown = ", ".join(kept[:5]) + (f" and {len(kept) - 5} more" if kept[5:] else "")
-        note(f"{folder}: kept what cpunet did not write: {shown}")
+@contextmanager
+def written_aside(target: Path) -> Iterator[Path]:
+    """Yield a temporary file name beside `target`; on success, move the file to `target`.
+
+    On an exception the temporary file is removed and `target` is unchanged.
+
+    Raises
+    ------
+    CpunetError
+        If `target` cannot be written.
+    """
+    target = Path(target)
+    aside = target.parent / f"{_hidden(target.stem)}.partial{target.suffix}"
+    try:
+        with _writing(target, aside):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            aside.touch(exist_ok=False)
+            yield aside
+            aside.replace(target)
+    finally:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_written_aside(
+    target: Path, kind: FolderKind, *inputs: Given, force: bool = False
+) -> Iterator[Path]:
+    """Yield a temporary folder beside `target`; on success, move it to `target`.
+
+    Parameters
+    ----------
+    target
+        Folder to create.
+    kind
+        Kind of the folder.
+    inputs
+        Files and folders that are read; `target` must not be, contain or lie in any of them.
+    force
+        Whether to replace an empty folder, or one of this kind; see `require_replaceable`.
+
+    Raises
+    ------
+    CpunetError
+        If `target` exists and must not be replaced, or cannot be written.
+    """
+    target = Path(target)
+    refuse_existing(target, *inputs, force=force)
+    require_replaceable(target, kind)
+    place = target.resolve() if target.is_symlink() else target
+    aside = place.parent / _hidden(place.name)
+    try:
+        with _writing(target, aside):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            aside.mkdir()
+            yield aside
+            mark(aside, kind)
+            if force and place.exists():
+                require_replaceable(place, kind)  # the user may have come meanwhile
+                _exchange(aside, place)
+            else:
+                aside.replace(place)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _exchange(aside: Path, place: Path) -> None:
+    """Move a folder into the place of another one, which is removed only afterwards."""
+    old = aside.with_name(f"{aside.name}-old")
+    place.replace(old)
+    try:
+        aside.replace(place)
+    except OSError:
+        old.replace(place)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def _writing(target: Path, aside: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise not_written(error, target, aside) from error
+
+
+def not_written(error: OSError, target: Path, aside: Path) -> CpunetError:
+    """Describe why `target` was not written at `aside`; another file that failed is named."""
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    other = str(error.filename or aside)
+    what = "" if aside.name in other else f", {other}"
+    return CpunetError(
+        f"{target}: cannot be written ({reason}{what}); make room there, or choose another "
+        "place"
+    )
+
+
+def _hidden(name: str) -> str:
+    return f".{name}-{secrets.token_hex(4)}"
 
 
 def _named(given: Given) -> Iterator[Path]:
     """Existing files and folders that a command-line argument refers to."""
     if given is None or str(given) == "":
         return
-    path = Path(given)
     text = str(given)
-    if os.path.lexists(path):
-        yield path
+    if os.path.lexists(text):
+        yield Path(text)
     elif (file := text.rpartition(":")[0]) and os.path.lexists(file):
         yield Path(file)
     elif glob.has_magic(text):
@@ -222,43 +249,20 @@ def _named(given: Given) -> Iterator[Path]:
 
 def _same(one: Path, other: Path) -> bool:
     """Whether two resolved paths are the same file, also under different names."""
-    try:
+    with suppress(OSError):
         return one == other or one.samefile(other)
-    except OSError:
-        return False
+    return False
 
 
-def _marker(folder: Path) -> dict[str, object]:
+def _marker(folder: Path) -> dict[str, Any]:
     try:
-        content = plain_json((folder / MARKER).read_text(encoding="utf-8"))
+        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    ours = isinstance(content, dict) and content.get("program") == PROGRAM
-    return content if ours else {}
+    return content if isinstance(content, dict) else {}
 
 
-def _leaves(folder: Path) -> Iterator[Path]:
-    """Files, links and empty folders below a folder."""
-    for path in sorted(folder.iterdir()):
-        if path.is_dir() and not path.is_symlink() and any(path.iterdir()):
-            yield from _leaves(path)
-        else:
-            yield path
-
-
-def _others(folder: Path, kind: FolderKind) -> Iterator[Path]:
-    """Paths in a folder that are not the program's own."""
-    marker = _marker(folder)
-    files = marker.get("files")
-    listed = (
-        {file for file in files if isinstance(file, str)} if isinstance(files, list) else set()
-    )
-    own = re.compile(kind.own if isinstance(files, list) else f"{kind.own}|{kind.older}")
-    for path in _leaves(folder):
-        name = _relative(path, folder)
-        if name != MARKER and name not in listed and not own.fullmatch(name):
-            yield path
-
-
-def _relative(path: Path, folder: Path) -> str:
-    return path.relative_to(folder).as_posix()
+def _names(folder: Path) -> list[str]:
+    """Names of the files and links below a folder, relative to it, in order."""
+    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in found)

@@ -146,14 +146,3 @@ def test_no_input_is_replaced(command, home, name, words, out):
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err
     assert contents(home) == before
-
-
-def test_a_thesis_survives_a_training(command, stand, tiny, tmp_path):
-    words = ("train", *stand.inputs, "--out", tmp_path / "run", *tiny)
-    assert command(*words).code == 0
-    (tmp_path / "run" / "thesis.tex").write_text("mine")
-    outcome = command(*words, "--force")
-    assert outcome.code == 0
-    assert f"{tmp_path / 'run'}: kept what cpunet did not write: thesis.tex" in outcome.err
-    assert (tmp_path / "run" / "thesis.tex").read_text() == "mine"
-    assert (tmp_path / "run" / "run.json").exists()

@@ -138,30 +138,6 @@ def test_force_begins_again(command, words, trained, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (
-            torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB\nGPU 0"),
-            "error: the GPU's memory does not suffice; try --set training.batch_size=2",
-        ),
-        (
-            RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"),
-            "error: the computer's memory does not suffice; try --set training.batch_size=2",
-        ),
-    ],
-)
-def test_too_little_memory(command, words, tmp_path, monkeypatch, error, line):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr("cpunet.jobs.training.cyclegan_trainer.train", fail)
-    outcome = command(*words)
-    assert outcome.code == 2
-    assert outcome.err.splitlines()[-1] == line
-    assert list(tmp_path.iterdir()) == []
-
-
 # Each is where a training is killed: what has happened to an iteration, and its number.
 MOMENTS = [
     ("its line is half written", 1),

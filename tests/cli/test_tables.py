@@ -75,7 +75,7 @@ def test_other_tables(screen, capsys):
             one["iou_std"] = dict.fromkeys(METHODS, 1.5)
         peak |= {"n_sim": 100, "n_data": 100}
     table = side_by_side(dict.fromkeys(names, full), "ren")
-    messages.show(compare.comparison_table(table, "Scores"))
+    messages.tell(compare.comparison_table(table, "Scores"))
     cells = [cell.text for row in table.rows for cell in row.cells]
     require_whole(capsys.readouterr().out, cells)
 
@@ -84,17 +84,17 @@ def test_other_tables(screen, capsys):
     truth = {"name": "legend200", "values": values, "difference": values, "sigma": values}
     spread = dict.fromkeys(values, 0.0123)
     told = {"runs": runs, "mean": values, "spread": spread, "truth": truth}
-    messages.show(response.response_table(told))
+    messages.tell(response.response_table(told))
     require_whole(capsys.readouterr().out, ["38.12", "55.43 ± 0.012", "1.953", "+55.4"])
 
 
 def test_markup_and_empty_tables(screen, capsys):
     table = Table("name", title="nothing")
-    messages.show(table)
+    messages.tell(table)
     table = Table("name")
     table.add_column("value", justify="right")
     table.add_row("[bold]a[/]", "[bold]123456789.123456789[/]")
-    messages.show(table)
+    messages.tell(table)
     assert "123456789.123456789" in capsys.readouterr().out
 
 

@@ -129,12 +129,6 @@ def test_a_sample_that_is_large_enough_is_everything() -> None:
     assert load_prepared(source, CONFIG, "measured", most=9).rejections == {}
 
 
-def test_more_than_the_memory_holds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cpunet.machine_memory.available_bytes", lambda: 100)
-    with pytest.raises(CpunetError, match=r"run7.lh5: more than 4 selected pulses: about"):
-        load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
-
-
 def test_only_windows_are_kept() -> None:
     prepared = load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
     assert prepared.pulses.waveforms.shape == (9, 40)

@@ -404,7 +404,7 @@ def test_a_foreign_folder_is_left_alone(tmp_path):
     mine.mkdir()
     (mine / "thesis.tex").write_text("...")
     with (
-        pytest.raises(CpunetError, match=r"run\.unfinished: is no folder with a unfinished"),
+        pytest.raises(CpunetError, match=r"run\.unfinished: is no folder that cpunet train"),
         unfinished_folder(tmp_path / "run", force=True),
     ):
         pass

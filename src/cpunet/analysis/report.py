@@ -73,7 +73,7 @@ def write_report(
     Parameters
     ----------
     folder
-        An existing folder, see `files.folder_written_aside`.
+        An existing folder, see `outputs.folder_written_aside`.
     metrics
         ``peaks``: by peak, ``n_sim``, ``n_data``, ``not_prepared`` (counts by method),
         ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, show, tell
+from cpunet.cli.messages import monitor, tell
 from cpunet.cli.simulate import HitFrame
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -172,7 +172,7 @@ def calibrate(
     )
     if plan:
         for line in plan_lines(job.plan(out_folder, force=force, monitor=monitor())):
-            show(line)
+            tell(line)
         return
     assert out_folder is not None
     content = job.run(out_folder, force=force, monitor=monitor())

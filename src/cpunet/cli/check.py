@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, show
+from cpunet.cli.messages import monitor, out, tell
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -62,7 +62,7 @@ def check(
             checked = check(*pair, chosen, on.peak, monitor())
         picture = out_file
         if name:
-            show(f"{name}:")
+            tell(f"{name}:")
             picture = out_file and out_file.with_stem(f"{out_file.stem}-{name}")
         _show(checked, picture, force=force)
         stopped |= checked.level == Level.ERROR
@@ -75,7 +75,7 @@ def _show(checked: Checked, picture: Path | None, *, force: bool) -> None:
 
     for finding in checked.findings:
         out.print(MARKS[finding.level], end="", soft_wrap=True)
-        show(str(finding))
+        tell(str(finding))
     if picture is not None and checked.sides:
         draw(checked, picture, force=force)
-        show(f"{picture}: pulses of both sides")
+        tell(f"{picture}: pulses of both sides")

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import show, tell
+from cpunet.cli.messages import tell
 
 if TYPE_CHECKING:
     from cpunet.analysis.side_by_side import SideBySide
@@ -50,16 +50,15 @@ def compare(
     table, missing = compare_reports(
         reports, method=method, out=out_file, missing_ok=missing_ok, force=force
     )
-    say = show if out_file is None else tell
     if out_file is None or len(table.names) <= FEW:
-        say(comparison_table(table, f"Scores of {escape(table.method)}"))
+        tell(comparison_table(table, f"Scores of {escape(table.method)}"))
         for note in table.notes:
-            say(f"note: {note}")
+            tell(f"note: {note}")
     if table.over_runs is not None:
         title = "Over runs: median ± standard deviation (lowest – highest)"
-        say(comparison_table(table.over_runs, title))
+        tell(comparison_table(table.over_runs, title))
     for name in missing:
-        say(f"no report: {name}")
+        tell(f"no report: {name}")
     if out_file is not None:
         tell(str(out_file))
 

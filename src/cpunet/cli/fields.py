@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, show, tell
+from cpunet.cli.messages import monitor, tell
 from cpunet.outputs import refuse_inputs
 
 DetectorFile = Annotated[
@@ -49,6 +49,5 @@ def fields(
         monitor=monitor(),
     )
     width = max(map(len, told))
-    say = show if out_file is None else tell
     for name, value in told.items():
-        say(f"{name:<{width}}  {value}")
+        tell(f"{name:<{width}}  {value}")

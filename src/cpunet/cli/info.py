@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import show, tell, warn
+from cpunet.cli.messages import tell, warn
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
@@ -91,11 +91,11 @@ def info(
     if told["kind"] == "run" and (wrong := problem(told)):
         warn(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
-        show(_tables(told))
-        show("one of them: --table NAME; each in full: --table all")
+        tell(_tables(told))
+        tell("one of them: --table NAME; each in full: --table all")
     elif told["kind"] == "channels":
         for name, one in told["channels"].items():
-            show(f"{name}:")
+            tell(f"{name}:")
             _print([("", one)] if isinstance(one, str) else in_words(one))
     else:
         _print(in_words(told))
@@ -112,7 +112,7 @@ def info(
 def _print(lines: Lines) -> None:
     width = max(len(name) for name, _ in lines)
     for name, text in lines:
-        show(f"{name:<{width}}  {text}")
+        tell(f"{name:<{width}}  {text}")
 
 
 def _tables(told: Mapping[str, Any]) -> Table:

@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 
 import cpunet
-from cpunet.cli.boundary import ended_with, report_interrupt
+from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
 from cpunet.cli.check import check
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
-from cpunet.cli.environment import drop_nonsense, share_the_machine
+from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.fields import fields
 from cpunet.cli.import_weights import import_
@@ -24,7 +24,6 @@ from cpunet.cli.messages import out, warn
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
-from cpunet.cli.streams import finish_streams, prepare_streams
 from cpunet.cli.train import train
 from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
@@ -90,16 +89,12 @@ def main() -> None:
     debug = DEBUG in words[:end]  # known wherever it stands, also before anything is imported
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
     try:
-        prepare_streams()
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, report_interrupt)
-        for line in drop_nonsense():
-            warn(line)
+            signal.signal(number, stop)
         share_the_machine()
         if clash := other_package():
             warn(clash)
         status = app(words, standalone_mode=False)
     except BaseException as error:
-        status = ended_with(error, debug=debug)
-    finish_streams()
+        status = ended_with(error, words, debug=debug)
     sys.exit(status or 0)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -17,30 +18,20 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from cpunet.cli.streams import Notes, OutputError, Results
 from cpunet.jobs.common.monitor import Advance, Monitor
 
-out = Results()
-err = Notes(stderr=True)
+# in FILE:key:, a picture would replace key
+out, err = Console(emoji=False), Console(emoji=False, stderr=True)
 
 LOG_EVERY_S = 30.0  # between lines of progress in a log file
 
 
-def show(result: str | Table) -> None:
+def tell(result: str | Table) -> None:
     """Print a line as it is (brackets are no markup), or a table with every number whole."""
     if isinstance(result, Table):
         _print_table(result)
     else:
         out.print(result, markup=False, highlight=False, soft_wrap=True)
-
-
-def tell(result: str | Table) -> None:
-    """Show what is in an output that is in place: if it cannot be printed, only warn."""
-    try:
-        show(result)
-    except OutputError as error:
-        warn(f"{error}; the output is whole")
-        out.quiet = True  # once is enough
 
 
 def fail(message: str) -> None:
@@ -63,8 +54,6 @@ def _print_table(table: Table) -> None:
 
     Words and headings are broken if that makes the table fit; else it is wider than the screen.
     """
-    if out.quiet:
-        return
     _, right, _, left = table.padding
     room = out.width - 1 - len(table.columns) * (left + right + 1)
     least, most = [], []
@@ -81,7 +70,7 @@ def _print_table(table: Table) -> None:
         column.width, column.no_wrap, column.overflow = low + more, False, "fold"
         spare -= 0 if spare < 0 else more
     whole = out.width - room + sum(column.width or 0 for column in table.columns)
-    Results(file=out.file, width=max(out.width, whole)).print(table)
+    Console(emoji=False, file=out.file, width=max(out.width, whole)).print(table)
 
 
 def monitor() -> Monitor:

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from cpunet.cli.environment import MAX_THREADS
-
 if TYPE_CHECKING:
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.recipes.schema import Recipe
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
 # Far beyond what anyone needs, and what a job can hold or live to see.
 MAX_SAMPLES = 1 << 20
 MAX_REALISATIONS = 10_000
+MAX_THREADS = 1024
 
 
 def within(

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, show, tell, warn
+from cpunet.cli.messages import monitor, tell, warn
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -76,7 +76,7 @@ def response(
         truth = read_electronics(electronics)
     told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
     if out_folder is None:
-        show(response_table(told))
+        tell(response_table(told))
     else:
         tell(response_table(told))
         tell(f"{out_folder / 'response.png'}")

@@ -11,7 +11,6 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
-from cpunet.cli.environment import MAX_THREADS
 from cpunet.cli.messages import monitor, tell
 from cpunet.errors import CpunetError
 
@@ -66,7 +65,10 @@ OutTable = Annotated[str | None, typer.Option(help="Table to write; geds/ren or 
 Jobs = Annotated[
     int,
     typer.Option(
-        min=1, max=MAX_THREADS, help="Processes, a file each at a time.", rich_help_panel=FILES
+        min=1,
+        max=options.MAX_THREADS,
+        help="Processes, a file each at a time.",
+        rich_help_panel=FILES,
     ),
 ]
 Resume = Annotated[

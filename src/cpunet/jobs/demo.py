@@ -79,11 +79,10 @@ def demonstrate(
         electronics, detector, windows, tuple(events.values()), kind=kind, seed=seed
     )
     if force:
-        remove_parts(out, monitor.note)
+        remove_parts(out)
     require_same_parts(out, plan, recipe, _PEAK)
-    # the folder of a missing part can contain files of others, which are kept
     if not is_there(out, "stand"):
-        write_stand(plan, stand, force=stand.exists(), monitor=monitor)
+        write_stand(plan, stand, monitor=monitor)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     if not is_there(out, "run"):
         train_run(
@@ -97,7 +96,7 @@ def demonstrate(
                 device,
                 # an unfinished training is resumed, except with --force
                 resume=isinstance(recipe.training, TrainingConfig) and not force,
-                force=force or run.exists(),
+                force=force,
             ),
             monitor=monitor,
         )
@@ -107,6 +106,5 @@ def demonstrate(
         data,
         report,
         ValidateOptions(stand / "truth.npz", seed=seed, device=device),
-        force=report.exists(),
         monitor=monitor,
     )

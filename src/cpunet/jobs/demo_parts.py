@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from cpunet.analysis.report_folder import METRICS, REPORT
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation.stand import MARKER, STAND
 from cpunet.jobs.simulation.stand_plan import StandPlan
-from cpunet.outputs import Note, made_here, remove_own, require_replaceable, told_kept
+from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
 from cpunet.yaml_files import json_mapping
@@ -58,16 +59,12 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
 
 
 def is_there(out: Path, part: str) -> bool:
-    """Whether a part exists; a folder with only files of others does not count."""
-    folder, kind = out / part, _KINDS[part]
-    emptied = made_here(folder, kind) and not (folder / kind.known_by).exists()
-    return folder.exists() and not emptied
+    """Whether a part exists."""
+    return (out / part).exists()
 
 
-def remove_parts(out: Path, note: Note) -> None:
+def remove_parts(out: Path) -> None:
     """Remove all parts, or none if something else is in the place of one.
-
-    Files that the program did not write are kept and reported.
 
     Raises
     ------
@@ -81,7 +78,7 @@ def remove_parts(out: Path, note: Note) -> None:
         folder = out / part
         try:
             if folder.exists():
-                told_kept(folder, remove_own(folder, _KINDS[part]), note)
+                shutil.rmtree(folder)
         except OSError as error:
             reason = error.strerror or error
             raise CpunetError(f"{folder}: cannot be removed ({reason})") from error

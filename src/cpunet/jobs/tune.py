@@ -20,7 +20,6 @@ from torch import nn
 from cpunet.analysis.distances import null_distances, wasserstein
 from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
     InputFile,
@@ -33,7 +32,7 @@ from cpunet.jobs.common.inputs import (
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides, match
 from cpunet.jobs.training.network_start import network_start
-from cpunet.outputs import refuse_inputs
+from cpunet.outputs import refuse_inputs, written_aside
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection

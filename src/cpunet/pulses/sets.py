@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.machine_memory import require_memory
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -100,11 +99,6 @@ def load_prepared(
         part = _prepare_selected(block, config, kind, select, peaks, n_read)
         n_read += len(block)
         n_kept += len(part)
-        require_memory(
-            block.waveforms.nbytes,
-            f"{source.path}: more than {n_kept} selected pulses",
-            "select fewer energies, or give a shorter file",
-        )
         sets.append(part)
         drawn.append(rng.random(len(part)))
         if most is not None and n_kept > 1.5 * most:

@@ -17,8 +17,7 @@ import numpy.typing as npt
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, WaveformTable
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.container import Pulses
 
 if TYPE_CHECKING:
@@ -278,7 +277,8 @@ def write_errors(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         raise CpunetError(
-            f"{path}: cannot be written ({os_reason(error)}); nothing was left"
+            f"{path}: cannot be written ({os_reason(error)}); make room there, or choose "
+            "another place"
         ) from error
 
 

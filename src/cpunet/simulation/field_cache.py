@@ -11,7 +11,7 @@ import numpy.typing as npt
 import platformdirs
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
+from cpunet.outputs import written_aside
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.grid import Grid
 from cpunet.simulation.poisson import Potentials

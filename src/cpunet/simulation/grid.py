@@ -10,7 +10,6 @@ import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
 from cpunet.errors import CpunetError
-from cpunet.machine_memory import require_memory
 from cpunet.simulation.geometry import (
     DITCH,
     GERMANIUM,
@@ -21,7 +20,6 @@ from cpunet.simulation.geometry import (
 )
 
 MAX_NODES = 1_500_000
-_BYTES_A_NODE = 1000  # of a direct solver
 PASSIVATED, DITCH_EDGE, CONTACT_EDGE = 3, 6, 7
 
 # minimum distance to a contact, as a fraction of a step
@@ -69,11 +67,6 @@ def make_grid(detector: Detector) -> Grid:
             f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes; "
             f"give a coarser one (at most {MAX_NODES} nodes)"
         )
-    require_memory(
-        nr * nz * _BYTES_A_NODE,
-        f"detector {detector.name}: grid_mm {h:g} with {nr} x {nz} nodes",
-        "give a coarser one",
-    )
     # rounded, so that 23 steps of 0.1 mm are exactly 2.3 mm
     r, z = (np.round(np.arange(n) * h, 9) for n in (nr, nz))
     rr, zz = np.meshgrid(r, z, indexing="ij")

@@ -12,28 +12,29 @@ The folder is visible, so that nobody wonders where a day of GPU time went.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.file_locks import locked
-from cpunet.files import folder_written_aside, not_written
 from cpunet.outputs import (
     FolderKind,
     Given,
     copy_own,
+    folder_written_aside,
     mark,
+    not_written,
     refuse_existing,
     refuse_inputs,
     remove_own,
+    require_kind,
     require_replaceable,
-    told_kept,
 )
 from cpunet.training.checkpoints import (
     CHECKPOINT,
@@ -68,7 +69,6 @@ def unfinished_folder(
     *inputs: Given,
     resume: bool = False,
     force: bool = False,
-    note: Callable[[str], None] = lambda _message: None,
 ) -> Iterator[Path]:
     """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
 
@@ -84,8 +84,6 @@ def unfinished_folder(
         Whether an unfinished training may exist; it is kept for `UnfinishedRun` to continue.
     force
         Replace an existing run folder, and allow an unfinished training to be replaced.
-    note
-        Called with messages on what is kept of either.
 
     Raises
     ------
@@ -99,7 +97,7 @@ def unfinished_folder(
     require_replaceable(out, RUN)
     folder = unfinished_name(out)
     refuse_inputs(folder, *inputs)
-    require_replaceable(folder, UNFINISHED)
+    require_kind(folder, UNFINISHED)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
@@ -112,30 +110,41 @@ def unfinished_folder(
             finished = False
             try:
                 yield folder
-                _put_in_place(folder, out, force=force, note=note)
+                _put_in_place(folder, out, force=force)
                 finished = True
             finally:
                 if finished or not has_checkpoint(folder):
-                    told_kept(folder, remove_own(folder, UNFINISHED), note)
+                    remove_own(folder, UNFINISHED)
     except OSError as error:
         raise CpunetError(
-            f"{not_written(error, folder)}; what is stored is kept, continue with --resume"
+            f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
+            "--resume"
         ) from error
 
 
-def _put_in_place(folder: Path, out: Path, *, force: bool, note: Callable[[str], None]) -> None:
+def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
     # a copy: until it is in place, the training can be resumed from the original folder
     try:
-        with folder_written_aside(out, RUN, force=force, note=note) as whole:
+        with folder_written_aside(out, RUN, force=force) as whole:
             copy_own(folder, whole, RUN)
     except CpunetError as error:
         raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
 
 
-def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Lock out other processes."""
-    busy = f"{folder}: another process is training there; wait for it, or choose another --out"
-    return locked(folder / MARKER, busy)
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock out other processes, whose weights would be mixed with those of this one."""
+    with (folder / MARKER).open("a") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CpunetError(
+                f"{folder}: another process is training there; wait for it, or choose another "
+                "--out"
+            ) from None
+        except OSError:
+            pass
+        yield
 
 
 class UnfinishedRun:

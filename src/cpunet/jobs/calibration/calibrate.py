@@ -23,7 +23,6 @@ from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
 from cpunet.calibration.titles import titled
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.jobs.calibration.calibration_inputs import (
     DEPLETION,
     Freedom,
@@ -42,7 +41,7 @@ from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
-from cpunet.outputs import FolderKind
+from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.simulation.geometry import Detector
@@ -144,9 +143,7 @@ class Calibration:
         """
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
-        with folder_written_aside(
-            out, RUN, *self.files, force=force, note=monitor.note
-        ) as folder:
+        with folder_written_aside(out, RUN, *self.files, force=force) as folder:
             sides = self._sides(folder, monitor)
             with monitor.stage("Calibrating") as advance:
                 calibrated = self._search(sides, monitor, lambda: advance(1)).run()
@@ -196,9 +193,7 @@ class Calibration:
         if out is None:
             with tempfile.TemporaryDirectory() as aside:
                 return self._planned(Path(aside), monitor)
-        with folder_written_aside(
-            out, PLAN, *self.files, force=force, note=monitor.note
-        ) as folder:
+        with folder_written_aside(out, PLAN, *self.files, force=force) as folder:
             content = self._planned(folder, monitor)
             (folder / "plan.json").write_text(json.dumps(content, indent=1) + "\n")
             figure = directions_figure(content["directions"][str(PLANNED[1])])

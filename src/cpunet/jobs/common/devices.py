@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 import resource
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 
@@ -26,26 +24,6 @@ def resolve_device(device: str) -> str:
         count = torch.cuda.device_count()
         raise CpunetError(f"device {device!r}: the last of {count} GPUs is cuda:{count - 1}")
     return device
-
-
-@contextmanager
-def enough_memory(remedy: str) -> Iterator[None]:
-    """Context manager that reports exhausted memory in one line.
-
-    Parameters
-    ----------
-    remedy
-        Advice for the user.
-    """
-    try:
-        yield
-    except (torch.cuda.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        # the CPU allocator has no exception class
-        known = isinstance(error, torch.cuda.OutOfMemoryError | MemoryError)
-        if not (known or "DefaultCPUAllocator" in str(error)):
-            raise
-        where = "GPU" if isinstance(error, torch.cuda.OutOfMemoryError) else "computer"
-        raise CpunetError(f"the {where}'s memory does not suffice; try {remedy}") from error
 
 
 def peak_memory_mb(device: str) -> dict[str, float]:

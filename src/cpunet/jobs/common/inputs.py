@@ -253,7 +253,7 @@ def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
     if high > MAX_KEV:
         return f"{there}: if these are ADC counts, give --kev-per-adc"
-    if high < MIN_KEV:
+    if 0 < high < MIN_KEV:
         return f"{there}: if these are MeV, give --kev-per-adc 1000"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
     n = int((energies >= from_kev).sum())

@@ -23,7 +23,6 @@ from cpunet.analysis.response_figure import (
 )
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.closed_forms import (
     learned_chain,
@@ -35,7 +34,7 @@ from cpunet.jobs.inspection.closed_forms import (
 from cpunet.jobs.inspection.response_errors import fitted_errors, propagated
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.outputs import FolderKind, refuse_existing
+from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.regular_files import read_text
@@ -137,9 +136,7 @@ def describe_responses(
     if out is not None:
         window = first.preparation.samples_after * first.dt_ns
         figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
-        with folder_written_aside(
-            out, RESPONSE, *runs, force=force, note=monitor.note
-        ) as folder:
+        with folder_written_aside(out, RESPONSE, *runs, force=force) as folder:
             text = json.dumps(told, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
             figure.savefig(folder / "response.png", dpi=_DPI)

@@ -14,13 +14,12 @@ import cpunet
 from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.channels import ALL, channels_of
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing, resolved
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
@@ -130,7 +129,7 @@ def describe(
     if (
         out is not None
         and without_remains is not None
-        and resolved(out) == resolved(without_remains)
+        and out.resolve() == without_remains.resolve()
     ):
         raise CpunetError(
             f"{out}: is given for the figure and for the traces; choose another --out"

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.simulate import ImpurityFrom, solved
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import LI_CONTACT, Detector, FloatArray
 from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE

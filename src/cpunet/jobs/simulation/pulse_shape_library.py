@@ -10,10 +10,9 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import put_column
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray

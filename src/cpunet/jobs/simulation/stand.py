@@ -16,7 +16,6 @@ from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.growing_archive import GrowingArchive
 from cpunet.jobs.simulation.hit_sources import Window
@@ -28,7 +27,7 @@ from cpunet.jobs.simulation.stand_plan import (
     Side,
     StandPlan,
 )
-from cpunet.outputs import FolderKind
+from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
@@ -146,7 +145,7 @@ def write_stand(
     """Make a planned stand, see `make_stand`."""
     many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
     summary = StandSummary()
-    with folder_written_aside(out, STAND, force=force, note=monitor.note) as folder:
+    with folder_written_aside(out, STAND, force=force) as folder:
         library = plan.sim.library(monitor) if many else None
         _write_sim(folder, plan, library, summary, monitor)
         if many and plan.shift is not None:

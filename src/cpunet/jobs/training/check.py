@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.inputs import (
     InputFile,
     InputSet,
@@ -27,7 +26,7 @@ from cpunet.jobs.common.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection

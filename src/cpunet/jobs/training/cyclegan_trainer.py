@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -47,21 +47,15 @@ class CycleGanTrainer:
             )
         group.share_of(self.config.batch_size)
 
-    def less_memory(self, processes: int) -> str:
-        """Return what to change if the memory does not suffice."""
-        half = self.config.batch_size // 2 // processes * processes
-        return f"--set training.batch_size={max(2, processes, half)}"
-
     def workplace(
         self,
         out: Path,
         read: Sequence[Path | str | None],
         options: TrainOptions,
-        note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of ``OUT.unfinished``, which becomes `out` when the training is complete."""
         resume, force = options.resume, options.force
-        return unfinished_folder(out, *read, resume=resume, force=force, note=note)
+        return unfinished_folder(out, *read, resume=resume, force=force)
 
     def train(self, job: TrainingJob) -> Trained | None:
         """Train or resume; return None in processes other than the leader."""

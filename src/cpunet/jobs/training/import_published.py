@@ -14,9 +14,8 @@ import numpy.typing as npt
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import folder_written_aside, refuse_existing
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.pickles import PickledPulse, TruncatedError, as_pulse, entries
@@ -106,7 +105,7 @@ def import_weights(
         "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions(),
     }
-    with folder_written_aside(out, RUN, force=force, note=monitor.note) as folder:
+    with folder_written_aside(out, RUN, force=force) as folder:
         write_run(folder, nn.ModuleDict(networks), recipe, info)
     return info
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.jobs.training.chain_and_inverse import known_response, match
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.outputs import folder_written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.process_group import ProcessGroup
@@ -33,17 +33,11 @@ class ResponseTrainer:
             "start it without torchrun"
         )
 
-    def less_memory(self, processes: int) -> str:
-        """Return what to change if the memory does not suffice."""
-        del processes
-        return "fewer energies (--peak) or files"
-
     def workplace(
         self,
         out: Path,
         read: Sequence[Path | str | None],
         options: TrainOptions,
-        note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of a folder that appears when the fit is complete."""
         if options.resume:
@@ -51,7 +45,7 @@ class ResponseTrainer:
                 f"recipe {self.recipe.name}: takes a minute and keeps no checkpoints; give the "
                 "recipe that the training was begun with, or leave out --resume"
             )
-        return folder_written_aside(out, RUN, *read, force=options.force, note=note)
+        return folder_written_aside(out, RUN, *read, force=options.force)
 
     def train(
         self,

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import enough_memory
 from cpunet.jobs.common.inputs import (
     InputFile,
     InputSet,
@@ -70,7 +69,7 @@ def train_run(
     ------
     CpunetError
         If the input cannot be used, the folder exists, there is an unfinished training of
-        another kind, memory does not suffice, the training diverges or another process fails.
+        another kind, the training diverges or another process fails.
     StoppedError
         If `stop` returned true.
     """
@@ -82,15 +81,14 @@ def train_run(
         read = (*sim.files, *data.files, options.init)
         place: AbstractContextManager[Path] = nullcontext(out)
         if group.leads:  # the others do not write
-            place = trainer.workplace(out, read, options, told.note)
+            place = trainer.workplace(out, read, options)
         with place as folder:
             sim_set, data_set = _read(sim, data, recipe, selection, told)
             if options.init is not None:
                 _require_sampling(options.init, data_set)
             how = replace(options, device=device)
             job = TrainingJob(recipe, how, group, sim_set, data_set, data, folder, told, stop)
-            with enough_memory(trainer.less_memory(group.size)):
-                done = trainer.train(job)
+            done = trainer.train(job)
             if done is None:
                 return {}
             return write_run(folder, done.model, done.recipe, done.info)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
@@ -21,15 +21,11 @@ class Trainer(Protocol):
     def require_shareable(self, group: ProcessGroup) -> None:
         """Raise a `CpunetError` if several processes cannot train the recipe together."""
 
-    def less_memory(self, processes: int) -> str:
-        """Return what to change if the memory of `processes` does not suffice."""
-
     def workplace(
         self,
         out: Path,
         read: Sequence[Path | str | None],
         options: TrainOptions,
-        note: Callable[[str], None],
     ) -> AbstractContextManager[Path]:
         """Context of the folder to write to; see `cpunet.jobs.training.train.train_run`."""
 

@@ -12,11 +12,10 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info

@@ -20,7 +20,6 @@ from cpunet.electronics.equivalent import Equivalent, ae_ratios, current_delay_n
 from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
-from cpunet.files import folder_written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
@@ -30,7 +29,7 @@ from cpunet.jobs.translation.simflow_checks import (
     chosen_libraries,
     known_detector,
 )
-from cpunet.outputs import FolderKind, refuse_existing
+from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.regular_files import read_text
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.yaml_files import MAX_BYTES, plain_json
@@ -127,9 +126,7 @@ def export_legend_pars(
         "ae_against_energy": methods,
     }
     pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}} | ae_pars
-    with folder_written_aside(
-        out, LEGEND_PARS, *given, force=force, note=monitor.note
-    ) as folder:
+    with folder_written_aside(out, LEGEND_PARS, *given, force=force) as folder:
         for kind, content in pars.items():
             _write(folder / f"{kind}.yaml", {name: content})
         _write(folder / WHOLE, {name: whole})

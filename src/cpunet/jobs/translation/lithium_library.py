@@ -10,9 +10,8 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.jobs.simulation.library_arrays import put_column
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.simulation.lithium import LithiumLayer, arrived
 

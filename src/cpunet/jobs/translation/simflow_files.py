@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.jobs.translation.library_file import number
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.translation.low_rank import Loss
 from cpunet.translation.peak_currents import LENGTH, PEAK

@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
@@ -30,7 +29,7 @@ from cpunet.jobs.translation.simflow_checks import (
     require_complete,
 )
 from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.translation.library_mode import TemplateTranslator

@@ -15,7 +15,6 @@ from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.memory import give_back_large_arrays
 from cpunet.jobs.common.monitor import Advance, Monitor
-from cpunet.jobs.common.output_lock import only_writer
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.jobs.translation.translation_blocks import (
     NOISE_ROWS,
@@ -105,32 +104,31 @@ class FileTranslation:
             See `translate_file`.
         """
         refuse_inputs(out, self.run, *source.files)
-        with only_writer(out):
-            before = source_print(source)
-            options = asdict(self.options) | {"noise_key": noise_key}
-            made = {"source": before, "run": self._print, "options": options}
-            if resume and not force and out.exists():
-                return finished(out, made) | {"skipped": True}
-            refuse_existing(out, force=force)
-            pulses = self.opened(source)
-            others = _other_columns(pulses, monitor.note)
-            writer = PulseWriter(
-                out,
-                table=self.options.table or f"geds/{self.kind.part}",
-                waveform_units=self.form.units,
-                t0_ns=self.form.t0_ns,
-                attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)},
-                samples=self.form.samples,
-                force=force,
-            )
-            with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
-                counts = self._translate(pulses, noise_key, writer, others, advance)
-                self._require_some(source, counts)
-                require_unchanged(source, before)
-                told = counts.told(adc=self.options.adc is not None)
-                record = made | {"counts": told, "cpunet": cpunet.__version__}
-                writer.stamp(TRANSLATION, as_json(record))
-            return told
+        before = source_print(source)
+        options = asdict(self.options) | {"noise_key": noise_key}
+        made = {"source": before, "run": self._print, "options": options}
+        if resume and not force and out.exists():
+            return finished(out, made) | {"skipped": True}
+        refuse_existing(out, force=force)
+        pulses = self.opened(source)
+        others = _other_columns(pulses, monitor.note)
+        writer = PulseWriter(
+            out,
+            table=self.options.table or f"geds/{self.kind.part}",
+            waveform_units=self.form.units,
+            t0_ns=self.form.t0_ns,
+            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)},
+            samples=self.form.samples,
+            force=force,
+        )
+        with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
+            counts = self._translate(pulses, noise_key, writer, others, advance)
+            self._require_some(source, counts)
+            require_unchanged(source, before)
+            told = counts.told(adc=self.options.adc is not None)
+            record = made | {"counts": told, "cpunet": cpunet.__version__}
+            writer.stamp(TRANSLATION, as_json(record))
+        return told
 
     def opened(self, source: InputFile) -> PulseSource:
         """Open a file of pulses that this run can translate.

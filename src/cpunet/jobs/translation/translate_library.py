@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.files import written_aside
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.monitor import Advance, Monitor
@@ -24,7 +23,7 @@ from cpunet.jobs.translation.library_file import (
     require_charge,
     sampling_period_ns,
 )
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.source import BLOCK_BYTES

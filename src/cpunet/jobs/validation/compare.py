@@ -12,8 +12,7 @@ from cpunet.analysis.report_folder import METRICS
 from cpunet.analysis.side_by_side import SideBySide, side_by_side
 from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError
-from cpunet.files import written_aside
-from cpunet.outputs import refuse_existing
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.regular_files import read_text
 from cpunet.yaml_files import MAX_BYTES, plain_json
 

@@ -37,7 +37,6 @@ from cpunet.jobs.validation.peak_sets import PeakSets, current_amplitudes, peak_
 from cpunet.jobs.validation.pulse_tests import survivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
-from cpunet.machine_memory import require_memory
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
@@ -46,9 +45,6 @@ from cpunet.translation.translator import IREN, REN
 
 PAIRS = 200  # pairs of pulses in the test of linearity
 MOST_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
-# Windows in memory per pair of pulses: both sides, translations by all methods, and temporary
-# arrays.
-_WINDOWS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,17 +196,9 @@ def _load_both(
     how: ValidateOptions,
     monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
-    most, length = how.most, ren.recipe.preparation.length
+    most = how.most
     more_kev = () if how.ae_range_kev is None else (how.ae_range_kev,)
     selection = validation_selection(names, ren.recipe, more_kev)
-    # a file with an unknown number of pulses can contain the maximum
-    numbers = [file.open().n_pulses for file in (sim, data)]
-    pulses = max(most if n is None else min(most, n) for n in numbers)
-    require_memory(
-        pulses * length * _WINDOWS * np.dtype(np.float32).itemsize,
-        f"{data.path}: comparing {pulses} pulses",
-        "give a smaller --most",
-    )
     sim_set = load_simulated(sim, ren.recipe, selection, monitor, most=most)
     data_set = load_measured(data, ren.recipe, selection, monitor, most=most)
     require_same_sampling(sim_set, data_set)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpunet.analysis.report_folder import REPORT, VALUES
-from cpunet.files import folder_written_aside
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.outputs import folder_written_aside
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.training.run_folder import read_info
 
@@ -81,7 +81,7 @@ def validated(
         found = evaluate(run, sim, data, how, monitor)
         return found, drawings(found)
     read = (run, *sim.files, *data.files, how.truth)
-    with folder_written_aside(out, REPORT, *read, force=force, note=monitor.note) as folder:
+    with folder_written_aside(out, REPORT, *read, force=force) as folder:
         found = evaluate(run, sim, data, how, monitor)
         to_draw = drawings(found)
         found.forget_noisy()

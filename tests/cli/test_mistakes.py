@@ -1,0 +1,345 @@
+"""Mistakes that people make: each ends in one line with a remedy, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import re
+import shlex
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from torch import nn
+
+from cpunet.cli.main import main
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.outputs import folder_written_aside
+from cpunet.recipes import load_recipe
+from cpunet.training.run_folder import RUN, write_run
+
+TRAIN = "train --recipe fast --sim sim.lh5 --data data.lh5 --out out"
+SIMULATE = "simulate --detector ppc.yaml --hits hits.npz --out out"
+Patch = Callable[[pytest.MonkeyPatch], None]
+
+
+class Mistake(NamedTuple):
+    """Words of a command, the line that it ends in, and what is wrong with the machine."""
+
+    words: str
+    line: str
+    patch: Patch | None = None
+    status: int = 2
+
+
+def failing(what: str, error: BaseException) -> Patch:
+    """Let a function of the package raise an error."""
+
+    def fail(*_given: object, **_options: object) -> None:
+        raise error
+
+    return lambda patch: patch.setattr(what, fail)
+
+
+def signalled(number: int) -> Patch:
+    """Let a signal arrive as the output is moved into its place."""
+    arrive = lambda *_given, **_options: signal.raise_signal(number)  # noqa: E731
+    return lambda patch: patch.setattr("pathlib.Path.replace", arrive)
+
+
+def without(package: str) -> Patch:
+    """Let a package be missing."""
+    return lambda patch: patch.setitem(sys.modules, package, None)
+
+
+DESCRIBE = "cpunet.jobs.inspection.info.describe"
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+MISTAKES = {
+    # files
+    "wrong path": Mistake("info none.lh5", r"none.lh5: no such file; check the name"),
+    "brackets and colons": Mistake(
+        "info 'none[bold]:key:[/bold].lh5'", r"none\[bold\]:key:\[/bold\].lh5: no such file; .*"
+    ),
+    "folder for a file": Mistake(
+        "translate run folder --out out", r"folder: is a folder; give a file of pulses"
+    ),
+    "file for a folder": Mistake(
+        "translate sim.lh5 sim.lh5 --out out", r"sim.lh5: no finished run .*; make one with .*"
+    ),
+    "wrong table": Mistake(f"{TRAIN} --data-table geds/no", r"data.lh5: .*geds/no.*; .*"),
+    "which table": Mistake(
+        f"{TRAIN} --data two.lh5", r"two.lh5: 2 tables of waveforms \(.*\); choose one with .*"
+    ),
+    "wrong column": Mistake(f"{TRAIN} --data-energy nothing", r"data.lh5.*nothing.*; .*"),
+    "truncated": Mistake(f"{TRAIN} --data half.lh5", r"half.lh5: .*; .*"),
+    "empty": Mistake(f"{TRAIN} --data empty.lh5", r"empty.lh5: is empty; .*"),
+    "text": Mistake(f"{TRAIN} --data text.lh5", r"text.lh5: not a HDF5 file, .*; .*"),
+    "code in a pickle": Mistake("info evil.pickle", r"evil.pickle: .*; .*"),
+    "objects in an archive": Mistake("info objects.npz", r"objects.npz: .*; .*"),
+    # energies and sides
+    "energies in ADC": Mistake(
+        f"{TRAIN} --data adc.lh5", r"adc.lh5: .*energy.*; .*--kev-per-adc.*"
+    ),
+    "energies in MeV": Mistake(
+        f"{TRAIN} --data mev.lh5",
+        r"mev.lh5: none of .*; .*if these are MeV, give --kev-per-adc 1000",
+    ),
+    "energies are NaN": Mistake(f"{TRAIN} --data nan.lh5", r"nan.lh5: .*; .*"),
+    "negative energies": Mistake(
+        f"{TRAIN} --data negative.lh5", r"negative.lh5: .*; check the calibration .*-2102"
+    ),
+    "no energies": Mistake(f"{TRAIN} --data none-at-all.lh5", r"none-at-all.lh5: .*; .*"),
+    "sides swapped": Mistake(
+        "train --sim data.lh5 --data sim.lh5 --out out",
+        r"data.lh5: given as simulated pulses, but these look measured.*swapped.*--insist.*",
+    ),
+    "translated already": Mistake(
+        f"{TRAIN} --sim translated.lh5", r"translated.lh5: .*translated.*; .*"
+    ),
+    "other sampling": Mistake(
+        f"{TRAIN} --sim sim10.lh5",
+        r"sim10.lh5: sampled every 10 ns, but data.lh5 every 16 ns; resample one of them",
+    ),
+    # selection
+    "unknown peak": Mistake(f"{TRAIN} --peak TEP", r".*'TEP' is no known peak .*FEP.*"),
+    "constant pulses": Mistake(
+        f"{TRAIN} --data constant.lh5", r"constant.lh5: .*constant.*; .*"
+    ),
+    "saturated pulses": Mistake(
+        f"{TRAIN} --data saturated.lh5", r"saturated.lh5: .*saturated.*; .*"
+    ),
+    "all pulses cut": Mistake(
+        f"{TRAIN} --set cuts.decay_sigmas=1e-9", r".*the quality cuts leave no pulse; widen .*"
+    ),
+    "too few pulses": Mistake(
+        f"{TRAIN} --data few.lh5",
+        r"24 simulated and 2 measured pulses; 200 of each .* are needed: select more.*",
+    ),
+    # outputs
+    "output exists": Mistake(
+        f"{SIMULATE} --out sim.lh5",
+        r"sim.lh5: exists already; choose another name or give --force",
+    ),
+    "output is the input": Mistake(
+        "translate run sim.lh5 --out sim.lh5 --force",
+        r"sim.lh5: is the input; choose another --out",
+    ),
+    "output in a file": Mistake(
+        "translate run sim.lh5 --out text.lh5/out.lh5",
+        r"text.lh5/out.lh5: cannot be written \(.*\); .*choose another place",
+    ),
+    "another kind of folder": Mistake(
+        f"{TRAIN} --out report --force",
+        r"report: is no folder that cpunet train made, .*; choose another name",
+    ),
+    "a thesis in the folder": Mistake(
+        f"{TRAIN} --out mine --force",
+        r"mine: holds thesis.tex, which cpunet did not write; move it elsewhere, or .*",
+    ),
+    "disk full": Mistake(
+        f"{SIMULATE}",
+        r"out: cannot be written \(No space left on device\); make room there, or .*",
+        failing("pathlib.Path.replace", FULL),
+    ),
+    "disk full for the terminal": Mistake(
+        "info sim.lh5",
+        r"sim.lh5: No space left on device; make room, or choose another place",
+        failing(DESCRIBE, FULL),
+    ),
+    "killed": Mistake(f"{SIMULATE}", r"interrupted; .*", signalled(signal.SIGTERM), 143),
+    "Ctrl-C": Mistake(f"{SIMULATE}", r"interrupted; .*", signalled(signal.SIGINT), 130),
+    # runs and reports
+    "half a run": Mistake("translate halfrun sim.lh5 --out out", r"halfrun.*; .*"),
+    "a report for a run": Mistake(
+        "translate report sim.lh5 --out out", r"report: no finished run .*; make one with .*"
+    ),
+    "damaged scores": Mistake("compare report report2", r"report2/metrics.json: .*; .*"),
+    # settings
+    "recipe is no YAML": Mistake(f"{TRAIN} --recipe bad.yaml", r"recipe bad.yaml: not YAML .*"),
+    "unknown recipe": Mistake(
+        f"{TRAIN} --recipe papr", r"recipe 'papr': neither a file nor one of .*paper.*"
+    ),
+    "unknown key": Mistake(
+        f"{TRAIN} --set training.none=1", r".*the recipe has no training.none.*"
+    ),
+    "impossible value": Mistake(
+        f"{TRAIN} --set training.steps=-1", r"recipe fast: training.steps: .*"
+    ),
+    "options that exclude each other": Mistake(
+        "export run --out out.onnx --detector V1", r"--detector .*--to legend-pars; add it"
+    ),
+    "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
+    "option left out": Mistake("train --sim sim.lh5", r"Missing option '--data'.*--help"),
+    "search without its extra": Mistake(
+        "tune --sim sim.lh5 --data data.lh5 --out out",
+        r"tuning needs optuna, which is not installed; pip install .*",
+        without("optuna"),
+    ),
+    "export without its extra": Mistake(
+        "export run --out out.onnx",
+        r"the package onnx is needed for ONNX; pip install .*",
+        without("onnx"),
+    ),
+    # simulation
+    "unknown detector": Mistake(
+        "fields V999", r"detector V999: neither a file nor one of .*ppc.*"
+    ),
+    "metres for millimetres": Mistake("fields metres.yaml", r"detector .*metres.*: .*"),
+    "hits outside": Mistake(f"{SIMULATE} --hits far.npz", r"far.npz: .*; .*--origin.*"),
+    "hits without energies": Mistake(f"{SIMULATE} --hits noenergy.npz", r"noenergy.npz: .*"),
+    # machine
+    "no GPU": Mistake(
+        f"{TRAIN} --device cuda",
+        r"no GPU was found; use --device cpu or install .*",
+        lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
+    ),
+    "no memory": Mistake(
+        "info sim.lh5",
+        r"sim.lh5: out of memory \(Unable to allocate 6 GiB\); take fewer pulses, or .*",
+        failing(DESCRIBE, MemoryError("Unable to allocate 6 GiB")),
+    ),
+    "no memory on the GPU": Mistake(
+        "info sim.lh5",
+        r"sim.lh5: out of memory \(CUDA out of memory.*\); take fewer pulses, or .*",
+        failing(DESCRIBE, RuntimeError("CUDA out of memory. Tried\nto allocate")),
+    ),
+    "nobody's thought of": Mistake(
+        "info sim.lh5",
+        r"sim.lh5: unexpected KeyError \('dt'\); please report it to .* --debug prints",
+        failing(DESCRIBE, KeyError("dt")),
+        1,
+    ),
+}
+
+
+def write_runs(folder: Path) -> None:
+    """A run, half a run, and one with a file of the user."""
+    recipe = load_recipe("fast")
+    info = {"recipe": "fast", "dt_ns": 16.0, "peak": "FEP", "seconds": 0, "seed": 0}
+    model = nn.ModuleDict({"ren": ResponseGenerator(recipe.matching.generator, 16.0)})
+    for name in ("run", "halfrun", "mine"):
+        with folder_written_aside(folder / name, RUN) as aside:
+            write_run(aside, model, recipe, info | {"device": "cpu"})
+    (folder / "halfrun" / "weights.safetensors").unlink()
+    (folder / "mine" / "thesis.tex").touch()
+
+
+def fill(folder: Path, stand) -> None:
+    """Make the files that the commands are given."""
+    write_runs(folder)
+    shutil.copy(stand.sim, folder / "sim.lh5")
+    shutil.copy(stand.data, folder / "data.lh5")
+    waves, kev = stand.data_waveforms, stand.data_kev
+    for name, energies in {
+        "mev": kev / 1000,
+        "nan": kev * np.nan,
+        "negative": -kev,
+        "few": np.where(np.arange(len(kev)) < 9, kev, 1000),
+        "adc": kev,
+        "none-at-all": kev,
+        "two": kev,
+    }.items():
+        stand.write(folder / f"{name}.lh5", "geds/raw", waves, energies)
+    for name, pulses in {
+        "constant": 0 * waves + 8000,
+        "saturated": waves.clip(0, 20_000),
+    }.items():
+        stand.write(folder / f"{name}.lh5", "geds/raw", pulses, kev)
+    with h5py.File(folder / "adc.lh5", "r+") as file:
+        file["geds/raw/energy"].attrs["units"] = "ADC"
+    with h5py.File(folder / "none-at-all.lh5", "r+") as file:
+        del file["geds/raw/energy"]
+        file["geds/raw"].attrs["datatype"] = "table{waveform,event_number}"
+    with h5py.File(folder / "two.lh5", "r+") as file:
+        file.copy("geds", "more")
+    sim = (stand.sim_waveforms, stand.sim_kev)
+    stand.write(folder / "sim10.lh5", "geds/sim", *sim, units="", dt_ns=10)
+    (folder / "half.lh5").write_bytes(stand.data.read_bytes()[:20_000])
+    (folder / "empty.lh5").touch()
+    (folder / "text.lh5").write_text("1 2 3\n" * 50)
+    (folder / "folder").mkdir()
+    (folder / "evil.pickle").write_bytes(pickle.dumps(EvilPulse()))
+    np.savez(folder / "objects.npz", waveform=np.array([{}] * 9), dt_ns=16)
+    for name, content in {"report": '{"peaks": {}}', "report2": '{"peaks": '}.items():
+        (folder / name).mkdir()
+        (folder / name / "metrics.json").write_text(content)
+    (folder / "bad.yaml").write_text("training: [1,\n")
+    crystal = {
+        "crystal_length": 20.0, "crystal_radius": 20.0, "point_contact_length": 1.6,
+        "point_contact_radius": 2.0, "li_thickness": 1.0, "impurity_z0_1e10_per_cm3": -0.8,
+        "bias_V": 2500, "temperature_K": 85, "grid_mm": 0.5,
+    }  # fmt: skip
+    (folder / "ppc.yaml").write_text(yaml.safe_dump(crystal))
+    lengths = {key: crystal[key] / 1000 for key in crystal if key.startswith("crystal_")}
+    (folder / "metres.yaml").write_text(yaml.safe_dump(crystal | lengths))
+    x = np.array([5.0, 6.0, 9.0])
+    hits = {"x_mm": x, "y_mm": 0 * x, "z_mm": x, "offsets": np.array([0, 1, 2, 3])}
+    np.savez(folder / "hits.npz", **hits, edep_keV=0 * x + 900)
+    np.savez(folder / "far.npz", **(hits | {"z_mm": x + 500}), edep_keV=0 * x + 900)
+    np.savez(folder / "noenergy.npz", **hits)
+
+
+class EvilPulse:
+    """Whose pickle would make a folder."""
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.mkdir, ("executed",)
+
+
+@pytest.fixture(scope="module")
+def filled(stand, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("mistakes")
+    fill(folder, stand)
+    words, sys.argv = sys.argv, ["cpunet", "translate", f"{folder}/run", f"{folder}/sim.lh5"]
+    sys.argv += ["--no-noise", "--out", f"{folder}/translated.lh5"]
+    try:
+        with pytest.raises(SystemExit, match="0"):
+            main()
+    finally:
+        sys.argv = words
+    return folder
+
+
+@pytest.fixture
+def home(filled: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(filled)
+    monkeypatch.setenv("CPUNET_CACHE", str(filled.parent / "cache"))
+    return filled
+
+
+def listing(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_ends_in_one_line_and_leaves_nothing(command, home, monkeypatch, name):
+    mistake = MISTAKES[name]
+    before = listing(home)
+    with monkeypatch.context() as patched:
+        if mistake.patch is not None:
+            mistake.patch(patched)
+        outcome = command(*shlex.split(mistake.words))
+    lines = outcome.err.splitlines()
+    assert outcome.code == mistake.status, outcome.err
+    assert [line for line in lines if line.startswith("error: ")] == lines[-1:]
+    assert re.fullmatch(f"error: {mistake.line}", lines[-1]), lines[-1]
+    assert "Traceback" not in outcome.err
+    assert outcome.out == ""
+    assert listing(home) == before
+
+
+@pytest.mark.parametrize("words", ["--debug info sim.lh5", "info sim.lh5 --debug"])
+def test_debug_shows_where_wherever_it_stands(command, home, monkeypatch, words):
+    failing(DESCRIBE, KeyError("dt"))(monkeypatch)
+    outcome = command(*words.split())
+    assert outcome.code == 1
+    assert "Traceback" in outcome.err
+    assert outcome.err.splitlines()[-1].startswith("error: sim.lh5: unexpected KeyError")
