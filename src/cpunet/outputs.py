@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cpunet.errors import CpunetError
-from cpunet.yaml_files import plain_json
 
 MARKER = ".cpunet.json"
 PROGRAM = "cpunet"
@@ -230,7 +229,7 @@ def _same(one: Path, other: Path) -> bool:
 
 def _marker(folder: Path) -> dict[str, object]:
     try:
-        content = plain_json((folder / MARKER).read_text(encoding="utf-8"))
+        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     ours = isinstance(content, dict) and content.get("program") == PROGRAM

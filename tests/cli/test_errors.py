@@ -256,10 +256,10 @@ def test_weights_of_another_architecture(translate_refused, run):
 
 
 def test_wrong_settings(train_refused, tmp_path):
-    assert "error: recipe 'none': neither a file" in train_refused("--recipe", "none")
-    assert "the recipe has no training.none" in train_refused("--set", "training.none=1")
+    assert "error: none: neither a file" in train_refused("--recipe", "none")
+    assert "training.none: no such setting" in train_refused("--set", "training.none=1")
     line = train_refused("--set", "training.batch_size=x")
-    assert line.startswith("error: recipe small: training.")
+    assert line.startswith("error: small: training.")
     assert "batch_size: " in line
     assert "expected KEY=VALUE" in train_refused("--set", "training.batch_size")
     line = train_refused("--peak", "TEP")
