@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.pulses.reading.opening import open_pulses

@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.jobs.simulation.hit_sources import Window
 from cpunet.jobs.simulation.stand_plan import Side, StandPlan
 from cpunet.simulation.clustering import cluster_hits

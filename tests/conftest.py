@@ -5,8 +5,6 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
-import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,20 +32,8 @@ def beside(name: str) -> ModuleType:
     return module
 
 
-compiled = beside("compiled")
-
-
-def others_compiled() -> Path:
-    """Folder of what other packages compile."""
-    try:
-        found: Path = compiled.of_others()
-    except compiled.NotCompiledError as error:
-        raise pytest.UsageError(str(error)) from None
-    return found
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Have all compile once, and processes that are started use one thread.
+def pytest_configure() -> None:
+    """Have processes that are started use one thread.
 
     The last bits of a training depend on the number of threads, and a server that processes
     are forked from keeps that of the first test that needs it.
@@ -56,15 +42,6 @@ def pytest_configure(config: pytest.Config) -> None:
     # freed arrays stay with a process: to be given new pages each time takes a tenth longer
     os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(32 << 20))
     os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 30))
-    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
-        own = Path(os.environ["NUMBA_CACHE_DIR"]) / worker
-        os.environ["NUMBA_CACHE_DIR"] = str(own)  # numba looks when it is imported
-        compiled.share(own, others_compiled())
-    elif getattr(config.option, "dist", "no") != "no":
-        folder = tempfile.mkdtemp(prefix="cpunet-tests-")
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-        os.environ["NUMBA_CACHE_DIR"] = folder
-        others_compiled()
 
 
 def pytest_collection_finish() -> None:

@@ -122,8 +122,8 @@ def test_a_run_with_a_damaged_fit_is_described_as_far_as_it_goes(tmp_path):
     ("text", "message"),
     [
         (None, "a folder without run.json; give the folder of a run, or a file"),
-        ("{", r"run.json: cannot be read \([^\n]*\); the run is damaged"),
-        ("[1]", r"run.json: holds no run"),
+        ("{", r"run.json: damaged \([^\n]*\); train it again"),
+        ("[1]", r"run.json: .*no mapping"),
     ],
 )
 def test_folders_that_are_no_runs(tmp_path, text, message):

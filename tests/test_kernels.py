@@ -1,111 +1,114 @@
-"""Code of compiled loops: kept, made again when what it uses changes, never mixed up."""
+"""Code of compiled loops: kept, made again when a module of loops changes, never mixed up."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from cpunet.kernels import KernelFiles, code_folder, kernel, sources
-from cpunet.trusted_folders import trusted
+from cpunet import kernels
 
 CALLED = """
-from cpunet.kernels import kernel
-
+from cpunet.numbers import N
 @kernel
 def called(x):
-    return x + {number}
+    return x + N
 """
 CALLING = """
-from cpunet.kernels import kernel
-from loops.called import called
-
+from cpunet.called import called
 @kernel
 def calling(x):
     return 10 * called(x)
 """
-PROGRAM = """
-from loops.calling import calling
-print(calling(1), sum(calling.stats.cache_hits.values()))
+LOOP = """
+from numba import prange
+@kernel(parallel=True)
+def loop(x):
+    for i in prange(2):
+        x += i
+    return x
 """
+SHOW = "from cpunet.calling import calling as f; print(f({}), sum(f.stats.cache_hits.values()))"
 
 
-@pytest.mark.slow
-def test_other_code_of_a_called_function_is_taken(tmp_path: Path) -> None:
-    package = tmp_path / "loops"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "calling.py").write_text(CALLING)
-    told = []
-    for number in (1, 1, 2):
-        (package / "called.py").write_text(CALLED.format(number=number))
-        done = subprocess.run(
-            [
-                sys.executable,
-                "-c",
-                f"import sys; sys.path.insert(0, {str(tmp_path)!r}){PROGRAM}",
-            ],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        told.append(done.stdout.strip())
-    assert told == ["20 0", "20 1", "30 0"]
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A package of that name with few loops."""
+    home = tmp_path / "site" / "cpunet"
+    home.mkdir(parents=True)
+    (home / "__init__.py").touch()
+    shutil.copy(kernels.__file__, home)
+    (home / "numbers.py").write_text("N = 1")
+    for name, text in {"called": CALLED, "calling": CALLING, "loop": LOOP}.items():
+        (home / f"{name}.py").write_text(f"from cpunet.kernels import kernel\n{text}\n")
+    return home
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "import loops.called",
-        "from loops.called import called",
-        "from loops import called as other",
-        "from loops import (  # several\n    numbers,\n    called,\n)",
-    ],
-)
-def test_code_depends_on_all_modules_that_are_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+def begin(home: Path, program: str, **variables: str) -> subprocess.Popen[str]:
+    given = {"PYTHONPATH": str(home.parent), "NUMBA_CACHE_DIR": str(home.parents[1] / "code")}
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        env=os.environ | given | variables,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def words(process: subprocess.Popen[str]) -> list[str]:
+    told, _ = process.communicate()
+    assert process.returncode == 0
+    return told.split()
+
+
+def test_a_changed_callee_or_constant_gives_a_new_folder_and_result(home: Path) -> None:
+    assert words(begin(home, SHOW.format(1))) == ["20", "0"]
+    assert words(begin(home, SHOW.format(1))) == ["20", "1"]
+    (home / "numbers.py").write_text("N = 2")
+    assert words(begin(home, SHOW.format(1))) == ["30", "0"]
+    (home / "called.py").write_text((home / "called.py").read_text().replace("+", "-"))
+    assert words(begin(home, SHOW.format(1))) == ["-10", "0"]
+    assert len(list((home.parents[1] / "code").iterdir())) == 3
+
+
+def test_a_read_only_installation_uses_the_cache_of_the_user(home: Path) -> None:
+    home.chmod(0o555)
+    user = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(home.parents[1] / "user")}
+    for hits in "01":
+        assert words(begin(home, SHOW.format(1), **user)) == ["20", hits]
+    assert not list(home.rglob("*.nb?"))
+    nowhere = {"NUMBA_CACHE_DIR": str(home / "numbers.py")}
+    assert words(begin(home, SHOW.format(1), **nowhere)) == ["20", "0"]
+
+
+def test_of_two_who_compile_at_once_none_has_the_code_of_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package = tmp_path / "loops"
-    package.mkdir()
-    for name, text in {"__init__": "", "numbers": "", "called": "called = 1"}.items():
-        (package / f"{name}.py").write_text(text)
-    (package / "calling.py").write_text(line)
-    monkeypatch.syspath_prepend(tmp_path)
-    sources.cache_clear()
-    try:
-        import_module("loops.calling")
-        assert package / "called.py" in sources("loops.calling")
-    finally:
-        sources.cache_clear()
-        for name in [name for name in sys.modules if name.partition(".")[0] == "loops"]:
-            del sys.modules[name]
+    """The second has looked before the first has written, and writes over its index."""
+
+    def twice(value):
+        return 2 * value
+
+    monkeypatch.setattr(kernels, "_folder", lambda: tmp_path)
+    one, other, later = (kernels.kernel(twice) for _ in range(3))
+    monkeypatch.setattr(other._cache._cache_file, "_load_index", dict)
+    assert (one(1), other(1.5)) == (2, 3.0)
+    assert (later(1), later(1.5)) == (2, 3.0)
+    assert sum(later.stats.cache_hits.values()) == 1
 
 
-@pytest.mark.thorough
-def test_of_two_who_need_the_same_code_one_compiles(tmp_path: Path) -> None:
-    package = tmp_path / "loops"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "called.py").write_text(CALLED.format(number=1))
-    program = (
-        f"import os, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from loops.called import called\n"
-        "child = os.fork()\n"
-        "called(1)\n"
-        "hits = sum(called.stats.cache_hits.values())\n"
-        "if child == 0:\n"
-        "    os._exit(hits)\n"
-        "print(hits + os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "1"  # one of the two had it from the other
-    assert not list(tmp_path.rglob("*.lock"))
+def test_few_folders_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels.config, "CACHE_DIR", str(tmp_path))
+    for number in range(12):
+        (tmp_path / f"cpunet-{number:02}").mkdir()
+        os.utime(tmp_path / f"cpunet-{number:02}", (number, number))
+    (tmp_path / "other").mkdir()
+    folder = kernels._folder.__wrapped__()
+    kept = [f"cpunet-{number:02}" for number in range(5, 12)]
+    assert {place.name for place in tmp_path.iterdir()} == {*kept, folder.name, "other"}
 
 
 def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() -> None:
@@ -114,126 +117,25 @@ def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() 
     def total(values):
         return values.sum()
 
-    assert kernel(fastmath={"reassoc"})(total).targetoptions["forceinline"]
-    assert not kernel(total).targetoptions.get("forceinline")
+    assert kernels.kernel(fastmath={"reassoc"})(total).targetoptions["forceinline"]
+    assert not kernels.kernel(total).targetoptions.get("forceinline")
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> list[KernelFiles]:
-    """The same files as two processes see them."""
-    return [KernelFiles(str(tmp_path), "loop", "stamp") for _ in range(2)]
-
-
-def test_two_who_save_at_once_do_not_mix_their_code(
-    files: list[KernelFiles], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The second has looked before the first has written, and writes over its index."""
-    one, other = files
-    with monkeypatch.context() as patched:
-        patched.setattr(other, "_load_index", dict)
-        one.save("of one", "code of one")
-        other.save("of the other", "code of the other")
-    for reader in files:
-        assert reader.load("of one") in (None, "code of one")
-        assert reader.load("of the other") == "code of the other"
-    one.save("of one", "code of one")
-    assert one.load("of one") == "code of one"
-    assert one.load("of the other") == "code of the other"
-
-
-def test_code_of_older_sources_is_not_taken_and_removed(tmp_path: Path) -> None:
-    before, after = (KernelFiles(str(tmp_path), "loop", stamp) for stamp in ("old", "new"))
-    before.save("key", "old code")
-    assert before.load("key") == "old code"
-    assert after.load("key") is None
-    after.save("other key", "new code")
-    assert after.load("key") is None
-    assert len([*tmp_path.iterdir()]) == 2  # one index, one piece of code
-
-
-@pytest.mark.parametrize("part", ["index", "code"])
-@pytest.mark.parametrize("damage", ["empty", "half", "flipped", "foreign"])
-def test_damaged_code_is_compiled_again(tmp_path: Path, part: str, damage: str) -> None:
-    files = KernelFiles(str(tmp_path), "loop", "stamp")
-    files.save("key", "code")
-    (path,) = tmp_path.glob("*.nbi" if part == "index" else "*.nbc")
-    whole = path.read_bytes()
-    flipped = whole[:-3] + bytes([whole[-3] ^ 4]) + whole[-2:]
-    contents = {"empty": b"", "half": whole[: len(whole) // 2], "foreign": b"\xff" * 99}
-    path.write_bytes((contents | {"flipped": flipped})[damage])
-    found = files.load("key")
-    assert found is None or (part, damage, found) == ("index", "flipped", "code")
-    files.save("key", "new code")
-    assert files.load("key") == "new code"
-
-
-def test_code_is_never_kept_where_others_can_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own = tmp_path / "own"
-    monkeypatch.setattr("platformdirs.user_cache_path", lambda _name: own)
-    private, shared = tmp_path / "private", tmp_path / "shared"
-    for folder, mode in ((private, 0o755), (shared, 0o777)):
-        folder.mkdir()
-        folder.chmod(mode)
-    assert code_folder(private) == private
-    for folder in (shared, shared / "below"):
-        folder.mkdir(exist_ok=True)
-        found = code_folder(folder)
-        assert found is not None
-        assert own in found.parents
-        assert trusted(found)
-    shared.chmod(0o775)  # a group is others, too
-    assert code_folder(shared) != shared
-    shared.chmod(0o1777)
-    (shared / "mine").mkdir(mode=0o700)
-    assert code_folder(shared / "mine") == shared / "mine"
-    own.chmod(0o777)
-    assert code_folder(shared) is None
-
-
-def test_threads_can_be_lowered_and_raised_again():
+def test_threads_can_be_lowered_and_raised_again(home: Path) -> None:
     program = (
         "import numba, torch\nfrom cpunet.kernels import use_threads\n"
         "for count in (1, 3, 9):\n"
         "    use_threads(count)\n"
         "    print(numba.get_num_threads(), torch.get_num_threads())"
     )
-    given = os.environ | {"NUMBA_NUM_THREADS": "4"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given
-    )
-    assert done.stdout.splitlines() == ["1 1", "3 3", "4 9"]
+    assert words(begin(home, program, NUMBA_NUM_THREADS="4")) == [*"113349"]
 
 
-PARALLEL = """
-from numba import prange
-from cpunet.kernels import kernel
-
-@kernel(parallel=True)
-def loop(x):
-    for i in prange(2):
-        x += i
-    return x
-"""
-
-
-@pytest.mark.parametrize(
-    "begin",
-    [
-        pytest.param("import torch; print(torch.get_num_threads())", id="torch-first"),
-        pytest.param("print(1)", id="numba-first"),
-    ],
-)
-def test_a_parallel_loop_leaves_torch_its_threads(tmp_path, begin):
-    (tmp_path / "loop.py").write_text(PARALLEL)
+@pytest.mark.parametrize("first", ["import torch; torch.get_num_threads()", ""])
+def test_a_parallel_loop_leaves_torch_its_threads(home: Path, first: str) -> None:
     program = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{begin}\n"
-        "import numba\nfrom loop import loop\nloop(3)\n"
-        "import torch\nprint(numba.get_num_threads(), torch.get_num_threads())"
+        f"{first}\nimport numba\nfrom cpunet.loop import loop\nloop(3)\nimport torch\n"
+        "print(numba.get_num_threads(), torch.get_num_threads())"
     )
-    given = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "4"}
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given
-    )
-    assert done.stdout.split() == ["1", "4", "1"]
+    begun = begin(home, program, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="4")
+    assert words(begun) == ["4", "1"]

@@ -1,13 +1,9 @@
-"""On-disk cache of compiled loops, invalidated only when code that they use changes.
+"""Compiled loops: their code is kept, and compiled again when a module of loops changes.
 
-numba's own cache checks only the file of a function, so the function keeps old code of
-functions that it calls in other files.  Moreover, if two processes compile at once, as the
-first jobs after an installation do, one can load the other's code.  Neither happens here: the
-second process waits for the code of the first.
-
-numba chooses the folder: beside the package, or ``NUMBA_CACHE_DIR``.  A folder to which others
-can write is never used, since it would let them execute any code; then the user's own cache
-is used.  Damaged files are compiled again.
+numba itself looks only at the file of a function, and so keeps old code of functions that it
+calls in other files.  Therefore code is kept in a folder named by a digest of all modules with
+loops and of all that they import: in ``NUMBA_CACHE_DIR``, else in the user's cache.  If neither
+can be written to, each process compiles anew.
 """
 
 from __future__ import annotations
@@ -15,32 +11,24 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
-import pickle
+import os
 import re
-import sys
-import time
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numba
 import platformdirs
 import threadpoolctl
 from numba.core import config
-from numba.core.caching import FunctionCache, IndexDataCacheFile
-
-from cpunet.errors import CpunetError
-from cpunet.file_locks import lock
-from cpunet.trusted_folders import trusted
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
-# Maximum wait for code that another process compiles, in case that process hangs.
-MAX_WAIT_S = 60.0
-_DIGEST_BYTES = hashlib.sha256().digest_size
-_IMPORT = re.compile(r"^(?:from ([\w.]+) )?import (\([^)]*|.*)", re.MULTILINE)
+_MAX_FOLDERS = 8  # one for each state of the sources, some 5 MB
 
 
 @overload
@@ -101,160 +89,78 @@ def at_most_threads(count: int) -> Iterator[None]:
         numba.set_num_threads(before)
 
 
-@functools.cache
-def sources(module: str) -> frozenset[Path]:
-    """Files of a module and of all modules of its package that it imports at the top."""
-    package = module.partition(".")[0]
-    seen, ahead = {module}, [module]
-    found = set()
+def _digest() -> str:
+    """Digest of all modules with loops and of those that they import, wherever they lie."""
+    home = Path(__file__).parent
+    texts = {}
+    for file in home.rglob("*.py"):
+        parts = (home.name, *file.relative_to(home).with_suffix("").parts)
+        texts[".".join(parts).removesuffix(".__init__")] = file.read_text(encoding="utf-8")
+    found = set[str]()
+    ahead = [name for name, text in texts.items() if f"{__name__} import" in text]
     while ahead:
-        file = Path(str(sys.modules[ahead.pop()].__file__))
-        found.add(file)
-        names = set[str]()
-        for origin, items in _IMPORT.findall(file.read_text(encoding="utf-8")):
-            words = re.findall(r"[\w.]+", items)
-            names |= {origin, *words, *(f"{origin}.{word}" for word in words)}
-        ours = [n for n in names - seen if n.partition(".")[0] == package and n in sys.modules]
-        seen.update(ours)
-        ahead += ours
-    return frozenset(found)
+        found.add(name := ahead.pop())
+        imported = re.findall(r"^from ([\w.]+) import", texts[name], re.MULTILINE)
+        ahead += [other for other in imported if other in texts.keys() - found]
+    return hashlib.sha256("\0".join(texts[name] for name in sorted(found)).encode()).hexdigest()
 
 
 @functools.cache
-def digest(module: str) -> str:
-    """Digest of the sources of a module, independent of their location."""
-    contents = sorted(file.read_bytes() for file in sources(module))
-    return hashlib.sha256(b"\0".join(contents)).hexdigest()
-
-
-def code_folder(chosen: Path) -> Path | None:
-    """The cache folder: the chosen one, or a replacement if that is not trusted.
-
-    Returns
-    -------
-    Path or None
-        None if no folder is writable by the user alone.
-    """
-    if trusted(chosen):
-        return chosen
-    own = platformdirs.user_cache_path("cpunet") / "kernels" / chosen.resolve().name
-    own = own.with_name(
-        f"{own.name}-{hashlib.sha256(bytes(chosen.resolve())).hexdigest()[:16]}"
-    )
+def _folder() -> Path | None:
+    """Folder of the code of these sources; of earlier ones the last few are kept."""
+    base = Path(config.CACHE_DIR or platformdirs.user_cache_path("cpunet") / "loops")
+    folder = base / f"cpunet-{_digest()[:16]}"
     try:
-        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.utime(folder)
     except OSError:
         return None
-    return own if trusted(own) else None
+    with suppress(OSError):  # another process removes them as well
+        used = sorted(base.glob("cpunet-*"), key=lambda place: place.stat().st_mtime)
+        for old in used[:-_MAX_FOLDERS]:
+            shutil.rmtree(old)
+    return folder
 
 
-class KernelFiles(IndexDataCacheFile):  # type: ignore[misc]
-    """Files of one function: an index, and one file of code per signature.
+class _Locator(_CacheLocator):  # type: ignore[misc]
+    """Tells numba where the code of a function is."""
 
-    Code is preceded by a digest.  Damaged code and damaged indices are ignored.
-    """
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file = file  # for numba's warnings
+        self._name = f"{function.__module__}-{function.__code__.co_firstlineno}"
 
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            found = super()._load_index()
-        except Exception:  # unpickling damaged bytes can raise anything
-            return {}
-        return found if isinstance(found, dict) else {}
+    def get_cache_path(self) -> str:
+        return str(_folder())
 
-    def _load_data(self, name: str) -> Any:
-        content = (Path(self._cache_path) / name).read_bytes()
-        known, code = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        if hashlib.sha256(code).digest() != known:
-            raise OSError("damaged")  # numba treats it as missing
-        return pickle.loads(code)
+    def get_source_stamp(self) -> str:
+        return ""  # the folder is that of the sources
 
-    def _save_data(self, name: str, data: Any) -> None:
-        code = self._dump(data)
-        with self._open_for_write(self._data_path(name)) as stream:
-            stream.write(hashlib.sha256(code).digest() + code)
+    def get_disambiguator(self) -> str:
+        return self._name
 
-    def save(self, key: Any, data: Any) -> None:
-        """Cache code; another process may do so at the same time.
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator:
+        return cls(py_func, py_file)
 
-        If that fails, as on a full disk, the code is compiled again next time.
-        """
-        with suppress(OSError):
-            self._keep(key, data)
 
-    def _keep(self, key: Any, data: Any) -> None:
-        # numba numbers files from 1, so two processes would give different code the same name
-        name = self._data_name_pattern.format(number=uuid.uuid4().int)
-        self._save_data(name, data)  # first, so that files in the index exist
-        kept = self._load_index() | {key: name}
-        self._save_index(kept)
-        # code of older sources, and files that another process has removed from the index
-        pattern = self._data_name_pattern.format(number=0).replace(".0.", ".*.")
-        for file in Path(self._cache_path).glob(pattern):
-            if file.name not in kept.values():
-                with suppress(OSError):
-                    file.unlink()  # a process that looks for it compiles again
+class _Result(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_Locator,)
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of one function, valid as long as its sources are unchanged."""
-
-    _cache_path: str
+    _impl_class = _Result
 
     def __init__(self, function: Callable[..., Any], *, parallel: bool) -> None:
         super().__init__(function)
         self._parallel = parallel
-        self._claim: IO[str] | None = None
-        folder = code_folder(Path(self._cache_path))
-        if folder is None:
+        # numba numbers files from 1: of two processes that compile a loop for different types
+        # at once, one would load the other's code
+        name = f"{self._impl.filename_base}.{uuid.uuid4().hex}.{{number:d}}.nbc"
+        self._cache_file._data_name_pattern = name  # noqa: SLF001
+        if _folder() is None:
             self.disable()
-            return
-        self._cache_path = str(folder)
-        self._cache_file = KernelFiles(
-            self._cache_path, self._impl.filename_base, digest(function.__module__)
-        )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the code for a signature; None if this process must compile it.
-
-        If another process is compiling the function, wait for its code.
-        """
         if self._parallel:
             start_threads()  # before numba does so itself when it loads or compiles the loop
-        found = super().load_overload(sig, target_context)
-        if found is None and self._enabled:
-            self._claim = _claimed(Path(self._cache_path) / f"{self._impl.filename_base}.lock")
-            found = super().load_overload(sig, target_context)
-            if found is not None:
-                self._release()
-        return found
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Cache code, and let waiting processes load it."""
-        try:
-            super().save_overload(sig, data)
-        finally:
-            self._release()
-
-    def _release(self) -> None:
-        if self._claim is not None:
-            with suppress(OSError):
-                Path(self._claim.name).unlink()
-            self._claim.close()
-            self._claim = None
-
-
-def _claimed(path: Path) -> IO[str] | None:
-    """Open and lock a file, waiting up to `MAX_WAIT_S`; None if it cannot be opened."""
-    try:
-        stream = path.open("a")
-    except OSError:
-        return None
-    end = time.monotonic() + MAX_WAIT_S
-    while time.monotonic() < end:
-        try:
-            lock(stream.fileno(), "compiling")
-        except CpunetError:
-            time.sleep(0.02)
-        else:
-            break
-    return stream
+        return super().load_overload(sig, target_context)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpunet.analysis.remains_figure import Slopes, remains_figure, sizes_figure
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.readout import read_out
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw

@@ -249,7 +249,7 @@ WRONG = {
         lambda home, _: cpunet.train(
             home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.step": 1}
         ),
-        "the recipe has no training.step",
+        r"training.step: no such setting; did you mean steps\?",
     ),
     "there already": (
         lambda home, _: cpunet.train(home / "sim.lh5", home / "raw.lh5", home / "run"),
@@ -299,7 +299,7 @@ WRONG = {
         lambda home, _: cpunet.train(
             home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.steps": {1}}
         ),
-        r"settings: \{1\} is of type set; give numbers",
+        r"training.steps: .*\(\{1\}\)",
     ),
     "no hits": (
         lambda home, _: cpunet.calibrate(home / "sim.lh5", home / "raw.lh5", home / "new"),

@@ -29,8 +29,7 @@ PLAIN = (
 
 def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
     """A small stand; made by the package's own job, in this process."""
-    from cpunet.electronics.chain import Electronics
-    from cpunet.electronics.presets import read_electronics
+    from cpunet.electronics.chain import Electronics, read_electronics
     from cpunet.jobs.simulation.hit_sources import energy_windows
     from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe

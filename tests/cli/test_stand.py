@@ -101,7 +101,10 @@ def test_it_is_replaced_with_force_only(command, made: Path):
         (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
         (("--preset", "orln"), "legend200, ornl, ringing"),
         (("--preset", "ornl", "--shift", "bias_V=1"), "give --kind shifted"),
-        (("--preset", "ornl", "--kind", "shifted", "--shift", "bias=1"), "no such key bias"),
+        (
+            ("--preset", "ornl", "--kind", "shifted", "--shift", "bias=1"),
+            "bias: no such setting",
+        ),
         (("--preset", "ornl", "--set", "hole_trapping_per_us=-1"), "hole_trapping_per_us"),
         (("--preset", "ornl", "--set", "dt_ns=16"), "leave dt_ns out"),
         (("--preset", "ornl", "--rate-khz", "1e300"), "1e+300 is not from 0 to 1000"),

@@ -8,9 +8,9 @@ import scipy.fft
 import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.finishing import finish, finish_both
 from cpunet.electronics.noise_traces import coloured_noise, noise_power
-from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare

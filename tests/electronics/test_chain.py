@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, electronics_names, read_electronics
 from cpunet.electronics.exact_response import linear_response, respond
 from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.electronics.presets import electronics_names, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.drawn_remains import (
     SIZES_KEV,
     DrawnRemains,
@@ -15,7 +16,6 @@ from cpunet.electronics.drawn_remains import (
     TraceNoise,
     passing,
 )
-from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.readout import read_out
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw

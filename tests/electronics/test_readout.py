@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum, Wander
+from cpunet.electronics.chain import Electronics, Hum, NoiseSpectrum, Wander, read_electronics
 from cpunet.electronics.noise_traces import (
     coloured_noise,
     cut_noise,
@@ -13,7 +13,6 @@ from cpunet.electronics.noise_traces import (
     read_baselines,
 )
 from cpunet.electronics.other_pulses import draw_other_pulses
-from cpunet.electronics.presets import read_electronics
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.remains import Remains, read_baselines
 from cpunet.errors import CpunetError

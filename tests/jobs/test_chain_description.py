@@ -16,8 +16,7 @@ from torch import nn
 from cpunet.analysis.response_figure import response_figure
 from cpunet.cli.main import main
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.chain import Electronics
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import (
     chain_of,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.demo import demonstrate
 from cpunet.recipes import load_recipe

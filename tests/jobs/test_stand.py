@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cpunet.electronics.presets import read_electronics
+from cpunet.electronics.chain import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation import stand_plan
 from cpunet.jobs.simulation.hit_sources import GammaSource, OpenHits, Window

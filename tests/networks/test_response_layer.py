@@ -7,9 +7,8 @@ import pytest
 import scipy.fft
 import torch
 
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.presets import read_electronics
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,

@@ -244,7 +244,7 @@ def test_wrong_crystals_name_the_field(
     with pytest.raises(CpunetError) as caught:
         read_detector(path, ["temperature_K=90"])
     message = str(caught.value)
-    assert message.startswith(f"crystal {tmp_path / 'crystals' / 'B99000.yaml'}: ")
+    assert message.startswith(f"{tmp_path / 'crystals' / 'B99000.yaml'}: ")
     assert said in message
     assert "--crystal" in message
     assert "\n" not in message
@@ -264,7 +264,7 @@ def test_what_the_metadata_lack_is_named(
     said = refused(path, given[0], given[1], given[3])
     assert "l200_site.recommended_voltage_in_V nor" in said
     assert said.endswith("give --set bias_V=VALUE")
-    assert "temperature_K (LEGEND diodes do not tell it)" in refused(path, *given[1:])
+    assert "temperature_K: missing (LEGEND diodes do not tell it)" in refused(path, *given[1:])
     assert capfd.readouterr() == ("", "")
 
 
@@ -295,14 +295,14 @@ def test_diodes_with_a_name_or_height_that_none_has(tmp_path: Path) -> None:
     assert read_detector(path, given).name == "B99000A"
     tall = {**DIODE, "geometry": {**DIODE["geometry"], "height_in_mm": 1e200}}
     path.write_text(yaml.safe_dump(tall))
-    assert "crystal_length = 1e+200" in refused(path, *given)
+    assert "crystal_length: " in refused(path, *given)
 
 
 def test_a_crystal_belongs_to_a_diode(tmp_path: Path) -> None:
     path = metadata(tmp_path, CRYSTAL, DIODE)
     with pytest.raises(CpunetError, match="leave out --crystal"):
         read_detector("icpc", crystal=path)
-    with pytest.raises(CpunetError, match=r"crystal .*nowhere\.yaml: cannot be read"):
+    with pytest.raises(CpunetError, match=r"nowhere\.yaml: no such file"):
         read_detector(path, ["temperature_K=90"], tmp_path / "nowhere.yaml")
 
 
@@ -343,7 +343,8 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     refused(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
     refused(tmp_path / "binary.yaml")
-    assert "KEY=VALUE" in refused("icpc", "bias_V")
     assert "bias_kV" in refused("icpc", "bias_kV=4")
     assert "bias_V" in refused("icpc", "bias_V=high")
-    refused("icpc", "bias_V=[")
+    for word, said in (("bias_V", "expected KEY=VALUE"), ("bias_V=[", "not YAML")):
+        with pytest.raises(CpunetError, match=said):
+            read_detector("icpc", [word])

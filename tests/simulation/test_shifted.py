@@ -60,15 +60,15 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "said"),
     [
-        ("temprature_K=1", "no such key temprature_K; there are temperature_K, "),
-        ("temperature_K=warm", "temperature_K = 'warm'"),
+        ("temprature_K=1", "temprature_K: no such setting; did you mean temperature_K?"),
+        ("temperature_K=warm", "temperature_K: Input should be a valid number, "),
         ("temperature_K=.nan", "finite"),
         ("impurity_factor=0", "greater than 0"),
         ("diffusion_constant=cold", "diffusion_constant"),
         ("diffusion_constant=true", "diffusion_constant: Input should be a number"),
         ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
-        ("nowhere.yaml", "nowhere.yaml: cannot be read; give KEY=VALUE or a YAML file"),
-        ("a={", "no plain value"),
+        ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ("a={", "not YAML"),
     ],
 )
 def test_bad_shifts_are_named(part: str, said: str) -> None:
@@ -79,7 +79,7 @@ def test_bad_shifts_are_named(part: str, said: str) -> None:
 
 
 def test_impossible_detectors_and_settings_are_refused() -> None:
-    with pytest.raises(CpunetError, match=r"shifted: temperature_K = .*less than or equal"):
+    with pytest.raises(CpunetError, match=r"shifted: temperature_K: .*less than or equal"):
         Shift(temperature_K=100).detector(read_detector("icpc"))
-    with pytest.raises(CpunetError, match="hole_trapping_per_us = -1"):
+    with pytest.raises(CpunetError, match=r"hole_trapping_per_us: .*-1"):
         Shift(hole_trapping_per_us=-1).settings(SimulationSettings())

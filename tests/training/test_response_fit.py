@@ -11,11 +11,10 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.noise_traces import coloured_noise
-from cpunet.electronics.presets import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import (
     PADDING_AFTER,

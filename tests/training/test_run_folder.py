@@ -236,15 +236,6 @@ def test_runs_of_the_previous_release_load(run):
     assert read_info(run)["other"] == {"kept": [1]}
 
 
-def test_nested_without_end(run):
-    (run / "run.json").write_text("[" * 100_000)
-    (run / "recipe.yaml").write_text("[" * 5000)
-    for read in (read_info, read_recipe):
-        with pytest.raises(CpunetError) as error:
-            read(run)
-        one_line(error, str(run), "damaged")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -10,13 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.outputs import refuse_inputs
-from cpunet.regular_files import read_text
-from cpunet.yaml_files import MAX_BYTES, parsed
+from cpunet.settings import read_values
 
 
 def run_chain(
@@ -74,12 +71,8 @@ def run_chain(
 
 
 def _chain(config: Path) -> dict[str, Any]:
-    try:
-        chain = parsed(read_text(config, MAX_BYTES))
-    except (OSError, yaml.YAMLError) as error:
-        said = " ".join(str(error).split())
-        raise CpunetError(f"{config}: cannot be read ({said[:200]}); correct it") from error
-    if not isinstance(chain, dict) or not {"outputs", "processors"} <= chain.keys():
+    chain = read_values(config)
+    if not {"outputs", "processors"} <= chain.keys():
         raise CpunetError(f"{config}: no chain of dspeed; give outputs and processors")
     return chain
 

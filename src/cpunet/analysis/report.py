@@ -7,13 +7,11 @@ blocks all requests.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -37,6 +35,7 @@ from cpunet.analysis.report_tables import (
 )
 from cpunet.analysis.style import colours, label
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.settings import plain
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 # section of a figure by the end of its name; all others are under Details
@@ -90,7 +89,7 @@ def write_report(
     notes
         Paragraphs of plain text for the top of the page.
     """
-    metrics = _json_ready(metrics)
+    metrics = plain(metrics)
     text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
     (folder / METRICS).write_text(text + "\n", encoding="utf-8")
     drawn = {}
@@ -184,16 +183,3 @@ def _gallery(drawn: Sequence[Markup]) -> Markup:
 def _file_stem(name: str) -> str:
     """Name of the figure, with characters that file systems may refuse replaced."""
     return re.sub(r"[^\w.-]+", "_", name)
-
-
-def _json_ready(value: Any) -> Any:
-    """Convert to plain Python types, with ``None`` for non-finite numbers."""
-    if isinstance(value, Mapping):
-        return {str(key): _json_ready(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json_ready(item) for item in value]
-    if isinstance(value, (np.generic, np.ndarray)):
-        return _json_ready(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

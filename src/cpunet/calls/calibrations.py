@@ -16,17 +16,17 @@ from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
+from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
-from cpunet.jobs.simulation.simulation_settings import load_settings
 from cpunet.recipes.schema import Recipe
+from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run_folder import read_info
-from cpunet.yaml_files import json_mapping
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,12 +52,12 @@ class CalibratedRun(Run):
         """
         folder = Path(folder)
         info = read_info(folder)
-        content = json_mapping(
-            folder / CALIBRATION,
-            absent=f"{folder}: no calibrated run ({CALIBRATION} cannot be read); open it with "
-            "cpunet.Run.load, or calibrate",
-            remedy="calibrate again",
-        )
+        if not (folder / CALIBRATION).is_file():
+            raise CpunetError(
+                f"{folder}: no calibrated run (no {CALIBRATION}); open it with "
+                "cpunet.Run.load, or calibrate"
+            )
+        content = read_json(folder / CALIBRATION, "calibrate again")
         return cls(folder, info, tuple(content.get("notes", ())), content)
 
     @property
@@ -78,7 +78,7 @@ class CalibratedRun(Run):
     @cached_property
     def settings(self) -> SimulationSettings:
         """The calibrated settings of the simulation."""
-        return load_settings(self.folder / SETTINGS)
+        return read_settings(SimulationSettings, self.folder / SETTINGS)
 
     @property
     def figures(self) -> dict[str, Figure]:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.yaml_files import shown
 
 File: TypeAlias = str | Path | InputFile
 
@@ -51,25 +47,10 @@ def as_recipe(recipe: str | Path | Recipe, settings: Mapping[str, Any] | None) -
         If there is no such recipe or value.
     """
     if not isinstance(recipe, Recipe):
-        # JSON is YAML
-        words = [
-            f"{key}={json.dumps(value, default=_plain)}"
-            for key, value in (settings or {}).items()
-        ]
-        return load_recipe(str(recipe), words)
+        return load_recipe(recipe, settings or {})
     if settings:
         raise CpunetError(
             "settings override values of a recipe that is given by name; this one is whole "
             "already, so change it and leave settings out"
         )
     return recipe
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's numbers and arrays as those of JSON."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise CpunetError(
-        f"settings: {shown(value)} is of type {type(value).__name__}; give numbers, text, "
-        "lists or mappings"
-    )

@@ -193,18 +193,19 @@ def _start(
 ) -> Start:
     from cpunet.jobs.calibration.calibration_inputs import Start
     from cpunet.jobs.common.inputs import InputFile
-    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
+    from cpunet.settings import read_settings
     from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.settings import SimulationSettings, split_overrides
 
     of_detector, of_settings = split_overrides(overrides)
     if of_detector and detector is None:
-        raise CpunetError(f"--set {of_detector[0]}: give the --detector that it is of")
+        raise CpunetError(f"--set {next(iter(of_detector))}: give the --detector that it is of")
     given = settings_file is not None or of_settings
     return Start(
         None if sim is None else InputFile(sim, insist=insist),
         None if hits is None else frame.file(hits),
         None if detector is None else read_detector(detector, of_detector, crystal),
-        load_settings(settings_file, of_settings) if given else None,
+        read_settings(SimulationSettings, settings_file, of_settings) if given else None,
         cluster_mm,
     )
 

@@ -42,7 +42,7 @@ def demo(
 
     Example: cpunet demo --preset ornl --kind shifted --out demo2
     """
-    from cpunet.electronics.presets import read_electronics
+    from cpunet.electronics.chain import read_electronics
     from cpunet.jobs.demo import demonstrate
     from cpunet.jobs.demo_parts import PARTS
     from cpunet.recipes import load_recipe

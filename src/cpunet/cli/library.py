@@ -135,8 +135,9 @@ def make(
     Example: cpunet library make --detector icpc --out psl.lh5
     """
     from cpunet.jobs.simulation.pulse_shape_library import DT_NS, LENGTH_NS, write_library
-    from cpunet.jobs.simulation.simulation_settings import load_settings
+    from cpunet.settings import read_settings
     from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.settings import SimulationSettings
 
     refuse_inputs(out_file, detector, crystal, settings)
     degrees = parse_numbers(angles, angles.count(",") + 1, "--angles")
@@ -145,10 +146,13 @@ def make(
     if settings is None:
         dt = DT_NS if dt is None else dt
         length_ns = LENGTH_NS if length_ns is None else length_ns
+    given = {"dt_ns": dt, "length_ns": length_ns}
     counts = write_library(
         read_detector(detector, set_values or (), crystal),
         out_file,
-        settings=load_settings(settings, {"dt_ns": dt, "length_ns": length_ns}),
+        settings=read_settings(
+            SimulationSettings, settings, {k: v for k, v in given.items() if v is not None}
+        ),
         grid_mm=grid_mm,
         angles_deg=tuple(map(int, degrees)),
         force=force,

@@ -236,9 +236,10 @@ def simulate(
     """
     from cpunet.jobs.simulation.hit_sources import GammaSource, energy_windows
     from cpunet.jobs.simulation.simulate import simulate_file
-    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.recipes import load_recipe
+    from cpunet.settings import read_settings
     from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.settings import SimulationSettings, split_overrides
 
     if (hits is None) == (events is None):
         raise CpunetError(
@@ -256,7 +257,7 @@ def simulate(
         source = GammaSource(tuple(chosen), wanted, source_height_mm, source_radius_mm, seed)
     overrides, set_settings = split_overrides(set_values or ())
     if temperature is not None:
-        overrides.append(f"temperature_K={temperature}")
+        overrides["temperature_K"] = temperature
     options_given = {
         "dt_ns": dt,
         "length_ns": length,
@@ -270,7 +271,7 @@ def simulate(
         read_detector(detector, overrides, crystal),
         source,
         out_file,
-        load_settings(settings_file, values),
+        read_settings(SimulationSettings, settings_file, values),
         impurity_from=impurity_from.value,
         windows=tuple(chosen or energy_windows(",".join(peaks), peaks, window_kev)),
         mode="auto" if exact is None else "exact" if exact else "library",

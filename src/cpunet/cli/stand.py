@@ -109,12 +109,13 @@ def stand(
 
     Example: cpunet stand --preset ornl --kind shifted --shift bias_V=20 --out stand2
     """
-    from cpunet.electronics.presets import read_electronics
+    from cpunet.electronics.chain import read_electronics
     from cpunet.jobs.simulation.hit_sources import energy_windows
-    from cpunet.jobs.simulation.simulation_settings import load_settings, split_overrides
     from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe
+    from cpunet.settings import read_settings
     from cpunet.simulation.geometry_readers import read_detector
+    from cpunet.simulation.settings import SimulationSettings, split_overrides
     from cpunet.simulation.shifted import Shift
 
     refuse_inputs(out_folder, preset, detector, crystal, settings_file, *(shift or ()))
@@ -131,7 +132,7 @@ def stand(
         out_folder,
         kind=kind.value,
         shift=Shift.of(shift) if shift else None,
-        settings=load_settings(settings_file, values),
+        settings=read_settings(SimulationSettings, settings_file, values),
         seed=seed,
         force=force,
         monitor=monitor(),

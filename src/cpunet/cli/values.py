@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 from cpunet.errors import CpunetError
-from cpunet.yaml_files import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -89,11 +88,9 @@ def parse_numbers(text: str, n: int, option: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise CpunetError(
-            f"{option} {shown(text)[1:-1]}: expected {n} numbers separated by commas"
-        )
+        raise CpunetError(f"{option} {text[:60]}: expected {n} numbers separated by commas")
     if max(map(abs, numbers), default=0) > _LARGEST:
-        raise CpunetError(f"{option} {shown(text)[1:-1]}: at most {_LARGEST:g}")
+        raise CpunetError(f"{option} {text[:60]}: at most {_LARGEST:g}")
     return numbers
 
 
@@ -125,8 +122,8 @@ def event_count(text: str) -> int:
     digits = text.strip().lstrip("0") or "0"
     if not text.strip().isdecimal():
         raise CpunetError(
-            f"--events: {shown(text)} is no number of events; give N or FEP=N,DEP=M"
+            f"--events: {text[:60]!r} is no number of events; give N or FEP=N,DEP=M"
         )
     if len(digits) > len(str(MAX_EVENTS)) or int(digits) > MAX_EVENTS:
-        raise CpunetError(f"--events: {shown(text)} are too many; at most {MAX_EVENTS}")
+        raise CpunetError(f"--events: {text[:60]!r} are too many; at most {MAX_EVENTS}")
     return int(digits)

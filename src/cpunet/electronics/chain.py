@@ -10,7 +10,15 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
-from cpunet.recipes.base import Config, Fraction, NonNegative, Positive, Samples
+from cpunet.settings import (
+    Config,
+    Fraction,
+    NonNegative,
+    Positive,
+    Samples,
+    names,
+    read_settings,
+)
 
 REFERENCE_KEV = 2614.5
 """Energy (keV) of the full-energy peak, at which energy-dependent values are quoted."""
@@ -255,7 +263,7 @@ class Electronics(Config):
 
         Examples
         --------
-        >>> from cpunet.electronics.presets import read_electronics
+        >>> from cpunet.electronics.chain import read_electronics
         >>> read_electronics("ornl").disturbed(rate_khz=3).earlier_pulses.rate_kHz
         3.0
         """
@@ -305,7 +313,7 @@ class Electronics(Config):
 
         Examples
         --------
-        >>> from cpunet.electronics.presets import read_electronics
+        >>> from cpunet.electronics.chain import read_electronics
         >>> bool(abs(read_electronics("ornl").transfer.at(0)) < 1e-12)  # no constant current
         True
         """
@@ -348,7 +356,7 @@ class Electronics(Config):
 
         Examples
         --------
-        >>> from cpunet.electronics.presets import read_electronics
+        >>> from cpunet.electronics.chain import read_electronics
         >>> read_electronics("legend200").step_response([-16, 0, 1000]).round(2).tolist()
         [0.0, 0.0, 0.99]
 
@@ -369,3 +377,39 @@ class Electronics(Config):
     def impulse_response(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Impulse response in 1/ns, the derivative of `step_response`, at times in ns."""
         return self.transfer.impulse(t_ns)
+
+
+_PRESETS = Path(__file__).parent / "presets"
+
+
+def electronics_names() -> list[str]:
+    """Names of the preset readout chains.
+
+    Examples
+    --------
+    >>> electronics_names()
+    ['legend200', 'ornl', 'ringing']
+    """
+    return names(_PRESETS)
+
+
+def read_electronics(path: str | Path) -> Electronics:
+    """Read a readout chain.
+
+    Parameters
+    ----------
+    path
+        Name of a preset (see `electronics_names`) or a YAML file with the fields of
+        `Electronics`.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or the chain is invalid. The message names the field.
+
+    Examples
+    --------
+    >>> read_electronics("ornl").decays[0].tau_us
+    54.6
+    """
+    return read_settings(Electronics, path, folder=_PRESETS)

@@ -53,7 +53,7 @@ def respond(
     --------
     A step through one pole without decay approaches the full charge.
 
-    >>> from cpunet.electronics.presets import read_electronics
+    >>> from cpunet.electronics.chain import read_electronics
     >>> step = Pulses.of(np.ones((1, 10)), dt_ns=4, energy_kev=[1592.5])
     >>> chain = read_electronics("legend200")
     >>> trace = respond(step, chain)[0]

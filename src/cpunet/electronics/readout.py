@@ -84,7 +84,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
 
     Examples
     --------
-    >>> from cpunet.electronics.presets import read_electronics
+    >>> from cpunet.electronics.chain import read_electronics
     >>> step = Pulses.of(np.ones((2, 900)), dt_ns=4, energy_kev=[1592.5, 2614.5])
     >>> traces = read_out(step, read_electronics("legend200"), seed=1)
     >>> traces.waveforms.shape, traces.waveforms.dtype

@@ -14,8 +14,8 @@ from cpunet.jobs.simulation.stand import MARKER, STAND
 from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
+from cpunet.settings import read_json
 from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
-from cpunet.yaml_files import json_mapping
 
 # parts in the order of creation, each with a file that exists when it is complete
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
@@ -85,8 +85,7 @@ def remove_parts(out: Path) -> None:
 
 
 def _read_stand(stand: Path) -> dict[str, Any]:
-    absent = f"{stand}: is no stand ({MARKER} cannot be read); give another --out"
-    return json_mapping(stand / MARKER, absent, _WAY_OUT)
+    return read_json(stand / MARKER, _WAY_OUT)
 
 
 def _content(recipe: Recipe) -> dict[str, Any]:

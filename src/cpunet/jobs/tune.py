@@ -36,9 +36,9 @@ from cpunet.outputs import refuse_inputs, written_aside
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.settings import checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.loop import train
 from cpunet.training.run_folder import write_run
@@ -246,7 +246,7 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
             node = node[parent]
         node[last] = value
     source = ", ".join(f"{key} = {value}" for key, value in values.items())
-    return recipe_from(settings, source=f"recipe {recipe.name}, search, {source}")
+    return checked(Recipe, settings, f"recipe {recipe.name}, search, {source}")
 
 
 def _holds(config: SearchConfig, value: Any) -> bool:

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.preparation import FloatColumn, Prepared, Rejection
-from cpunet.recipes.base import Config
 from cpunet.recipes.schema import CutConfig
+from cpunet.settings import Config
 
 # With fewer pulses the MAD is meaningless and no window is set.
 _MIN_N = 10

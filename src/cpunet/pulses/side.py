@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,6 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading.source import PulseSource
-from cpunet.yaml_files import plain_json
 
 # attributes of a table, and of a file
 SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
@@ -113,7 +113,7 @@ def recorded_attributes(source: PulseSource) -> dict[str, str]:
 def recorded_detector(source: PulseSource) -> str | None:
     """Name of the simulated detector; None if the file does not contain it."""
     try:
-        detector = plain_json(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
+        detector = json.loads(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
         name = detector["name"]
     except (ValueError, LookupError, TypeError):
         return None

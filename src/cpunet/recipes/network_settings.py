@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples, Width
+from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
 # parameters that stretch the simulated drift, see `cpunet.networks.drift_clock`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]

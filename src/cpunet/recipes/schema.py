@@ -11,7 +11,6 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, model_validator
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.base import Config, Positive, Samples
 from cpunet.recipes.network_settings import (
     ConvConfig,
     GruConfig,
@@ -21,6 +20,7 @@ from cpunet.recipes.network_settings import (
     ResponseConfig,
 )
 from cpunet.recipes.training_settings import MatchingConfig, TrainingConfig
+from cpunet.settings import Config, Positive, Samples
 
 
 class PeakConfig(Config):

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from cpunet.recipes.base import Config, Count, Fraction, NonNegative, Positive, Samples
 from cpunet.recipes.network_settings import DriftTerms
+from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples
 
 _Number = Annotated[int, Field(ge=1, le=1000)]
 

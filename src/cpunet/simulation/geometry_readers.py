@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from cpunet.errors import CpunetError
-from cpunet.regular_files import read_text
+from cpunet.settings import Set, checked, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_crystal import LONGEST_MM, impurity_values
 from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
-from cpunet.yaml_files import MAX_BYTES, key_and_value, shown, yaml_fields, yaml_names
 
-_FOLDER = files("cpunet.simulation") / "detectors"
+_FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
 _Z0 = "impurity_z0_1e10_per_cm3"
 
@@ -28,11 +23,11 @@ _Hints = dict[str, str]
 
 def detector_names() -> list[str]:
     """Names of the preset detectors."""
-    return yaml_names(_FOLDER)
+    return names(_FOLDER)
 
 
 def read_detector(
-    path: str | Path, overrides: Iterable[str] = (), crystal: str | Path | None = None
+    path: str | Path, overrides: Set = (), crystal: str | Path | None = None
 ) -> Detector:
     """Read a detector and apply overrides.
 
@@ -62,40 +57,25 @@ def read_detector(
     """
     name = str(path)
     hints: _Hints = {}
-    if name in detector_names():
-        values = _mapping((_FOLDER / f"{name}.yaml").read_text("utf-8"), f"detector {name}")
+    if name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
+        values = read_values(path, _FOLDER)
     else:
-        values = _from_file(Path(path))
+        values = siggen_values(read_text(path, _FOLDER), name)
     if "geometry" in values:
         values, hints = _legend(values, Path(path), crystal)
     elif crystal is not None:
         raise CpunetError(
-            f"detector {name}: only LEGEND metadata take their impurities from another "
-            "file; leave out --crystal"
+            f"{name}: only LEGEND metadata take their impurities from another file; leave out "
+            "--crystal"
         )
-    for override in overrides:
-        pair = key_and_value(override, f"detector {name}")
-        if pair is None:
-            raise CpunetError(f"detector {name}: {shown(override)} is no KEY=VALUE")
-        values |= [pair]
-    try:
-        return Detector.model_validate({"name": Path(name).stem, **values})
-    except ValidationError as error:
-        raise CpunetError(f"detector {name}: {_first_problem(error, hints)}") from error
-
-
-def _from_file(path: Path) -> dict[str, Any]:
-    try:
-        text = read_text(path, MAX_BYTES)
-    except FileNotFoundError as error:
-        raise CpunetError(
-            f"detector {path}: neither a file nor one of {', '.join(detector_names())}"
-        ) from error
-    except OSError as error:
-        raise CpunetError(f"detector {path}: cannot be read ({error.strerror})") from error
-    if path.suffix.lower() not in _MAPPINGS:
-        return siggen_values(text, str(path))
-    return _mapping(text, f"detector {path}")
+    values = {"name": Path(name).stem} | values | key_values(overrides)
+    missing = {
+        key: f"missing ({why}); give "
+        + ("the crystal's file with --crystal, or " if key == _Z0 else "")
+        + f"--set {key}=VALUE"
+        for key, why in hints.items()
+    }
+    return checked(Detector, values, name, missing)
 
 
 def _legend(
@@ -114,11 +94,7 @@ def _legend(
     hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
     if found is None:
         return values, hints
-    try:
-        text = read_text(found, MAX_BYTES)
-    except OSError as error:
-        raise CpunetError(f"crystal {found}: cannot be read ({error.strerror})") from error
-    content = _mapping(text, f"crystal {found}")
+    content = read_values(found)
     hints[_Z0] = f"production.impcc is empty or 0, and {found} has no impurity_curve"
     if content.get("impurity_curve") is None and crystal is None:
         return values, hints
@@ -127,7 +103,7 @@ def _legend(
         return values, hints  # refused together with the rest of the geometry
     # the curve describes the whole crystal and replaces a line through a few points
     values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
-    return values | impurity_values(content, f"crystal {found}", slice_name, length), hints
+    return values | impurity_values(content, str(found), slice_name, length), hints
 
 
 def _is_file(path: Path) -> bool:
@@ -136,29 +112,3 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:
         return False
-
-
-def _mapping(text: str, source: str) -> dict[str, Any]:
-    return yaml_fields(
-        text,
-        source,
-        invalid="no valid YAML or JSON",
-        empty="holds no keys; see the examples in detectors/",
-    )
-
-
-def _first_problem(error: ValidationError, hints: _Hints) -> str:
-    """First problem reported by pydantic, in one line that names the key."""
-    first = error.errors(include_url=False)[0]
-    key = ".".join(map(str, first["loc"]))
-    if first["type"] == "missing" and key in hints:
-        crystal = "give the crystal's file with --crystal, or " if key == _Z0 else "give "
-        return f"no {key} ({hints[key]}); {crystal}--set {key}=VALUE"
-    if first["type"] == "missing":
-        return f"no {key}; add it to the file, or give {key}=VALUE"
-    if first["type"] == "extra_forbidden":
-        return f"unknown key {shown(key)[1:-1]}; known are {', '.join(Detector.model_fields)}"
-    message = first["msg"].removeprefix("Value error, ")
-    if not key:
-        return f"{message}; correct these values"
-    return f"{key} = {shown(first['input'])}: {message[0].lower()}{message[1:]}"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.yaml_files import shown
 
 # keys of a diode and the fields of the detector
 _GEOMETRY = {
@@ -90,8 +90,8 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if kind is not None and kind not in _SIMULATED:
         why = f" ({_NOT_SIMULATED[kind]})" if str(kind) in _NOT_SIMULATED else ""
         raise CpunetError(
-            f"detector {name}: type {shown(kind)} is not simulated{why}; give one of type "
-            f"{', '.join(_SIMULATED)}"
+            f"detector {name}: type {reprlib.repr(kind)} is not simulated{why}; "
+            f"give one of type {', '.join(_SIMULATED)}"
         )
     geometry = _flat(diode["geometry"], name)
     for key in _REQUIRED:

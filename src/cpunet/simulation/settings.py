@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.recipes.base import Config
+from cpunet.settings import Config, Set, key_values
 from cpunet.simulation.velocity import VelocityFactors
 
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
@@ -141,3 +141,19 @@ class SimulationSettings(Config):
                 "held at once"
             )
         return self
+
+
+def split_overrides(overrides: Set) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split ``KEY=VALUE`` words into values of the detector and of `SimulationSettings`.
+
+    Examples
+    --------
+    >>> split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
+    ({'bias_V': 3500}, {'hole_trapping_per_us': 0.01})
+    """
+    values = key_values(overrides)
+    of_settings = values.keys() & SimulationSettings.model_fields.keys()
+    return (
+        {key: value for key, value in values.items() if key not in of_settings},
+        {key: value for key, value in values.items() if key in of_settings},
+    )

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from importlib.resources import files
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from cpunet.errors import CpunetError
-from cpunet.recipes.base import Config
-from cpunet.regular_files import read_text
+from cpunet.settings import Config, checked, key_values, read_settings, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.yaml_files import MAX_BYTES, key_and_value, shown, yaml_fields
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -70,10 +65,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
     @classmethod
     def default(cls) -> Shift:
         """Default shift of the package."""
-        text = (files("cpunet.simulation") / "shifted_detector.yaml").read_text(
-            encoding="utf-8"
-        )
-        return cls.model_validate(yaml.safe_load(text))
+        return read_settings(cls, Path(__file__).with_name("shifted_detector.yaml"))
 
     @classmethod
     def of(cls, parts: Iterable[str]) -> Shift:
@@ -91,12 +83,8 @@ hole_velocity_low_factor, hole_velocity_high_factor
         """
         values: dict[str, Any] = {}
         for part in parts:
-            pair = key_and_value(part, "shift")
-            values |= _file_values(Path(part)) if pair is None else [pair]
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise CpunetError(f"shift: {_problem(error, cls)}") from error
+            values |= key_values([part]) if "=" in part else read_values(part)
+        return checked(cls, values, "shift")
 
     def detector(self, detector: Detector) -> Detector:
         """Shifted version of a simulated detector.
@@ -112,13 +100,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
         values["bias_V"] += self.bias_V
         values["li_thickness"] += self.li_thickness_mm
         values["impurity_tilt_1e10_per_cm4"] += self.impurity_tilt_1e10_per_cm4
-        try:
-            return Detector.model_validate(values)
-        except ValidationError as error:
-            raise CpunetError(
-                f"detector {detector.name}, shifted: {_problem(error, Detector)}; "
-                "change the shift"
-            ) from error
+        return checked(Detector, values, f"detector {detector.name}, shifted")
 
     def settings(self, settings: SimulationSettings) -> SimulationSettings:
         """Shifted version of the simulation settings.
@@ -136,35 +118,4 @@ hole_velocity_low_factor, hole_velocity_high_factor
             for at in ("low", "high"):
                 name = f"{carrier}_velocity_{at}_factor"
                 values[name] *= getattr(self, name)
-        try:
-            return SimulationSettings.model_validate(values)
-        except ValidationError as error:
-            raise CpunetError(
-                f"settings, shifted: {_problem(error, SimulationSettings)}; change the shift"
-            ) from error
-
-
-def _file_values(path: Path) -> Mapping[str, Any]:
-    try:
-        text = read_text(path, MAX_BYTES)
-    except OSError as error:
-        raise CpunetError(
-            f"shift {path}: cannot be read; give KEY=VALUE or a YAML file"
-        ) from error
-    return yaml_fields(
-        text,
-        f"shift {path}",
-        invalid="not YAML",
-        empty="holds no shift; write lines such as temperature_K: 2",
-    )
-
-
-def _problem(error: ValidationError, kind: type[Config]) -> str:
-    """First problem in one line that names the key."""
-    first = error.errors()[0]
-    # for a union the location includes its member
-    key = str(first["loc"][0]) if first["loc"] else ""
-    if first["type"] == "extra_forbidden":
-        return f"no such key {key}; there are {', '.join(kind.model_fields)}"
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{key} = {shown(first['input'])}: {message}" if key else message
+        return checked(SimulationSettings, values, "settings, shifted")

@@ -29,12 +29,10 @@ from torch import Tensor, nn
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind
-from cpunet.recipes import recipe_from
 from cpunet.recipes.schema import Recipe
-from cpunet.regular_files import read_text
+from cpunet.settings import checked, read_json, read_values
 from cpunet.training.loop import Record
 from cpunet.training.run_schema import FORMAT, problem
-from cpunet.yaml_files import MAX_BYTES, json_mapping, parsed, plain_json
 
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
 RUN = FolderKind(
@@ -83,8 +81,9 @@ def read_info(run: Path) -> dict[str, Any]:
         If the folder is not a finished run, or of a newer version.
     """
     path = Path(run) / INFO
-    absent = f"{run}: no finished run ({INFO} cannot be read); make one with `cpunet train`"
-    info = json_mapping(path, absent, "train again")
+    if not path.is_file():
+        raise CpunetError(f"{run}: no finished run (no {INFO}); make one with `cpunet train`")
+    info = read_json(path, "train again")
     if wrong := problem(info):
         raise CpunetError(f"{path}: {wrong}")
     return info
@@ -93,13 +92,7 @@ def read_info(run: Path) -> dict[str, Any]:
 def read_recipe(run: Path) -> Recipe:
     """Return the resolved recipe of a run."""
     path = Path(run) / RECIPE
-    try:
-        settings = parsed(read_text(path, MAX_BYTES))
-        return recipe_from(_completed(settings), source=str(path))
-    except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    except yaml.YAMLError as error:
-        raise CpunetError(f"{path}: damaged; train again") from error
+    return checked(Recipe, _completed(read_values(path)), str(path))
 
 
 def _completed(settings: Any) -> Any:
@@ -145,7 +138,7 @@ def read_losses(run: Path) -> list[Record]:
         return []
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-        records = [plain_json(line) for line in lines]
+        records = [json.loads(line) for line in lines]
         if not all(map(_is_record, records)):
             raise ValueError("a line holds no losses")
     except OSError as error:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 import cpunet
 from cpunet.analysis.response_figure import (
@@ -37,10 +36,9 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.regular_files import read_text
+from cpunet.settings import checked, read_json
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run_folder import load_network, read_info, read_recipe
-from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 MARKER = "response.json"
@@ -177,15 +175,8 @@ def stand_electronics(stand: Path) -> Electronics:
         If the folder is not a virtual test stand.
     """
     path = Path(stand) / "stand.json"
-    try:
-        text = read_text(path, MAX_BYTES)
-        return Electronics.model_validate(plain_json(text)["electronics"])
-    except OSError as error:
-        raise CpunetError(
-            f"{stand}: no test stand (stand.json cannot be read); make one with `cpunet stand`"
-        ) from error
-    except (ValueError, KeyError, TypeError, ValidationError) as error:
-        raise CpunetError(f"{path}: holds no electronics; make the stand again") from error
+    content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
+    return checked(Electronics, content.get("electronics"), f"{path}: electronics")
 
 
 def _read_run(path: Path) -> _Learned:

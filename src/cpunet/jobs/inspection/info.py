@@ -31,10 +31,9 @@ from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
 from cpunet.pulses.spectrum import Values, suggested_calibration
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.regular_files import read_text
+from cpunet.settings import read_json
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
-from cpunet.yaml_files import MAX_BYTES, plain_json
 
 _RUN_FILE = "run.json"
 # what other folders are, by a file that they hold
@@ -335,14 +334,7 @@ def _run(folder: Path) -> dict[str, Any]:
         raise CpunetError(
             f"{folder}: {hint}a folder without {_RUN_FILE}; give the folder of a run, or a file"
         )
-    try:
-        content = plain_json(read_text(file, MAX_BYTES))
-    except (OSError, ValueError) as error:
-        raise CpunetError(
-            f"{file}: cannot be read ({error}); the run is damaged, train it again"
-        ) from error
-    if not isinstance(content, dict):
-        raise CpunetError(f"{file}: holds no run; train it again")
+    content = read_json(file, "train it again")
     # loads torch, which files do not need
     from cpunet.jobs.inspection.chain_description import noise_kev
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -17,7 +18,6 @@ from cpunet.pulses.side import (
     TRANSLATION,
     recorded_attributes,
 )
-from cpunet.yaml_files import plain_json
 
 # default values of the options of a translation; that of all others is None
 _DEFAULTS = {
@@ -50,7 +50,7 @@ def provenance(source: PulseSource) -> dict[str, str]:
 
 def _parsed(text: str | None) -> Mapping[str, Any]:
     with suppress(ValueError, TypeError):
-        found = plain_json(text or "")
+        found = json.loads(text or "")
         if isinstance(found, dict):
             return found
     return {}

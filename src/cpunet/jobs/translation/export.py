@@ -17,7 +17,7 @@ from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
-from cpunet.regular_files import read_text
+from cpunet.settings import read_json
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import (
     Backend,
@@ -27,7 +27,6 @@ from cpunet.translation.backends import (
 )
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
 from cpunet.translation.translator import IREN, REN, Translator
-from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 _LANGUAGES = {
@@ -133,12 +132,7 @@ def _write_noise(path: Path, noise: BaselineNoise) -> None:
 
 def _scores(report: Path) -> Mapping[str, Any]:
     path = report / "metrics.json"
-    try:
-        peaks = plain_json(read_text(path, MAX_BYTES))["peaks"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CpunetError(
-            f"{path}: no scores; give the folder that `cpunet validate` made"
-        ) from error
+    peaks = read_json(path, "give the folder that `cpunet validate` made").get("peaks")
     if not isinstance(peaks, dict):
         raise CpunetError(f"{path}: no scores of peaks; validate again")
     return peaks

@@ -30,9 +30,8 @@ from cpunet.jobs.translation.simflow_checks import (
     known_detector,
 )
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
-from cpunet.regular_files import read_text
+from cpunet.settings import plain, read_json
 from cpunet.training.run_folder import read_info, weights_sha256
-from cpunet.yaml_files import MAX_BYTES, plain_json
 
 QUIET = Monitor()
 WHOLE = "cpunet.yaml"
@@ -134,17 +133,8 @@ def export_legend_pars(
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.safe_dump(_plain(content), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(plain(content), sort_keys=False, allow_unicode=True)
     path.write_text(text, encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """Convert nested values to plain Python types, for YAML."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _against_energy(
@@ -152,14 +142,14 @@ def _against_energy(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """A/E against energy of a report on this run, and the entries of production for it."""
     path = report / "metrics.json"
+    metrics = read_json(path, "give the folder that `cpunet validate` made")
     try:
-        metrics = plain_json(read_text(path, MAX_BYTES))
         training, found = metrics["training"], metrics["ae_energy"]
         other = [key for key in SAME if training[key] != info[key]]
         missing = found.get("missing")
         methods = {} if missing else dict(found["methods"])
         pars = {} if missing else _ae_pars(methods)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
         ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +20,8 @@ from cpunet.jobs.translation.library_file import (
     n_templates,
     sampling_period_ns,
 )
-from cpunet.regular_files import read_text
+from cpunet.settings import read_values
 from cpunet.translation.ring_padding import padded_axis
-from cpunet.yaml_files import MAX_BYTES, parsed, plain_json
 
 PERIOD_NS = 1.0
 PULSES = "geds/sim"  # table of `cpunet simulate` with its provenance
@@ -149,9 +149,8 @@ def chosen_libraries(
 def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
     """Name of the detector whose simulation a run was trained with; None if unknown."""
     try:
-        described = parsed(read_text(Path(run) / "detector.yaml", MAX_BYTES))
-        name = described.get("name") if isinstance(described, dict) else None
-    except (OSError, ValueError, CpunetError):
+        name = read_values(Path(run) / "detector.yaml").get("name")
+    except CpunetError:
         name = None
     if name:
         return str(name)
@@ -163,7 +162,7 @@ def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
         with opened(file) as content:
             pulses = content.get(PULSES)
             told = pulses.attrs.get("simulation") if pulses is not None else None
-        made = plain_json(str(told)) if told else {}
+        made = json.loads(str(told)) if told else {}
         return str(made["detector"]["name"]) or None
     except (CpunetError, ValueError, KeyError, TypeError):
         return None

@@ -21,7 +21,6 @@ from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.translation.low_rank import Loss
 from cpunet.translation.peak_currents import LENGTH, PEAK
-from cpunet.yaml_files import plain_json
 
 Floats = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
@@ -194,7 +193,7 @@ def _read(group: h5py.Group, detector: str) -> RealisticLibrary:
     prefix = "waveform_" if basis is None else "coefficients_"
     arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
     try:
-        told = plain_json(text_attribute(group, TOLD) or "{}")
+        told = json.loads(text_attribute(group, TOLD) or "{}")
     except ValueError:
         told = {}
     return RealisticLibrary(

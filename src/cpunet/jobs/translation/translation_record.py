@@ -15,7 +15,6 @@ from cpunet.hdf5_files import opened
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.pulses.side import TRANSLATION
 from cpunet.training.run_folder import RECIPE, WEIGHTS
-from cpunet.yaml_files import plain_json
 
 Record = dict[str, Any]
 
@@ -122,7 +121,7 @@ def as_json(record: Record) -> str:
 def _read(out: Path) -> Record:
     try:
         with opened(out) as file:
-            record = plain_json(file.attrs[TRANSLATION])
+            record = json.loads(file.attrs[TRANSLATION])
     except (CpunetError, LookupError, ValueError, TypeError):
         record = None
     if not isinstance(record, dict):

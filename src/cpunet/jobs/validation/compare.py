@@ -13,8 +13,7 @@ from cpunet.analysis.side_by_side import SideBySide, side_by_side
 from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
-from cpunet.regular_files import read_text
-from cpunet.yaml_files import MAX_BYTES, plain_json
+from cpunet.settings import read_json
 
 REPORT = "report"  # folder of a demonstration that contains the metrics
 PAGE = "report.html"
@@ -101,12 +100,8 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
     CpunetError
         If the file cannot be read or does not contain the scores of a validation.
     """
-    try:
-        content = plain_json(read_text(file, MAX_BYTES))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise CpunetError(f"{file}: cannot be read ({reason}); {remedy}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("peaks"), dict):
+    content = read_json(file, remedy)
+    if not isinstance(content.get("peaks"), dict):
         raise CpunetError(f"{file}: holds no scores by peak; give a report of cpunet validate")
     return content
 

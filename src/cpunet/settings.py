@@ -1,0 +1,228 @@
+"""Settings: their base class, reading them by name or from a file, and plain values."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import reprlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cpunet.errors import CpunetError
+
+Positive = Annotated[float, Field(gt=0, le=1e30)]
+NonNegative = Annotated[float, Field(ge=0, le=1e30)]
+Millimetres = Annotated[float, Field(ge=0, le=1000)]
+# Upper limits are far above any realistic value, but not beyond memory and computing time.
+Count = Annotated[int, Field(ge=1, le=100_000_000)]
+Samples = Annotated[int, Field(ge=1, le=100_000)]
+Width = Annotated[int, Field(ge=1, le=4096)]
+Fraction = Annotated[float, Field(ge=0, lt=1)]
+
+Set: TypeAlias = Mapping[str, Any] | Iterable[str]
+
+
+class Config(BaseModel):
+    """Base of all settings: without unknown keys, with finite numbers, immutable."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    switches: ClassVar[tuple[str, ...]] = ()  # numbers that may be given as true and false
+
+    @model_validator(mode="before")
+    @classmethod
+    def _numbers_are_numbers(cls, values: Any) -> Any:
+        """Refuse true and false where a number is expected; they would count as 1 and 0."""
+        for name, value in values.items() if isinstance(values, Mapping) else ():
+            if isinstance(value, bool) and name in cls.model_fields.keys() - {*cls.switches}:
+                kinds = _kinds(cls.model_fields[name].annotation)
+                if kinds & {int, float} and bool not in kinds:
+                    raise ValueError(f"{name}: Input should be a number, not true or false")
+        return values
+
+
+C = TypeVar("C", bound=Config)
+
+
+def read_settings(
+    kind: type[C], name: str | Path | None = None, set_: Set = (), folder: Path | None = None
+) -> C:
+    """Read settings by name or from a file, and override single values.
+
+    Parameters
+    ----------
+    name
+        Name of a YAML file in `folder`, or a path. None has only the values of `set_`.
+    set_
+        See `key_values`. Keys of parts are joined by dots, as in ``training.batch_size``.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, or a key or value is not allowed.
+    """
+    source = "settings" if name is None else str(name)
+    values = {} if name is None else read_values(name, folder)
+    for key, value in key_values(set_).items():
+        *parents, last = key.split(".")
+        node = values
+        for parent in parents:
+            node = node.get(parent) if isinstance(node, dict) else None  # type: ignore[assignment]
+        if not isinstance(node, dict):
+            raise CpunetError(f"{source}: {key}: no such setting")
+        node[last] = value
+    return checked(kind, values, source)
+
+
+def checked(
+    kind: type[C], values: Any, source: str, missing: Mapping[str, str] | None = None
+) -> C:
+    """Validate settings; an error names the first wrong key in one line.
+
+    Parameters
+    ----------
+    source
+        Start of an error message.
+    missing
+        What to say of keys that are missing.
+    """
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise CpunetError(f"{source}: {_fault(error, kind, values, missing or {})}") from error
+
+
+def key_values(set_: Set) -> dict[str, Any]:
+    """Values by key, of a mapping or of ``KEY=VALUE`` words with a value in YAML.
+
+    Examples
+    --------
+    >>> key_values(["bias_V = 4000", "training.betas=[0.5, 0.9]"])
+    {'bias_V': 4000, 'training.betas': [0.5, 0.9]}
+    """
+    if isinstance(set_, Mapping):
+        return {k: v.tolist() if hasattr(v, "tolist") else v for k, v in set_.items()}
+    values = {}
+    for word in set_:
+        key, _, text = word.partition("=")
+        if not key.strip() or "=" not in word:
+            raise CpunetError(f"{reprlib.repr(word)}: expected KEY=VALUE, as in bias_V=4000")
+        values[key.strip()] = _parsed(text, reprlib.repr(word))
+    return values
+
+
+def names(folder: Path) -> list[str]:
+    """Names of the YAML files in a folder."""
+    return sorted(file.stem for file in folder.glob("*.yaml"))
+
+
+def read_text(name: str | Path, folder: Path | None = None) -> str:
+    """Text of a file, given by its path or by its name in `folder`."""
+    known = names(folder) if folder else []
+    file = folder / f"{name}.yaml" if folder and str(name) in known else Path(name)
+    try:
+        return file.read_text("utf-8")
+    except FileNotFoundError as error:
+        wrong = f"neither a file nor one of {', '.join(known)}" if known else "no such file"
+        raise CpunetError(f"{name}: {wrong}") from error
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise CpunetError(f"{name}: cannot be read ({reason})") from error
+
+
+def read_values(name: str | Path, folder: Path | None = None) -> dict[str, Any]:
+    """Read a mapping from a YAML or JSON file, see `read_text`."""
+    text = read_text(name, folder)
+    is_json = Path(name).suffix.lower() == ".json"  # may be indented with tabs
+    values = _parsed(text, str(name), json.loads if is_json else yaml.safe_load)
+    if not isinstance(values, dict):
+        raise CpunetError(f"{name}: holds no settings; write lines such as dt_ns: 16")
+    return values
+
+
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """Read a mapping from a JSON file; `remedy` says what to do if that fails."""
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); {remedy}") from error
+    if not isinstance(content, dict):
+        raise CpunetError(f"{path}: damaged (no mapping); {remedy}")
+    return content
+
+
+def plain(value: Any) -> Any:
+    """Convert nested values, also of NumPy, to what JSON has; non-finite numbers to None.
+
+    Examples
+    --------
+    >>> plain({"a": (1, float("nan"))})
+    {'a': [1, None]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _parsed(text: str, source: str, parse: Any = yaml.safe_load) -> Any:
+    try:
+        return parse(text)
+    except (yaml.YAMLError, ValueError) as error:
+        raise CpunetError(f"{source}: not YAML ({' '.join(str(error).split())})") from error
+
+
+def _fault(
+    error: ValidationError, kind: type[Config], values: Any, missing: Mapping[str, str]
+) -> str:
+    faults = error.errors(include_url=False)
+    # what is missing may be misspelt
+    first = next((one for one in faults if one["type"] == "extra_forbidden"), faults[0])
+    # a location also has the members of unions
+    keys = []
+    for place, part in enumerate(first["loc"]):
+        try:
+            values = values[part]
+        except (LookupError, TypeError):
+            if first["type"] != "missing" or place < len(first["loc"]) - 1:
+                continue
+        keys.append(part)
+    key = ".".join(map(str, keys))
+    if first["type"] == "missing":
+        return f"{key}: {missing.get(key, 'missing; add it')}"
+    if first["type"] == "extra_forbidden":
+        known = _fields(kind, keys[:-1])
+        near = difflib.get_close_matches(str(keys[-1]), known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        return f"{key[:60]}: no such setting; {hint}"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] != "value_error":
+        message += f" ({reprlib.repr(first['input'])})"
+    return f"{key}: {message}" if key else message
+
+
+def _fields(kind: type[Config], keys: list[Any]) -> list[str]:
+    """Names of the fields of a part of settings."""
+    kinds: set[Any] = {kind}
+    for key in filter(lambda key: isinstance(key, str), keys):  # no places in a list
+        found = [one.model_fields[key] for one in kinds if key in one.model_fields]
+        kinds = set().union(*(_kinds(field.annotation) for field in found))
+        kinds = {one for one in kinds if isinstance(one, type) and issubclass(one, Config)}
+    return list(dict.fromkeys(name for one in kinds for name in one.model_fields))
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """Types that an annotation such as ``Annotated[float, ...] | None`` allows."""
+    parts = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        parts = parts[:1]
+    return set().union(*map(_kinds, parts)) if parts else {annotation}
