@@ -28,6 +28,7 @@ from cpunet.training.run_folder import RUN, write_run
 
 TRAIN = "train --recipe fast --sim sim.lh5 --data data.lh5 --out out"
 SIMULATE = "simulate --detector ppc.yaml --hits hits.npz --out out"
+WRITE = "library lithium --out out.lh5"
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
@@ -145,8 +146,8 @@ MISTAKES = {
         r"mine: holds thesis.tex, which cpunet did not write; move it elsewhere, or .*",
     ),
     "disk full": Mistake(
-        f"{SIMULATE}",
-        r"out: cannot be written \(No space left on device\); make room there, or .*",
+        WRITE,
+        r"out.lh5: cannot be written \(No space left on device\); make room there, or .*",
         failing("pathlib.Path.replace", FULL),
     ),
     "disk full for the terminal": Mistake(
@@ -154,8 +155,8 @@ MISTAKES = {
         r"sim.lh5: No space left on device; make room, or choose another place",
         failing(DESCRIBE, FULL),
     ),
-    "killed": Mistake(f"{SIMULATE}", r"interrupted; .*", signalled(signal.SIGTERM), 143),
-    "Ctrl-C": Mistake(f"{SIMULATE}", r"interrupted; .*", signalled(signal.SIGINT), 130),
+    "killed": Mistake(WRITE, r"interrupted; .*", signalled(signal.SIGTERM), 143),
+    "Ctrl-C": Mistake(WRITE, r"interrupted; .*", signalled(signal.SIGINT), 130),
     # runs and reports
     "half a run": Mistake("translate halfrun sim.lh5 --out out", r"halfrun.*; .*"),
     "a report for a run": Mistake(
@@ -163,15 +164,15 @@ MISTAKES = {
     ),
     "damaged scores": Mistake("compare report report2", r"report2/metrics.json: .*; .*"),
     # settings
-    "recipe is no YAML": Mistake(f"{TRAIN} --recipe bad.yaml", r"recipe bad.yaml: not YAML .*"),
+    "recipe is no YAML": Mistake(f"{TRAIN} --recipe bad.yaml", r"bad.yaml: not YAML.*"),
     "unknown recipe": Mistake(
-        f"{TRAIN} --recipe papr", r"recipe 'papr': neither a file nor one of .*paper.*"
+        f"{TRAIN} --recipe papr", r"papr: neither a file nor one of .*paper.*"
     ),
     "unknown key": Mistake(
-        f"{TRAIN} --set training.none=1", r".*the recipe has no training.none.*"
+        f"{TRAIN} --set training.none=1", r"fast: training.none: no such setting; .*"
     ),
     "impossible value": Mistake(
-        f"{TRAIN} --set training.steps=-1", r"recipe fast: training.steps: .*"
+        f"{TRAIN} --set training.steps=-1", r"fast: training.steps: .*"
     ),
     "options that exclude each other": Mistake(
         "export run --out out.onnx --detector V1", r"--detector .*--to legend-pars; add it"
@@ -189,10 +190,8 @@ MISTAKES = {
         without("onnx"),
     ),
     # simulation
-    "unknown detector": Mistake(
-        "fields V999", r"detector V999: neither a file nor one of .*ppc.*"
-    ),
-    "metres for millimetres": Mistake("fields metres.yaml", r"detector .*metres.*: .*"),
+    "unknown detector": Mistake("fields V999", r"V999: neither a file nor one of .*ppc.*"),
+    "metres for millimetres": Mistake("fields metres.yaml", r"metres.yaml: .*"),
     "hits outside": Mistake(f"{SIMULATE} --hits far.npz", r"far.npz: .*; .*--origin.*"),
     "hits without energies": Mistake(f"{SIMULATE} --hits noenergy.npz", r"noenergy.npz: .*"),
     # machine
