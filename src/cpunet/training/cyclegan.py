@@ -25,7 +25,6 @@ from cpunet.training.fast_step import fast_translations, logits, plain_translati
 from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
 from cpunet.training.outside import Outside, tolerance
-from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.surroundings import NONE, Surroundings
 
 LOSS_NAMES = (
@@ -94,9 +93,6 @@ class Step:
     fast
         Whether to use the passes of `cpunet.training.fast_step`; None to use them if they are
         faster.
-    group
-        Process group, each process with its share of every batch; see also
-        `cpunet.training.group_norm`.
     outside
         Noise and preparation of translations before a discriminator sees them; None for none.
     chain
@@ -113,7 +109,6 @@ class Step:
         config: TrainingConfig,
         *,
         fast: bool | None = None,
-        group: ProcessGroup = ALONE,
         outside: Outside | None = None,
         chain: ChainStep | None = None,
         warmup: int = 0,
@@ -123,7 +118,6 @@ class Step:
         # of the discriminators, if this iteration updates them
         self.accuracy: dict[str, Tensor] = {}
         self.config, self.warmup = config, warmup
-        self.group = group
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
         self.noise = config.instance_noise
@@ -131,8 +125,7 @@ class Step:
             generator_pass(network, config.precision, compiled=config.compiled)
             for network in (model.ren, model.iren)
         )
-        # fast passes have their own batch norms, which do not support groups
-        plain = config.compiled or config.precision != "float32" or group.size > 1
+        plain = config.compiled or config.precision != "float32"
         pays = fast_passes_pay(model.ren, device.type) and not plain
         self.fast = pays if fast is None else fast
 
@@ -186,7 +179,6 @@ class Step:
 
         With noise outside the generators, `rows` are the indices of the simulated pulses.
         Discriminator losses are included only in iterations that update the discriminators.
-        In a group, losses are means over all processes.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
         losses, *judged = self._update_generators(sim, data, rows)
@@ -194,10 +186,9 @@ class Step:
         if iteration % self.config.discriminator_interval == 0:
             names = ("discriminator_data", "discriminator_sim")
             losses |= self._update_discriminators(dict(zip(names, judged, strict=True)))
-            self.accuracy = self.group.mean(self.accuracy)
         for schedule in self.schedules:
             schedule.step()
-        return self.group.mean({name: loss.detach() for name, loss in losses.items()})
+        return {name: loss.detach() for name, loss in losses.items()}
 
     def generator_losses(
         self, sim: Tensor, data: Tensor, rows: Tensor | None = None
@@ -260,7 +251,6 @@ class Step:
         losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
-        self.group.average_gradients(model.generator_parameters())
         clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
         self.generators.step()
         for network in discriminators:
@@ -300,7 +290,6 @@ class Step:
             )
             optimiser.zero_grad(set_to_none=True)
             (loss + penalty).backward()  # type: ignore[no-untyped-call]
-            self.group.average_gradients(network.parameters())
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss
