@@ -20,7 +20,6 @@ from cpunet.cli.main import main
 from cpunet.training.unfinished import UnfinishedRun
 
 AFTER = 2  # iterations
-PROGRAM = [sys.executable, __file__]
 # so that a checkpoint is there to go on from
 SETTINGS = ["training.checkpoint_interval=1", "training.log_interval=1"]
 

@@ -15,8 +15,8 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -75,18 +75,6 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
     start_threads()
     numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
-
-
-@contextmanager
-def at_most_threads(count: int) -> Iterator[None]:
-    """Let parallel loops that this thread calls use at most `count` threads."""
-    start_threads()
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(before, count))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
 
 
 def _digest() -> str:

@@ -25,7 +25,6 @@ from cpunet.training.loop import CheckpointHooks, StoppedError, train
 from cpunet.training.network_gate import NetworkGate
 from cpunet.training.outside import Outside
 from cpunet.training.pairs import Pairs
-from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
@@ -212,22 +211,6 @@ def test_pairs_teach_the_inverse_and_leave_ren_alone(sim, surroundings):
         torch.equal(value, before[name]) for name, value in model.ren.state_dict().items()
     )
     assert bool(model.iren.outlet.weight.any())
-
-
-def test_a_group_learns_pairs_from_the_gradients_of_all(sim, surroundings):
-    asked = []
-
-    class Pair(ProcessGroup):
-        def average_gradients(self, parameters) -> None:
-            asked.append([p.grad is not None for p in parameters])
-
-    torch.manual_seed(0)
-    model = CycleGan(RECIPE, surroundings).train()
-    sampler = EpochSampler(torch.from_numpy(sim.waveforms)[:, None], 8, 0)
-    behind = chain_step(model, surroundings)
-    learn(Pairs(model, sampler, RECIPE, surroundings, behind, Pair()))
-    assert len(asked) == RECIPE.training.pairs.iterations
-    assert all(map(all, asked))
 
 
 def test_nothing_is_added_where_the_pulse_does_not_move(surroundings):

@@ -50,15 +50,3 @@ def test_bf16_has_the_direction_of_the_gradient(tiny, sets):
     assert float((found[0] - expected[0]).norm() / expected[0].norm()) < 0.05
     assert torch.cosine_similarity(found[1], expected[1], dim=0) > 0.95
     assert not torch.equal(found[1], expected[1])
-
-
-@pytest.mark.thorough
-def test_only_the_plain_precision_takes_the_fast_step(tiny):
-    wide = "generator.width=16"
-    for settings, fast in (
-        ([], True),
-        (["training.precision=bf16"], False),
-        (["training.compiled=true"], False),
-    ):
-        recipe = tiny(wide, *settings)
-        assert Step(CycleGan(recipe), recipe.cyclegan.training).fast is fast

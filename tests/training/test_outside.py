@@ -109,7 +109,7 @@ def test_judges_see_noise_if_the_recipe_says_so(noise):
     with torch.no_grad():  # a generator that leaves its input as it is
         model.ren.forward = lambda pulses, **_: pulses
         model.iren.forward = lambda pulses, **_: pulses
-    step = Step(model, recipe.cyclegan.training, outside=outside, fast=False)
+    step = Step(model, recipe.cyclegan.training, outside=outside)
     _, judged, _ = step.generator_losses(windows(), windows(), torch.arange(4))
     rms = float(judged.fake[..., :200].std())
     assert rms == pytest.approx(RMS_KEV / 500, rel=0.1) if outside else rms < 1e-3

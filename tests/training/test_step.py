@@ -247,13 +247,13 @@ def test_judges_see_the_instance_noise_and_it_fades(tiny, batches, monkeypatch):
     step = make_step(recipe)
     seen: list[Tensor] = []
     judge = step.model.discriminator_data
-    read = judge.read
+    forward = judge.forward
 
     def noted(pulses: Tensor) -> Tensor:
         seen.append(pulses.detach())
-        return read(pulses)
+        return forward(pulses)
 
-    monkeypatch.setattr(judge, "read", noted)
+    monkeypatch.setattr(judge, "forward", noted)
     for iteration in range(10):
         seen.clear()
         step(iteration, sim, data)

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import shlex
 import signal
-import sys
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 import typer
 
 from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
 from cpunet.cli.messages import fail, monitor, tell
-from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_inputs
-
-if TYPE_CHECKING:  # torch takes seconds to import
-    from cpunet.training.process_group import Launch
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 Resume = Annotated[
@@ -56,8 +51,6 @@ def train(
     Example: cpunet train --recipe paper --sim sim.lh5 --data raw.lh5 --out run --resume
 
     Example: cpunet train --sim sim.lh5 --data raw.lh5 --data-table all --out runs
-
-    Example: torchrun --nproc-per-node 4 --no-python cpunet train --recipe paper … --out run
     """
     from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.training.train import train_run
@@ -65,24 +58,15 @@ def train(
     from cpunet.jobs.training.training_job import TrainOptions
     from cpunet.kernels import use_threads
     from cpunet.training.loop import StoppedError
-    from cpunet.training.process_group import ToldElsewhereError, launch
 
     refuse_inputs(out_folder, on.recipe)
     if threads is not None:
         use_threads(threads)
     shown = monitor()
-    launched = launch()
-    try:
-        chosen = on.load()
-    except CpunetError:
-        if _follows(launched):  # the process that leads says the same
-            raise typer.Exit(2) from None
-        raise
+    chosen = on.load()
     every = read_as.data_table == ALL
-    if every and launched is not None:
-        raise CpunetError(f"--data-table {ALL}: trains channel by channel; leave out torchrun")
     work = train_channels if every else train_run
-    with _StopRequest(shown, launched) as stop:
+    with _StopRequest(shown) as stop:
         try:
             told = work(
                 read_as.sim(sim),
@@ -95,12 +79,7 @@ def train(
             )
         except StoppedError as stopped:
             fail(str(stopped))
-            raise typer.Exit(stop.status) from None
-        except ToldElsewhereError as elsewhere:
-            stopped_too = isinstance(elsewhere.__cause__, StoppedError)
-            raise typer.Exit(stop.status if stopped_too else 2) from None
-    if _follows(launched):
-        return
+            raise typer.Exit(128 + stop.signal) from None
     if isinstance(told, Outcome):
         tell_channels(told, out_folder, _in_words)
     else:
@@ -115,21 +94,14 @@ def _in_words(info: dict[str, Any]) -> str:
     return f"trained in {info['seconds']:.0f} s on {info['device']}"
 
 
-def _follows(launched: Launch | None) -> bool:
-    return launched is not None and not launched.group.leads
-
-
 class _StopRequest:
     """Ctrl-C and batch systems stop a training between two iterations, with its state stored.
 
-    A second signal, or one before anyone asks whether to stop, acts as it did before.  In a
-    group a second one says nothing new, since batch system and torchrun may both pass on the
-    first, and torchrun itself ends what goes on for too long.
+    A second signal, or one before anyone asks whether to stop, acts as it did before.
     """
 
-    def __init__(self, shown: Monitor, launched: Launch | None) -> None:
+    def __init__(self, shown: Monitor) -> None:
         self.signal = 0
-        self._launched = launched
         self._shown = shown
         self._asked = False
         self._before: dict[int, signal._HANDLER] = {}
@@ -138,11 +110,6 @@ class _StopRequest:
         """Whether to stop."""
         self._asked = True
         return self.signal != 0
-
-    @property
-    def status(self) -> int:
-        """Of the process that stopped; in a group, the signal may have come to another one."""
-        return 128 + (self.signal or signal.SIGTERM)
 
     def __enter__(self) -> Self:
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -154,16 +121,9 @@ class _StopRequest:
             signal.signal(number, handler)
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
+        self.__exit__()
         if not self._asked:
-            if _follows(self._launched):
-                sys.exit(128 + number)  # the process that leads tells
-            self.__exit__()
             signal.raise_signal(number)
-        elif self._launched is None:
-            self.__exit__()
-            self.signal = number
-            self._shown.note("stopping after this iteration; once more to stop at once")
-        elif not self.signal:
-            self.signal = number
-            if not _follows(self._launched):
-                self._shown.note("stopping after this iteration")
+            return
+        self.signal = number
+        self._shown.note("stopping after this iteration; once more to stop at once")

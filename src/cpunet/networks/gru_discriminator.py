@@ -80,15 +80,9 @@ class GruDiscriminator(nn.Module):
 
     def forward(self, pulses: Tensor) -> Tensor:
         """Logits, shape (batch,), of pulses of shape (batch, 1, samples)."""
-        return self.judged(*self.gru(self.read(pulses)))
-
-    def read(self, pulses: Tensor) -> Tensor:
-        """Input of the GRU for pulses, shape (batch, steps, features)."""
         vectors = self.embedding(self._fraction(pulses[:, 0]))  # (batch, samples, dim)
-        return vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)  # type: ignore[no-any-return]
-
-    def judged(self, outputs: Tensor, final: Tensor) -> Tensor:
-        """Logits, shape (batch,), from the GRU's outputs and last states."""
+        steps = vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)
+        outputs, final = self.gru(steps)  # (batch, steps, both), (2, batch, hidden)
         final = torch.cat([final[0], final[1]], dim=1)  # (batch, both)
         # s(t) = softmax[I(t) A F]; the root keeps the softmax from saturating at the start
         query = self.attention(final)[:, :, None]  # (batch, both, 1)

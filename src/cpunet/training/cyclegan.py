@@ -15,17 +15,14 @@ from cpunet.networks.conv_discriminator import ConvDiscriminator
 from cpunet.networks.gru_discriminator import GruDiscriminator
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.time_major import fast_passes_pay
 from cpunet.recipes.network_settings import ConvConfig, GruConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.compared import Compared, Judged
-from cpunet.training.fast_step import fast_translations, logits, plain_translations
 from cpunet.training.generator_pass import generator_pass
 from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
 from cpunet.training.outside import Outside, tolerance
-from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.surroundings import NONE, Surroundings
 
 LOSS_NAMES = (
@@ -91,12 +88,6 @@ class Step:
     ----------
     model, config
         Networks to train, and settings of the training.
-    fast
-        Whether to use the passes of `cpunet.training.fast_step`; None to use them if they are
-        faster.
-    group
-        Process group, each process with its share of every batch; see also
-        `cpunet.training.group_norm`.
     outside
         Noise and preparation of translations before a discriminator sees them; None for none.
     chain
@@ -112,8 +103,6 @@ class Step:
         model: CycleGan,
         config: TrainingConfig,
         *,
-        fast: bool | None = None,
-        group: ProcessGroup = ALONE,
         outside: Outside | None = None,
         chain: ChainStep | None = None,
         warmup: int = 0,
@@ -123,7 +112,6 @@ class Step:
         # of the discriminators, if this iteration updates them
         self.accuracy: dict[str, Tensor] = {}
         self.config, self.warmup = config, warmup
-        self.group = group
         device = next(model.parameters()).device
         self.weights = window_weights(config.losses).to(device)
         self.noise = config.instance_noise
@@ -131,10 +119,6 @@ class Step:
             generator_pass(network, config.precision, compiled=config.compiled)
             for network in (model.ren, model.iren)
         )
-        # fast passes have their own batch norms, which do not support groups
-        plain = config.compiled or config.precision != "float32" or group.size > 1
-        pays = fast_passes_pay(model.ren, device.type) and not plain
-        self.fast = pays if fast is None else fast
 
         def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
             return AdamW(
@@ -186,7 +170,6 @@ class Step:
 
         With noise outside the generators, `rows` are the indices of the simulated pulses.
         Discriminator losses are included only in iterations that update the discriminators.
-        In a group, losses are means over all processes.
         """
         self.noise = self.config.instance_noise * self._rate_factor(iteration)
         losses, *judged = self._update_generators(sim, data, rows)
@@ -194,10 +177,9 @@ class Step:
         if iteration % self.config.discriminator_interval == 0:
             names = ("discriminator_data", "discriminator_sim")
             losses |= self._update_discriminators(dict(zip(names, judged, strict=True)))
-            self.accuracy = self.group.mean(self.accuracy)
         for schedule in self.schedules:
             schedule.step()
-        return self.group.mean({name: loss.detach() for name, loss in losses.items()})
+        return {name: loss.detach() for name, loss in losses.items()}
 
     def generator_losses(
         self, sim: Tensor, data: Tensor, rows: Tensor | None = None
@@ -205,8 +187,8 @@ class Step:
         """Return the six losses of the generators and the pulses for each discriminator."""
         model, weights = self.model, self.weights
         done = self._compared(sim, data, rows)
-        judged_data = logits(model.discriminator_data, self._noisy(done.judged_data.fake))
-        judged_sim = logits(model.discriminator_sim, self._noisy(done.judged_sim.fake))
+        judged_data = model.discriminator_data(self._noisy(done.judged_data.fake))
+        judged_sim = model.discriminator_sim(self._noisy(done.judged_sim.fake))
         losses = {
             "identity_data": weighted_l1(*done.identity_data, weights),
             "identity_sim": weighted_l1(*done.identity_sim, weights),
@@ -219,24 +201,23 @@ class Step:
 
     def _compared(self, sim: Tensor, data: Tensor, rows: Tensor | None) -> Compared:
         """Run the generators, and add noise to translations if it is added outside of them."""
-        model, outside = self.model, self.outside
+        outside = self.outside
         if self.chain is not None and outside is not None and rows is not None:
             return self.chain(sim, data, rows, outside)
-        if self.fast:
-            done = fast_translations(model.ren, model.iren, sim, data)
-        else:
-            done = plain_translations(self.ren, self.iren, sim, data)
-        fake_data, noise = done.fake_data, None
+        fake_data, fake_sim = self.ren(sim), self.iren(data)
+        same_data, same_sim = self.ren(data), self.iren(sim)
+        cycled_sim, cycled_data = self.iren(fake_data), self.ren(fake_sim)
+        noise = None
         if outside is not None and rows is not None:
-            fake_data = outside.dress_windows(done.fake_data, rows)
+            fake_data = outside.dress_windows(fake_data, rows)
             noise = tolerance(data, outside.preparation)
         return Compared(
-            (done.same_data, data),
-            (done.same_sim, sim),
-            (done.cycled_sim, sim),
-            (done.cycled_data, data),
+            (same_data, data),
+            (same_sim, sim),
+            (cycled_sim, sim),
+            (cycled_data, data),
             Judged(data, fake_data),
-            Judged(sim, done.fake_sim),
+            Judged(sim, fake_sim),
             noise,
         )
 
@@ -260,7 +241,6 @@ class Step:
         losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
-        self.group.average_gradients(model.generator_parameters())
         clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
         self.generators.step()
         for network in discriminators:
@@ -280,9 +260,9 @@ class Step:
         weight = self.config.losses.gradient_penalty
         # in one batch: the batch norm must see both kinds together
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
-        # neither cuDNN's GRU nor the compiled one has a second derivative
+        # cuDNN's GRU has no second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
-            found = network(pulses) if weight else logits(network, pulses)
+            found = network(pulses)
         loss = real_loss(found[: len(real)]) + fake_loss(found[len(real) :])
         right = torch.cat([found[: len(real)] > 0, found[len(real) :] < 0])
         accuracy = right.float().mean()
@@ -300,7 +280,6 @@ class Step:
             )
             optimiser.zero_grad(set_to_none=True)
             (loss + penalty).backward()  # type: ignore[no-untyped-call]
-            self.group.average_gradients(network.parameters())
             clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
             optimiser.step()
             losses[name] = loss

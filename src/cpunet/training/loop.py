@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -18,9 +17,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
-from cpunet.training.group_norm import share_norms
 from cpunet.training.pairs import Pairs
-from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.start import match_skips
 from cpunet.training.statistics import refresh_batch_statistics
@@ -48,10 +45,9 @@ class CheckpointHooks:
         before a stop, always after the listener has received all earlier records; on the way
         through `pairs` as well.  The tensors change again once it returns.
     start
-        State to continue from; the same in all processes of a group.
+        State to continue from.
     stop
-        Called after each iteration; True to stop there.  A group stops if it is True in any
-        process.
+        Called after each iteration; True to stop there.
     paired
         Called with the number of iterations on pairs since the last call.
     """
@@ -76,13 +72,11 @@ def train(
     surroundings: Surroundings = NONE,
     listener: Listener | None = None,
     hooks: CheckpointHooks = NOTHING_KEPT,
-    group: ProcessGroup = ALONE,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
     The same seed on the same computer results in the same weights, whether or not the training
-    was interrupted and resumed.  All processes of a group train on the same sets and end with
-    the same weights: those of a single process, up to rounding and the noise drawn.
+    was interrupted and resumed.
 
     Parameters
     ----------
@@ -104,13 +98,11 @@ def train(
         and ``"accuracy"`` of the discriminators where they were updated.
     hooks
         Hooks to save and resume the training, and to stop it.
-    group
-        Process group; `listener` and ``hooks.save`` are called in the leading process only.
 
     Raises
     ------
     CpunetError
-        If a set is empty, a group cannot share the batches, or a loss becomes NaN or infinite.
+        If a set is empty, or a loss becomes NaN or infinite.
     StoppedError
         If `hooks` asked to stop.
     """
@@ -124,34 +116,26 @@ def train(
         if surroundings.chain is not None:
             behind = ChainStep(*surroundings.chain, model.ren, model.iren, recipe)
         samplers = [
-            EpochSampler(
-                torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side, group
-            )
+            EpochSampler(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side)
             for side, pulses in zip(_sampler_seeds(seed), (sim, data), strict=True)
         ]
-        share_norms(model, group)
         if hooks.start is None:
             _begin(model, samplers, recipe, behind, init)
-        group.follow(model.state_dict().values())
         step = Step(
             model,
             config,
-            group=group,
             outside=surroundings.outside,
             chain=behind,
             warmup=0 if init is None and surroundings.teacher is None else config.warmup,
         )
-        pairs = Pairs(model, samplers[0], recipe, surroundings, behind, group)
+        pairs = Pairs(model, samplers[0], recipe, surroundings, behind)
         training = _Training(step, samplers, device, pairs)
         if hooks.start is not None:
-            training.load_state_dict(hooks.start, seed)
+            training.load_state_dict(hooks.start)
         try:
             if training.iteration == 0:
                 _learn_pairs(training, hooks)
-                group.follow(model.state_dict().values())
-                if group.size > 1:
-                    _reseed(seed, group.rank, 0)
-            _iterate(training, listener if group.leads else None, hooks)
+            _iterate(training, listener, hooks)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
@@ -190,7 +174,7 @@ class _Training:
         self, step: Step, samplers: list[EpochSampler], device: str, pairs: Pairs
     ) -> None:
         self.step, self.samplers, self.pairs = step, samplers, pairs
-        self.model, self.config, self.group = step.model, step.config, step.group
+        self.model, self.config = step.model, step.config
         self.device = torch.device(device)
         model, config = self.model, self.config
         average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
@@ -216,14 +200,9 @@ class _Training:
 
     def state_dict(self) -> State:
         """Return all that the next iterations depend on, except pulses and settings."""
-        own = {"cpu": torch.get_rng_state()}
+        random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
-            own["cuda"] = torch.cuda.get_rng_state(self.device)
-        of_all = {where: self.group.gathered(state) for where, state in own.items()}
-        random = [
-            {where: states[rank] for where, states in of_all.items()}
-            for rank in range(self.group.size)
-        ]
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
         pairs = {} if self.iteration else {"pairs": self.pairs.state_dict()}
         return pairs | {
             "iteration": self.iteration,
@@ -234,8 +213,8 @@ class _Training:
             "random": random,
         }
 
-    def load_state_dict(self, state: State, seed: int) -> None:
-        """Restore the state of a training with the same pulses, settings and seed."""
+    def load_state_dict(self, state: State) -> None:
+        """Restore the state of a training with the same pulses and settings."""
         self.iteration = state["iteration"]
         if "pairs" in state:
             self.pairs.load_state_dict(state["pairs"])
@@ -248,13 +227,9 @@ class _Training:
         for sampler, own in zip(self.samplers, state["decks"], strict=True):
             sampler.load_state_dict(own)
         random = state["random"]
-        rank = self.group.rank
-        if rank >= len(random):  # the group is larger than before
-            _reseed(seed, rank, self.iteration)
-            return
-        torch.set_rng_state(random[rank]["cpu"])
-        if self.device.type == "cuda" and "cuda" in random[rank]:
-            torch.cuda.set_rng_state(random[rank]["cuda"], self.device)
+        torch.set_rng_state(random["cpu"])
+        if self.device.type == "cuda" and "cuda" in random:
+            torch.cuda.set_rng_state(random["cuda"], self.device)
 
 
 def _learn_pairs(training: _Training, hooks: CheckpointHooks) -> None:
@@ -263,7 +238,7 @@ def _learn_pairs(training: _Training, hooks: CheckpointHooks) -> None:
     while pairs.left:
         pairs.advance()
         hooks.paired(1)
-        stop = training.group.any(hooks.stop())
+        stop = hooks.stop()
         if stop or pairs.iteration % interval == 0:
             _save(training, hooks)
         if stop:
@@ -276,9 +251,7 @@ def _learn_pairs(training: _Training, hooks: CheckpointHooks) -> None:
 
 def _save(training: _Training, hooks: CheckpointHooks) -> None:
     _require_finite_weights(training)
-    state = training.state_dict()
-    if training.group.leads:
-        hooks.save(state)
+    hooks.save(training.state_dict())
 
 
 def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHooks) -> None:
@@ -288,7 +261,7 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
         pending.append(training.advance())
         done = training.iteration
         last = done == config.iterations
-        stop = training.group.any(hooks.stop()) and not last
+        stop = hooks.stop() and not last
         keep = last or stop or done % config.checkpoint_interval == 0
         # several iterations are fetched at once: each transfer makes a GPU wait
         if keep or len(pending) == config.log_interval:
@@ -340,12 +313,6 @@ def _require_finite_weights(training: _Training) -> None:
 def _sampler_seeds(seed: int) -> Iterator[int]:
     # far apart, so that neighbouring seeds share no sampler
     yield from (2 * seed + 1_000_003, 2 * seed + 2_000_004)
-
-
-def _reseed(seed: int, rank: int, iteration: int) -> None:
-    """Seed each process of a group differently, so that each draws its own noise."""
-    (mixed,) = np.random.SeedSequence([seed, rank, iteration]).generate_state(1, np.uint64)
-    torch.manual_seed(int(mixed))
 
 
 @contextmanager

@@ -21,7 +21,6 @@ from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, load_optimiser
 from cpunet.training.losses import weighted_l1, window_weights
 from cpunet.training.outside import Outside, as_measured, of_height
-from cpunet.training.process_group import ALONE, ProcessGroup
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import Surroundings
 
@@ -41,8 +40,6 @@ class Pairs:
         Noise, and a teacher if there is one.
     behind
         Passes with a chain, if there is one.
-    group
-        Process group, each process with its share of the pairs.
     """
 
     def __init__(
@@ -52,10 +49,9 @@ class Pairs:
         recipe: Recipe,
         surroundings: Surroundings,
         behind: ChainStep | None,
-        group: ProcessGroup = ALONE,
     ) -> None:
         config = recipe.cyclegan.training
-        self.model, self.sampler, self.group = model, sampler, group
+        self.model, self.sampler = model, sampler
         self.surroundings, self.behind = surroundings, behind
         self.max_grad_norm = config.max_grad_norm
         self.count = number_of_pairs(recipe, surroundings)
@@ -80,14 +76,13 @@ class Pairs:
             If the loss is not finite.
         """
         loss = self._loss()
-        if self.group.any(not bool(torch.isfinite(loss))):
+        if not bool(torch.isfinite(loss)):
             raise CpunetError(
                 f"pairs: a loss is not finite in iteration {self.iteration}; lower "
                 "training.pairs.rate"
             )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        self.group.average_gradients(self.learning)
         torch.nn.utils.clip_grad_norm_(self.learning, self.max_grad_norm)
         self.optimiser.step()
         self.schedule.step()

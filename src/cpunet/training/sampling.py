@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cpunet.training.process_group import ALONE, ProcessGroup
-
 
 class EpochSampler:
     """Batches of a set of pulses without replacement, reshuffled when too few are left.
@@ -23,26 +21,15 @@ class EpochSampler:
         Pulses per batch; smaller sets are drawn with replacement.
     seed
         Seed of the order.
-    group
-        Process group: all draw the same batches, and each process takes its share.
-
-    Raises
-    ------
-    CpunetError
-        If a batch cannot be shared equally.
     """
 
-    def __init__(
-        self, pulses: Tensor, batch_size: int, seed: int, group: ProcessGroup = ALONE
-    ) -> None:
+    def __init__(self, pulses: Tensor, batch_size: int, seed: int) -> None:
         self.pulses = pulses
         self.batch_size = batch_size
-        share = group.share_of(batch_size)
-        self._own = slice(group.rank * share, (group.rank + 1) * share)
         self._random = torch.Generator().manual_seed(seed)
         self._order = torch.empty(0, dtype=torch.long)
         self.last_rows = torch.empty(0, dtype=torch.long)
-        """Rows of the pulses of the last share."""
+        """Rows of the pulses of the last batch."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the rows still to be drawn and the state of the random numbers."""
@@ -54,7 +41,7 @@ class EpochSampler:
         self._random.set_state(state["random"])
 
     def next_batch(self) -> Tensor:
-        """Return this process's share of the next batch, shape (share, 1, samples)."""
+        """Return the next batch, shape (batch, 1, samples)."""
         n = len(self.pulses)
         if n < self.batch_size:
             chosen = torch.randint(n, (self.batch_size,), generator=self._random)
@@ -63,5 +50,5 @@ class EpochSampler:
                 self._order = torch.randperm(n, generator=self._random)
             chosen = self._order[: self.batch_size]
             self._order = self._order[self.batch_size :]
-        self.last_rows = chosen[self._own]
+        self.last_rows = chosen
         return self.pulses[self.last_rows.to(self.pulses.device)]

@@ -35,7 +35,7 @@ def refresh_batch_statistics(
     network
         A generator; its mode (training or evaluation) is left as it was.
     sampler
-        Sampler of the side that it translates, with the process group of the batch norms.
+        Sampler of the side that it translates.
     batches
         How many batches to average over.
     run

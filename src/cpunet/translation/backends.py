@@ -20,7 +20,6 @@ from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.networks.time_major import FrozenUNet, fast_passes_pay
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -100,9 +99,7 @@ class NetworkBackend(Backend):
     """A network that maps windows to windows; its noise is the latent noise."""
 
     def __init__(self, network: PositionalUNet) -> None:
-        self.network = self._unet = network.eval()
-        # created on first use: an importer or exporter may still change or move the network
-        self._frozen: FrozenUNet | None = None
+        self.network = network.eval()
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network; its output is a prepared window already."""
@@ -112,19 +109,9 @@ class NetworkBackend(Backend):
                 "leave out remains_kev and second"
             )
         batch = torch.from_numpy(windows).to(self.device)
-        out = self._translate(batch[:, None], drawn.generator, mean=not drawn.noise)
+        out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
         result: FloatArray = out[:, 0].cpu().numpy()
         return result, np.zeros(len(windows), np.uint8)
-
-    def _translate(
-        self, batch: torch.Tensor, generator: torch.Generator | None, mean: bool
-    ) -> torch.Tensor:
-        if not fast_passes_pay(self._unet, self.device.type):
-            out: torch.Tensor = self._unet(batch, generator=generator, mean=mean)
-            return out
-        if self._frozen is None:
-            self._frozen = FrozenUNet(self._unet)
-        return self._frozen.translate(batch, generator=generator, mean=mean)
 
 
 class NoisyNetworkBackend(NetworkBackend):

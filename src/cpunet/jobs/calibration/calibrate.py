@@ -46,7 +46,6 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.process_group import ProcessGroup
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run_folder import RUN, write_run
 
@@ -156,9 +155,7 @@ class Calibration:
                 InputFile(folder / SIM), self.recipe, sides.selection, monitor
             )
             how = TrainOptions(self.peak, self.seed, "cpu")
-            job = TrainingJob(
-                self.recipe, how, ProcessGroup(), again, sides.data, self.data, folder, monitor
-            )
+            job = TrainingJob(self.recipe, how, again, sides.data, self.data, folder, monitor)
             trainer = ResponseTrainer(self.recipe)
             model, info, recipe = trainer.train(job, known=calibrated.response)
             info["sim"]["file"] = str(out / SIM)

@@ -1,4 +1,4 @@
-"""Training of a CycleGAN: resumable, also by several processes started by torchrun."""
+"""Training of a CycleGAN: resumable."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ from typing import Any, Self
 import torch
 from torch import nn
 
-from cpunet.errors import CpunetError
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.network_start import NetworkStart, network_start
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.recipes.schema import Recipe
-from cpunet.training.group_state import require_same_everywhere, share_state
 from cpunet.training.held_out import Kept
 from cpunet.training.judges import judges_noted
 from cpunet.training.loop import CheckpointHooks, Listener, Record, State, train
 from cpunet.training.network_gate import NetworkGate
 from cpunet.training.pairs import number_of_pairs
-from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import read_losses, weights_sha256
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
@@ -38,15 +35,6 @@ class CycleGanTrainer:
         self.config = recipe.cyclegan.training
         self.steps = self.config.iterations
 
-    def require_shareable(self, group: ProcessGroup) -> None:
-        """Raise an error if processes cannot share the batches, or the recipe has a chain."""
-        if self.recipe.chain is not None:
-            raise CpunetError(
-                f"recipe {self.recipe.name}: takes minutes in one process, its chain being "
-                "matched first; start it without torchrun"
-            )
-        group.share_of(self.config.batch_size)
-
     def workplace(
         self,
         out: Path,
@@ -57,18 +45,12 @@ class CycleGanTrainer:
         resume, force = options.resume, options.force
         return unfinished_folder(out, *read, resume=resume, force=force)
 
-    def train(self, job: TrainingJob) -> Trained | None:
-        """Train or resume; return None in processes other than the leader."""
-        fingerprint = _fingerprint(job)
-        require_same_everywhere(job.group, fingerprint)
-        if not job.group.leads:
-            state = share_state(job.group, None)
-            hooks = CheckpointHooks(lambda _state: None, state, job.stop)
-            self._trained(job, self._start(job), hooks, None)
-            return None
-        run = UnfinishedRun(job.folder, fingerprint, _environment(job), job.monitor.note)
-        state = share_state(job.group, run.begin(resume=job.options.resume))
-        start = self._start(job)
+    def train(self, job: TrainingJob) -> Trained:
+        """Train or resume."""
+        run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job), job.monitor.note)
+        state = run.begin(resume=job.options.resume)
+        how = job.options
+        start = network_start(job.sides, self.recipe, how.seed, how.init, job.monitor)
         with _Stages(job.monitor, start, self.steps, state) as stages:
 
             def listen(records: list[Record]) -> None:
@@ -90,17 +72,12 @@ class CycleGanTrainer:
             info["network"] = asdict(kept)
         return Trained(model, info, start.recipe)
 
-    def _start(self, job: TrainingJob) -> NetworkStart:
-        return network_start(
-            job.sides, self.recipe, job.options.seed, job.options.init, job.monitor
-        )
-
     def _trained(
         self,
         job: TrainingJob,
         start: NetworkStart,
         hooks: CheckpointHooks,
-        listener: Listener | None,
+        listener: Listener,
     ) -> tuple[nn.Module, Kept | None]:
         """Train; with a chain, also check whether the network improves held-out pulses."""
         sim, data = job.sim.prepared.pulses, job.data.prepared.pulses
@@ -119,7 +96,6 @@ class CycleGanTrainer:
             surroundings=surroundings,
             listener=listener,
             hooks=hooks,
-            group=job.group,
         )
         if gate is None or surroundings.chain is None:
             return model, None
@@ -179,7 +155,6 @@ def _environment(job: TrainingJob) -> dict[str, Any]:
     """Environment that affects the last bits of the weights."""
     return {
         "device": job.options.device,
-        "processes": job.group.size,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }

@@ -15,7 +15,6 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
-from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import RUN, append_losses
 
 
@@ -24,14 +23,6 @@ class ResponseTrainer:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
-
-    def require_shareable(self, group: ProcessGroup) -> None:
-        """Raise an error, since a fit runs in one process."""
-        del group
-        raise CpunetError(
-            f"recipe {self.recipe.name}: takes a minute in one process; "
-            "start it without torchrun"
-        )
 
     def workplace(
         self,

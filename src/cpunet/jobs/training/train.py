@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
     InputFile,
     InputSet,
@@ -23,7 +23,6 @@ from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.launched_group import group_for
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.pulses.peaks import EnergySelection, parse_selection
@@ -46,8 +45,6 @@ def train_run(
 ) -> dict[str, Any]:
     """Train REN and IREN on the pulses of a peak and write the run folder.
 
-    Processes that torchrun started train one CycleGAN together; the one of rank 0 writes.
-
     Parameters
     ----------
     sim, data
@@ -63,35 +60,28 @@ def train_run(
     Returns
     -------
     dict
-        Content of ``run.json``; empty in a process that did not write it.
+        Content of ``run.json``.
 
     Raises
     ------
     CpunetError
         If the input cannot be used, the folder exists, there is an unfinished training of
-        another kind, the training diverges or another process fails.
+        another kind, or the training diverges.
     StoppedError
         If `stop` returned true.
     """
     keep_freed_memory()
     trainer = trainer_for(recipe)
-    with group_for(trainer, options.device) as (group, device):
-        selection = parse_selection(options.peak, recipe.peaks)
-        told = monitor if group.leads else QUIET
-        read = (*sim.files, *data.files, options.init)
-        place: AbstractContextManager[Path] = nullcontext(out)
-        if group.leads:  # the others do not write
-            place = trainer.workplace(out, read, options)
-        with place as folder:
-            sim_set, data_set = _read(sim, data, recipe, selection, told)
-            if options.init is not None:
-                _require_sampling(options.init, data_set)
-            how = replace(options, device=device)
-            job = TrainingJob(recipe, how, group, sim_set, data_set, data, folder, told, stop)
-            done = trainer.train(job)
-            if done is None:
-                return {}
-            return write_run(folder, done.model, done.recipe, done.info)
+    options = replace(options, device=resolve_device(options.device))
+    selection = parse_selection(options.peak, recipe.peaks)
+    read = (*sim.files, *data.files, options.init)
+    with trainer.workplace(out, read, options) as folder:
+        sim_set, data_set = _read(sim, data, recipe, selection, monitor)
+        if options.init is not None:
+            _require_sampling(options.init, data_set)
+        job = TrainingJob(recipe, options, sim_set, data_set, data, folder, monitor, stop)
+        done = trainer.train(job)
+        return write_run(folder, done.model, done.recipe, done.info)
 
 
 def _read(

@@ -12,14 +12,10 @@ from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training.process_group import ProcessGroup
 
 
 class Trainer(Protocol):
     """A training method for a recipe."""
-
-    def require_shareable(self, group: ProcessGroup) -> None:
-        """Raise a `CpunetError` if several processes cannot train the recipe together."""
 
     def workplace(
         self,
@@ -29,8 +25,8 @@ class Trainer(Protocol):
     ) -> AbstractContextManager[Path]:
         """Context of the folder to write to; see `cpunet.jobs.training.train.train_run`."""
 
-    def train(self, job: TrainingJob) -> Trained | None:
-        """Train or resume; return None in a process that does not write."""
+    def train(self, job: TrainingJob) -> Trained:
+        """Train or resume."""
 
 
 def trainer_for(recipe: Recipe) -> Trainer:

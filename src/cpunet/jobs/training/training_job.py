@@ -15,7 +15,6 @@ from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
-from cpunet.training.process_group import ProcessGroup
 from cpunet.training.run_folder import versions
 
 
@@ -48,7 +47,7 @@ class TrainOptions:
     seed
         Seed of all random numbers.
     device
-        ``"cpu"``, ``"cuda"`` (one GPU per process), or ``"auto"`` for a GPU if there is one.
+        ``"cpu"``, ``"cuda"``, or ``"auto"`` for a GPU if there is one.
     init
         Folder of a run to start from, e.g. of another detector or period: of the same kind, or
         a fitted chain, whose pulse pairs the networks learn first.
@@ -74,8 +73,6 @@ class TrainingJob:
     ----------
     options
         Options with a resolved device.
-    group
-        Processes that train together.
     sim, data, data_file
         Prepared pulses of both sides, and the file of the measured ones.
     folder
@@ -86,7 +83,6 @@ class TrainingJob:
 
     recipe: Recipe
     options: TrainOptions
-    group: ProcessGroup
     sim: InputSet
     data: InputSet
     data_file: InputFile
@@ -110,7 +106,6 @@ class TrainingJob:
             "seed": how.seed,
             "init": None if how.init is None else str(how.init),
             "device": how.device,
-            "processes": self.group.size,
             "threads": torch.get_num_threads(),
             "started": started,
             "seconds": round(seconds, 1),
