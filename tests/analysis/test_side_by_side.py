@@ -153,9 +153,7 @@ def test_scores_scatter_over_runs_of_one_recipe():
         "0.600 ± 0.00 (0.600 – 0.600)",
         "+1.00 ± 0.00 (+1.00 – +1.00)",
     ]
-    assert "<td>81.0\u00a0±\u00a02.1 (80.0 – 84.0)</td>" in side_by_side_page(
-        side_by_side(runs)
-    )
+    assert "<td>81.0\u00a0±\u00a02.1 (80.0 – 84.0)</td>" in page_of(runs)
     apart = {"0": seed(80.0), "1": seed(80.0, peak="SEP")}
     assert side_by_side(apart).over_runs is None
 

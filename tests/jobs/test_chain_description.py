@@ -324,9 +324,9 @@ def test_the_truth_of_a_stand(run, tmp_path):
     content = {"electronics": electronics().model_dump(mode="json")}
     (stand / "stand.json").write_text(json.dumps(content))
     assert stand_electronics(stand) == electronics()
-    for text in ("", "[]", "{}", '{"electronics": {"name": "x"}}', '{"electronics": 1'):
+    for text, fault in (("", "damaged"), ("{}", "holds no electronics")):
         (stand / "stand.json").write_text(text)
-        one_line(lambda: stand_electronics(stand), "stand.json: holds no electronics")
+        one_line(lambda: stand_electronics(stand), f"stand.json: {fault}")
     (stand / "stand.json").unlink()
     one_line(lambda: stand_electronics(stand), f"{stand}: no test stand")
 

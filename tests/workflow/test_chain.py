@@ -175,8 +175,8 @@ def dsp_script() -> Any:
 
 
 DEFECTS = {
-    "no file": ("none.yaml", None, "none.yaml: cannot be read"),
-    "no YAML": ("bad.yaml", "a: [", "bad.yaml: cannot be read"),
+    "no file": ("none.yaml", None, "none.yaml: no such file"),
+    "no YAML": ("bad.yaml", "a: [", "bad.yaml: not YAML"),
     "no chain": ("bad.yaml", "outputs: [a]", "bad.yaml: no chain of dspeed; give outputs and"),
     "no decay": ("good.yaml", "outputs: []\nprocessors: {}", "or give events.tau_us"),
 }
