@@ -74,6 +74,7 @@ def test_a_changed_callee_or_constant_gives_a_new_folder_and_result(home: Path) 
     assert len(list((home.parents[1] / "code").iterdir())) == 3
 
 
+@pytest.mark.thorough
 def test_a_read_only_installation_uses_the_cache_of_the_user(home: Path) -> None:
     home.chmod(0o555)
     user = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(home.parents[1] / "user")}
@@ -121,6 +122,7 @@ def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() 
     assert not kernels.kernel(total).targetoptions.get("forceinline")
 
 
+@pytest.mark.thorough
 def test_threads_can_be_lowered_and_raised_again(home: Path) -> None:
     program = (
         "import numba, torch\nfrom cpunet.kernels import use_threads\n"
@@ -131,6 +133,7 @@ def test_threads_can_be_lowered_and_raised_again(home: Path) -> None:
     assert words(begin(home, program, NUMBA_NUM_THREADS="4")) == [*"113349"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("first", ["import torch; torch.get_num_threads()", ""])
 def test_a_parallel_loop_leaves_torch_its_threads(home: Path, first: str) -> None:
     program = (

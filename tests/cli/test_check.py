@@ -201,6 +201,7 @@ class SeenError(Exception):
     """In place of a minute of scores."""
 
 
+@pytest.mark.thorough
 def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch):
     """What was said of a file in training holds for the same file in validation."""
     info = json.loads((trained / "run.json").read_text())

@@ -189,6 +189,7 @@ def die_at(moment: str, iteration: int) -> None:
     UnfinishedRun.finish, Path.replace = watched_finish, watched_replace
 
 
+@pytest.mark.thorough
 def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]

@@ -177,6 +177,7 @@ def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: st
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_a_bench_detector_follows_the_law(reference_data: Path):
     source = open_pulses(reference_data / "real" / "th228.fcio", kev_per_adc=2614.5 / 40265)
     found = Remains.of_traces(source.blocks(1000), PREPARATION)

@@ -39,7 +39,7 @@ def test_energies_follow_their_quantiles():
     assert np.quantile(drawn, np.linspace(0, 1, 11)) == pytest.approx(TH228, rel=0.05)
 
 
-@pytest.mark.parametrize("error_kev", [0.3, 3.0])
+@pytest.mark.parametrize("error_kev", [pytest.param(0.3, marks=pytest.mark.thorough), 3.0])
 def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
     law, rng = RemainsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
     energies = energies_at(rng.random(8000), TH228)

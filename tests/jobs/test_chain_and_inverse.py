@@ -294,6 +294,7 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
 
 
+@pytest.mark.thorough
 def test_too_few_pulses_for_a_residual_leave_the_chain(files: Files, tmp_path: Path) -> None:
     few = written(tmp_path / "data.lh5", digitised(230, seed=2))
     recipe = load_recipe("best", [*ONE_START, *SHORT, "training.drift_terms=0"])

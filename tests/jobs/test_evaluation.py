@@ -96,6 +96,7 @@ def test_peaks_sidebands_and_continua_are_loaded() -> None:
     assert chosen.tolist() == [True, False, True, True, False]
 
 
+@pytest.mark.thorough
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     few = evaluate(
         run,
@@ -199,6 +200,7 @@ def found(run, files, tmp_path_factory):
     )
 
 
+@pytest.mark.thorough
 def test_numbers_without_noise_are_those_of_the_windows(found):
     peak = max(found.sets, key=lambda peak: len(peak.sim_rows))
     every = np.arange(len(peak.sim_rows))

@@ -160,6 +160,7 @@ def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
     assert REN.load(tmp_path / "free").backend.chain.response.drift is not None
 
 
+@pytest.mark.thorough
 def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None:
     # a training whose rates are next to nothing stays where it began
     train_run(
@@ -172,6 +173,7 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
         assert np.allclose(before[name], after[name], atol=1e-6), name
 
 
+@pytest.mark.thorough
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
     with pytest.raises(CpunetError, match="from which no readout chain can start"):
         train_run(files["sim"], files["one"], tmp_path / "a", FAST, TrainOptions(init=network))
@@ -192,6 +194,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
     assert not any((tmp_path / name).exists() for name in "abcd")
 
 
+@pytest.mark.thorough
 def test_pairs_are_a_stage_of_their_own(files, chain, tmp_path) -> None:
     monitor = Listening()
     options = TrainOptions(init=chain, device="cpu")

@@ -159,6 +159,7 @@ def test_one_table_under_two_names_is_one(file, raw):
     assert open_pulses(file).n_pulses == N
 
 
+@pytest.mark.thorough
 def test_encoded_waveforms_are_decoded(file, raw):
     table = waveform_table(raw)
     table.values.attrs["compression"] = ULEB128ZigZagDiff()

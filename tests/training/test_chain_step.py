@@ -31,6 +31,8 @@ from cpunet.training.surroundings import MatchedChain, Surroundings
 from cpunet.translation.translator import IREN, REN
 from synthetic import SMALL_NETWORK
 
+pytestmark = pytest.mark.thorough
+
 DT_NS, KEV, N = 16.0, 2614.5, 240
 RECIPE = load_recipe(
     "small",

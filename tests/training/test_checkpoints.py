@@ -369,6 +369,7 @@ def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole):
     assert content(out) == whole
 
 
+@pytest.mark.thorough
 def test_after_a_full_disk_the_checkpoint_before_it_is_used(sets, recipe, tmp_path, whole):
     out = tmp_path / "run"
     with pytest.raises(Interrupted):

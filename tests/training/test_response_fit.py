@@ -257,6 +257,7 @@ def faster(fine: Pulses, factor: float) -> Pulses:
 DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringing_mhz=[]")
 
 
+@pytest.mark.thorough
 def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     """The readout is then the true one, and not what makes up for the drift."""
     short = simulated(faster(charge(N, seed=1), 1.25))
@@ -288,6 +289,7 @@ def test_a_drift_of_another_detector_is_not_stretched(problem: Problem, monkeypa
     assert fit.poor
 
 
+@pytest.mark.thorough
 def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> None:
     response, fit = problem.fit(0, "training.drift_terms=2")
     assert response.drift is None

@@ -193,16 +193,12 @@ def test_damaged_info(run, text, message):
 
 # What is wrong with run.json: key and value
 WRONG_FACTS = [
-    *(("dt_ns", v) for v in (None, "16", [16], {}, True, 0, -16, 10**50, 1e10)),
-    *(("peak", v) for v in (None, 3, ["FEP"])),
-    *(("recipe", v) for v in (None, {"name": "fast"})),
-    *(("seed", v) for v in ("0", -1, 1.5, [0])),
-    *(("seconds", v) for v in ("9", -1, [1])),
-    *(("device", v) for v in (None, 0)),
-    *(("data", v) for v in (3, "x", [1], {"cuts": 3}, {"cuts": {"amplitude": 1}})),
-    *(("sim", v) for v in (3, {"file": 3}, {"used": [3]})),
-    *(("fit", v) for v in (3, {"errors": [1]}, {"covariance": [["a"]]})),
-    *(("format", v) for v in ("1", -1)),
+    *(("dt_ns", v) for v in (None, "16", -16)),
+    *(("peak", v) for v in (None, 3)),
+    ("seed", -1),
+    ("data", {"cuts": 3}),
+    ("fit", {"errors": [1]}),
+    ("format", "1"),
 ]
 
 

@@ -71,6 +71,7 @@ def test_pulses_are_dealt_equally_often():
     assert max(abs(c - 6000 / 7) for c in counts.values()) < 4 * np.sqrt(6000 / 7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("n_sim", "n_data"), [(5, 7), (7, 5), (6, 6)])
 def test_in_a_training_every_pulse_meets_every_other(monkeypatch, tiny, n_sim, n_data):
     pairs: Counter[tuple[int, int]] = Counter()

@@ -26,6 +26,7 @@ def make_step(recipe) -> Step:
     return Step(CycleGan(recipe).train(), recipe.cyclegan.training)
 
 
+@pytest.mark.thorough
 def test_rates_rise_from_zero_where_the_start_is_near(tiny, batches):
     recipe = tiny(
         "generator.width=4", "training.iterations=8", "training.decay_start=4",
@@ -219,6 +220,7 @@ def test_the_total_is_the_papers_weighted_sum(tiny):
     assert float(step.total(values)) == 5 * (1 + 10) + 20 * (100 + 1000) + 9 * (1e4 + 1e5)
 
 
+@pytest.mark.thorough
 def test_the_gradient_penalty_by_finite_differences(tiny, batches):
     sim, data = (b.double() for b in batches)
     step = make_step(tiny("training.losses.gradient_penalty=0.7"))
