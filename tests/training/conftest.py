@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from synthetic import same_random_numbers as same_random_numbers
@@ -49,3 +50,21 @@ def tiny() -> Callable[..., Recipe]:
 def sets() -> tuple[FloatArray, FloatArray]:
     """Eleven simulated and nine measured pulses of 64 samples."""
     return small_sides()
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> list[Prepared]:
+    """Hold the alignment of the first preparation in all others.
+
+    It is a whole number of samples, whose derivative is 0.  A finite difference across one of
+    its steps would see the step.
+    """
+    first: list[Prepared] = []
+
+    def once(*args) -> Prepared:
+        if not first:
+            first.append(prepare(*args))
+        return first[0]
+
+    monkeypatch.setattr("cpunet.training.outside.prepare", once)
+    return first

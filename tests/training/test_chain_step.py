@@ -29,6 +29,7 @@ from cpunet.training.run_folder import write_run
 from cpunet.training.sampling import EpochSampler
 from cpunet.training.surroundings import MatchedChain, Surroundings
 from cpunet.translation.translator import IREN, REN
+from derivatives import Values, slopes
 from synthetic import SMALL_NETWORK
 
 pytestmark = pytest.mark.thorough
@@ -229,6 +230,28 @@ def test_nothing_is_added_where_the_pulse_does_not_move(surroundings):
     moves = torch.diff(record[0], prepend=torch.zeros(1)) != 0
     assert bool(change[moves].any())
     assert not bool(change[~moves].any())
+
+
+def test_gradients_of_the_losses_are_finite_differences(sim, data, surroundings, held):
+    surroundings = copy.deepcopy(surroundings)
+    model = CycleGan(RECIPE, surroundings)
+    torch.manual_seed(0)
+    torch.nn.init.normal_(model.ren.outlet.weight, std=10.0)
+    torch.nn.init.normal_(model.iren.outlet.weight, std=0.01)
+    model.double().eval()
+    chain = chain_step(model, surroundings)
+    step = Step(model, RECIPE.cyclegan.training, outside=surroundings.outside, chain=chain)
+    waveforms, measured, rows = batches(sim, data)
+
+    def losses() -> Values:
+        return step.generator_losses(waveforms.double(), measured.double(), rows)[0]
+
+    for network in (model.ren, model.iren):
+        parameter = network.outlet.weight
+        along = torch.ones_like(parameter)
+        found, wanted = slopes(losses, parameter, along, 1e-6)
+        for name, value in found.items():
+            assert value == pytest.approx(wanted[name], rel=1e-2, abs=1e-7), name
 
 
 def moving(surroundings: Surroundings) -> CycleGan:

@@ -10,16 +10,24 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.extension import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Step
+from cpunet.training.half_maximum_alignment import crossing
 from cpunet.training.losses import weighted_l1, window_weights
-from cpunet.training.outside import Outside, as_measured, tolerance
+from cpunet.training.outside import Outside, as_measured, in_room, tolerance
 from cpunet.training.surroundings import Surroundings
+from derivatives import Values, slopes
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, RMS_KEV = 16.0, 4.0
 KEV = np.array([500.0, 1000.0, 2000.0, 4000.0])
+TINY = (
+    "discriminator.embedding_rows=20",
+    "discriminator.embedding_dim=4",
+    "discriminator.hidden=4",
+    "discriminator.samples_per_step=16",
+)
 
 
 def white(rms_kev: float = RMS_KEV) -> BaselineNoise:
@@ -52,10 +60,91 @@ def test_noisy_records_become_what_the_preparation_makes_of_them():
     assert found.start.tolist() == (wanted.align_sample - CONFIG.samples_before).tolist()
 
 
-def test_gradients_pass_through_noise_and_preparation():
-    made = windows().requires_grad_()
-    outside_of().dress_windows(made, torch.arange(4)).square().sum().backward()
-    assert bool((made.grad != 0).any(dim=2).all())
+def test_windows_get_the_room_that_they_get_without_gradients():
+    made = windows()[:, 0]
+    made[0] += 0.01 * torch.randn(800, generator=torch.Generator().manual_seed(0))
+    made[1, -20] = -1.0
+    torch.testing.assert_close(
+        in_room(made, CONFIG),
+        torch.from_numpy(with_room(made.numpy(), CONFIG, DT_NS)),
+        atol=2e-7,
+        rtol=0,
+    )
+
+
+def begin_late(held: list[Prepared]) -> bool:
+    """Whether the level of some windows lies in the extension, and of others does not."""
+    late = held[0].align_sample > PADDING_BEFORE + CONFIG.samples_before
+    return bool(late.any() and not late.all())
+
+
+@pytest.mark.parametrize("moved", ["gain", "shift"])
+def test_gradients_of_a_view_are_finite_differences(held, moved):
+    """Gain is divided out; a shift shifts; neither changes the tail."""
+    made = windows(16).double()
+    following = torch.cat([made[..., 1:], made[..., -1:] ** 2 / made[..., -2:-1]], dim=2)
+    numbers = {"gain": torch.ones(()).double(), "shift": torch.zeros(()).double()}
+    number = numbers[moved].requires_grad_()
+    outside = outside_of([500.0] * 16)
+    direction = torch.randn(16, 1, 800, generator=torch.Generator().manual_seed(0))
+    recipe = load_recipe("paper", TINY)  # whose discriminators scale a pulse to 0…1
+    torch.manual_seed(0)
+    judge = CycleGan(recipe).double().eval().discriminator_data
+
+    def views() -> Values:
+        early = numbers["shift"]
+        translated = numbers["gain"] * ((1 - early) * made + early * following)
+        seen = outside.dress_windows(translated, torch.arange(16))
+        time, _ = crossing(seen[:, 0], 0.5, torch.full((16,), CONFIG.samples_before))
+        tail = seen[..., -CONFIG.decay_fit_samples :].mean()
+        return {
+            "windows": (seen * direction).sum(),
+            "judged": judge(seen).mean(),
+            "tail": tail,
+            "half": time.mean(),
+        }
+
+    found, wanted = slopes(views, number, torch.ones(()), 1e-5)
+    assert begin_late(held)
+    for name, value in found.items():
+        assert value == pytest.approx(wanted[name], rel=1e-2, abs=1e-6), name
+    assert abs(found["tail"]) < 2e-3
+    assert found["half"] == pytest.approx({"gain": 0.0, "shift": -1.0}[moved], abs=0.1)
+
+
+def test_gradients_of_the_losses_are_finite_differences(held):
+    generators = [f"generator.{o}" for o in ("width=2", "residual=true", "dropout=0")]
+    heights = "discriminator.value_range=[-1,2]"  # or gains are divided out a second time
+    recipe = load_recipe("paper-noise", [*TINY, *generators, heights])
+    outside = outside_of([500.0] * 6)
+    torch.manual_seed(0)
+    model = CycleGan(recipe, Surroundings(outside)).double()
+    measured = windows(6).double()
+    simulated = measured.roll(1, dims=0) * torch.linspace(0.97, 1.03, 6)[:, None, None]
+    with torch.no_grad():
+        for network in (model.ren, model.iren):  # nearly the identity, with normal activations
+            torch.nn.init.normal_(network.outlet.weight, std=0.003)
+            for part in network.modules():
+                if isinstance(part, torch.nn.BatchNorm1d):
+                    part.momentum = 1.0
+            network(measured)
+    model.eval()
+    step = Step(model, recipe.cyclegan.training, outside=outside)
+
+    def losses() -> Values:
+        return step.generator_losses(simulated, measured, torch.arange(6))[0]
+
+    parameters = [
+        p
+        for network in (model.ren, model.iren)
+        for p in (network.outlet.weight, network.latent_mean.weight, network.inlet[0].weight)
+    ]
+    for n, parameter in enumerate(parameters):
+        along = torch.randn(parameter.shape, dtype=torch.float64)
+        found, wanted = slopes(losses, parameter, along / along.norm(), 1e-6)
+        for name, value in found.items():
+            assert value == pytest.approx(wanted[name], rel=1e-2, abs=1e-8), (n, name)
+    assert begin_late(held)
 
 
 def test_without_noise_a_window_is_left_as_it_is():

@@ -50,15 +50,12 @@ class UNetCorrection(RecordCorrection):
 
     def corrected(self, records: Tensor) -> tuple[Tensor, Tensor]:
         """Corrected records, and what was added in units of prepared pulses."""
-        with torch.no_grad():
-            highest, at = records.max(dim=1, keepdim=True)
-            sample = half_sample(records, highest, at)
-            inside = stretch(records, sample, -self.before, self.after)
-            height = inside[:, -TAIL:].mean(dim=1, keepdim=True) / self.tail_level
-            height = height.clamp_min(MIN_HEIGHT)
-        # again, with the gradient of a cycle through the records
-        inside = stretch(records, sample, -self.before, self.after) / height
-        added = self.added(inside)
+        highest, at = records.max(dim=1, keepdim=True)
+        sample = half_sample(records, highest, at)
+        inside = stretch(records, sample, -self.before, self.after)
+        height = inside[:, -TAIL:].mean(dim=1, keepdim=True) / self.tail_level
+        height = height.clamp_min(MIN_HEIGHT)
+        added = self.added(inside / height)
         changed = with_stretch(records, sample, -self.before, self.after, added * height)
         return changed, added
 

@@ -91,7 +91,7 @@ class LinearInverse(nn.Module):
         Returns
         -------
         Tensor
-            Float32, shape (n, length): pulses within 0 … 1 at the times of the measured ones,
+            Shape (n, length): pulses within 0 … 1 at the times of the measured ones,
             to be aligned and normalised like simulated ones.  NaN where a window has NaN.
         """
         sample = self.half_sample(windows)
@@ -102,7 +102,7 @@ class LinearInverse(nn.Module):
         pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
         pulses = nn.functional.pad(pulses, (0, 1), value=1.0)
         start = 1 + self.sizes.before - sample
-        return stretch(pulses, start, 0, self.sizes.length).float()
+        return stretch(pulses, start, 0, self.sizes.length).to(windows.dtype)
 
     def half_sample(self, windows: Tensor) -> Tensor:
         """Last sample below half of the maximum before the maximum, shape (n,)."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import PADDING_BEFORE, with_room
+from cpunet.electronics.extension import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.linear_inverse import stretch
 from cpunet.networks.response_layer import PADDING_AFTER as RESPONSE_ROOM
 from cpunet.pulses.container import Pulses
@@ -81,13 +81,27 @@ class Outside:
 
     def dress_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
         """The same for windows as a network makes them, shape (batch, 1, samples)."""
-        room = with_room(
-            windows[:, 0].detach().cpu().numpy(), self.preparation, self.noise.dt_ns
-        )
-        records = torch.from_numpy(room).to(windows)
-        inside = torch.arange(windows.shape[2], device=windows.device) + PADDING_BEFORE
-        records = records.index_copy(1, inside, windows[:, 0])
-        return self.dress(records, rows).windows
+        return self.dress(in_room(windows[:, 0], self.preparation), rows).windows
+
+
+def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:
+    """Extend windows as `cpunet.electronics.extension.with_room` does, with gradients.
+
+    Noise makes some windows begin later.  The samples that set the scale of a whole pulse then
+    lie in the extension, so level and slope of the decay must have their gradients.
+    """
+    last = windows[:, -config.decay_fit_samples :].double()
+    usable = (last > 0).all(dim=1, keepdim=True)  # else the slope is 0
+    lever = torch.arange(config.decay_fit_samples).to(last)
+    lever = lever - lever.mean()
+    slope = torch.where(usable, last, 1).log() @ (lever / lever.square().sum())
+    # the mean of the last samples is the level at their centre
+    since = torch.arange(PADDING_AFTER).to(last) + 0.5 * (config.tail_samples + 1)
+    level = last[:, -config.tail_samples :].mean(dim=1, keepdim=True)
+    after = level * (slope[:, None] * since).exp()
+    return torch.cat(
+        [windows.new_zeros(len(windows), PADDING_BEFORE), windows, after.to(windows)], dim=1
+    )
 
 
 def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dressed:
