@@ -483,6 +483,7 @@ def test_a_real_run_of_two_detectors(tmp_path):
                 ]
             },
             "validate": {"rivals": False},
+            "seeds": [1, 2],
         }
     )
     done = here.run("-c2", "--show-failed-logs")
@@ -497,4 +498,5 @@ def test_a_real_run_of_two_detectors(tmp_path):
         assert {"FEP", "SEP", "DEP"} == set(metrics["peaks"])
         assert sorted(p.stem for p in (folder / "translated").iterdir()) == parts
         assert not (folder / "data.lh5").exists()  # merged for the time being
+        assert "2 runs of fast, FEP" in (folder / "seeds.html").read_text()
     assert "Nothing to be done" in here.run("-c1").stdout
