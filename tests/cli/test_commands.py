@@ -258,7 +258,7 @@ def test_the_report_is_complete(report):
         assert len(content) > 5000 or not is_drawn(name)
     assert len([name for name in pictures if is_drawn(name)]) >= 12
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert page.count("<figure") >= len(pictures)
+    assert page.count('<figure class="drawn') == len(pictures)
     assert "SEP" in printed
     assert str(folder / "report.html") in printed
 
