@@ -46,19 +46,26 @@ PREPARATION = PreparationConfig(
     max_padding_after=0,
     saturation_run=4,
 )
-# settings of the narrowest networks, and of recipe small without its readout chain
+# settings of the narrowest networks, which begin with the identity
 SMALL_NETWORK = (
     "generator.width=2",
+    "generator.dropout=0",
+    "generator.residual=true",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
     "training.batch_size=4",
     "training.statistics_batches=1",
+    "training.discriminator_interval=1",
 )
-WITHOUT_CHAIN = (
-    "chain=null",
-    "training.noise=none",
-    "training.losses.baseline_len=200",
-    "training.losses.tail_len=400",
+LOSS_NAMES = (
+    "identity_data",
+    "identity_sim",
+    "cycle_forward",
+    "cycle_backward",
+    "adversarial_ren",
+    "adversarial_iren",
+    "discriminator_data",
+    "discriminator_sim",
 )
 
 

@@ -31,7 +31,7 @@ from cpunet.analysis.resampling import Draws, Resampled, resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 
-SCORES = load_recipe("small").scores.model_copy(update={"bootstraps": 50})
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 50})
 UNIT = hist.axis.Regular(10, 0.0, 1.0)
 
 any_floats = arrays(

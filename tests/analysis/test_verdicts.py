@@ -21,7 +21,7 @@ from cpunet.analysis.verdicts import (
 )
 from cpunet.recipes import load_recipe
 
-SCORES = load_recipe("small").scores.model_copy(update={"bootstraps": 60})
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 60})
 
 
 def one(iou: float, w1: float = 5.0) -> dict[str, Any]:

@@ -25,10 +25,7 @@ PER_PEAK = 24
 # The narrowest networks and the shortest training there are.
 TINY = [
     "generator.width=2",
-    "chain=null",
-    "training.noise=none",
-    "training.losses.baseline_len=200",
-    "training.losses.tail_len=400",
+    "generator.residual=true",
     "discriminator.embedding_rows=20",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
@@ -36,11 +33,12 @@ TINY = [
     "training.iterations=4",
     "training.decay_start=2",
     "training.batch_size=4",
+    "training.discriminator_interval=1",
     "training.statistics_batches=2",
     "training.log_interval=3",
     "scores.bootstraps=20",
 ]
-TINY_OPTIONS = ["--recipe", "small", *(word for value in TINY for word in ("--set", value))]
+TINY_OPTIONS = ["--recipe", "paper", *(word for value in TINY for word in ("--set", value))]
 
 Waveforms = npt.NDArray[Any]
 

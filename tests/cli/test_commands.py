@@ -39,7 +39,7 @@ def test_the_run_folder(trained, stand):
         "weights.safetensors",
     ]
     info = json.loads((trained / "run.json").read_text())
-    assert (info["recipe"], info["peak"], info["seed"]) == ("small", "FEP", 3)
+    assert (info["recipe"], info["peak"], info["seed"]) == ("paper", "FEP", 3)
     assert info["dt_ns"] == 16
     assert info["seconds"] > 0
     for side, kev in (("sim", stand.sim_kev), ("data", stand.data_kev)):
@@ -220,7 +220,7 @@ def test_metrics_have_their_schema(report, trained):
             assert 0 < paired["rmse"] < 1
             assert 0 < paired["edge_rmse"] < 1
     info = json.loads((trained / "run.json").read_text())
-    assert metrics["training"]["recipe"] == "small"
+    assert metrics["training"]["recipe"] == "paper"
     assert metrics["training"]["device"] == info["device"]
     assert metrics["training"]["seconds"] == info["seconds"]
 
@@ -293,7 +293,7 @@ def test_info_of_files_and_runs(command, stand, trained):
     told = command("info", trained)
     lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
     assert lines["run"] == str(trained)
-    assert lines["trained"].startswith("recipe small on FEP, seed 3; ")
+    assert lines["trained"].startswith("recipe paper on FEP, seed 3; ")
     assert "pulses used" in lines["simulated"] and "pulses used" in lines["measured"]  # noqa: PT018
     assert len(told.out.splitlines()) < 20
 

@@ -73,7 +73,7 @@ def test_export(command, trained, tmp_path):
     assert done.code == 0, done.err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ren.card.md", "ren.pt"]
     card = (tmp_path / "ren.card.md").read_text()
-    assert "recipe small" in card
+    assert "recipe paper" in card
     assert "`epsilon`" in card
     assert "data.lh5" in card
     refused = command("export", trained, "--format", "torchscript", "--out", out)

@@ -38,7 +38,7 @@ COMMANDS = {
     "train": [
         (TRAINING, "D"),
         (TRAINING, "."),
-        (f"{TRAINING} --recipe small", "D"),  # works beside the folder
+        (f"{TRAINING} --recipe paper", "D"),  # works beside the folder
         (f"{TRAINING} --recipe D/my.yaml", "D"),
         ("--sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy", "D"),
         ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN"),

@@ -95,7 +95,7 @@ def test_what_can_be_done_with_an_unfinished_training(
         command(*words)
     folder = tmp_path / "run.unfinished"
     told = json.loads((folder / "unfinished.json").read_text())
-    assert (told["seed"], told["recipe"]["name"]) == (3, "small")
+    assert (told["seed"], told["recipe"]["name"]) == (3, "paper")
 
     def refused(*more: object) -> str:
         outcome = command(*words, *more)
@@ -193,7 +193,7 @@ def die_at(moment: str, iteration: int) -> None:
 def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
-    recipe = load_recipe("small", overrides)
+    recipe = load_recipe("paper", overrides)
     files = InputFile(stand.sim), InputFile(stand.data)
     train_run(*files, tmp_path / "whole", recipe, TrainOptions(seed=5, device="cpu"))
     for moment in MOMENTS:

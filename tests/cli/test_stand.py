@@ -29,7 +29,7 @@ def made(command, tmp_path: Path) -> Path:
 
 
 def test_the_folder_is_read_and_prepared(made: Path):
-    recipe, quiet = load_recipe("small"), Monitor()
+    recipe, quiet = load_recipe("fast"), Monitor()
     chosen = parse_selection("FEP,DEP", recipe.peaks)
     sim = load_simulated(InputFile(made / "sim.lh5"), recipe, chosen, quiet)
     data = load_measured(InputFile(made / "data.lh5"), recipe, chosen, quiet)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.training.chain_and_inverse import Sides
-from cpunet.jobs.training.network_start import network_start
+from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation.translate import translate_file
@@ -198,17 +197,16 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
     # networks with noise outside are prepared alike
-    paper = load_recipe("paper-noise", ["generator.width=2"])
+    paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
     chosen = parse_selection("FEP", paper.peaks)
     sim = load_simulated(files.sim, paper, chosen, monitor).prepared.pulses
     measured = load_measured(data, paper, chosen, monitor)
     sides = Sides(sim, measured.prepared.pulses, data, measured)
-    start = network_start(sides, paper, 0, None, monitor)
-    outside = start.surroundings.outside
+    outside, entry = outside_noise(sides, paper, monitor)
     assert outside is not None
     assert outside.noise.remains is not None
     assert outside.noise.remains.law.rate_khz == told["rate_khz"]
-    assert start.told["fit"]["remains"]["rate_khz"] == told["rate_khz"]
+    assert entry["fit"]["remains"]["rate_khz"] == told["rate_khz"]
 
 
 def test_data_without_remains_are_given_none(run: Run) -> None:
@@ -292,21 +290,6 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
         monitor=monitor,
     )
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
-
-
-@pytest.mark.thorough
-def test_too_few_pulses_for_a_residual_leave_the_chain(files: Files, tmp_path: Path) -> None:
-    few = written(tmp_path / "data.lh5", digitised(230, seed=2))
-    recipe = load_recipe("best", [*ONE_START, *SHORT, "training.drift_terms=0"])
-    monitor, how = Listening(), TrainOptions(device="cpu")
-    info = train_run(files.sim, few, tmp_path / "run", recipe, how, monitor=monitor)
-    said = [note for note in monitor.notes if note.startswith("the residual is left out")]
-    assert len(said) == 1
-    assert re.search(r"without the 20 % for its test, \d+ measured pulses can be u", said[0])
-    assert not info["fit"]["residual"]["kept"]
-    assert info["fit"]["residual"]["held_out_before"] is None
-    ren = REN.load(tmp_path / "run")
-    assert np.isfinite(ren.translate(sampled(charge(20, 1), FINE), noise=False)).all()
 
 
 @pytest.mark.thorough

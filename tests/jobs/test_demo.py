@@ -15,11 +15,10 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.demo import demonstrate
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from synthetic import SMALL_NETWORK, WITHOUT_CHAIN
+from synthetic import SMALL_NETWORK
 
 TINY = (
     *SMALL_NETWORK,
-    *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
     "training.iterations=2",
     "training.decay_start=1",
@@ -27,7 +26,7 @@ TINY = (
     "training.log_interval=1",
     "scores.bootstraps=20",
 )
-RECIPE = load_recipe("small", TINY)
+RECIPE = load_recipe("paper", TINY)
 EVENTS = {"FEP": 240, "SEP": 60, "DEP": 60}
 BASELINE_METHODS = ("rc", "gauss_exp", "superpulse")
 
@@ -119,7 +118,7 @@ def test_finished_parts_are_kept_and_a_whole_one_is_refused(
             "stand: made with sim.hits.windows_kev.SEP = [2103.011, 2104.011], not none",
         ),
         (
-            {"recipe": load_recipe("small", [*TINY, "training.batch_size=3"])},
+            {"recipe": load_recipe("paper", [*TINY, "training.batch_size=3"])},
             "run: made with recipe.training.batch_size = 2, not 3",
         ),
     ],

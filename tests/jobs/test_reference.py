@@ -17,11 +17,11 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.timeout(1800)
-def test_the_small_recipe_beats_the_raw_simulation(reference_data: Path, tmp_path: Path):
+def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_path: Path):
     """Trained on FEP, judged on SEP and DEP, which it has not seen."""
     folder = reference_data / "closure"
     sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
-    train_run(sim, data, tmp_path / "run", load_recipe("small"), TrainOptions(device="cpu"))
+    train_run(sim, data, tmp_path / "run", load_recipe("fast"), TrainOptions(device="cpu"))
     metrics = validate_run(
         tmp_path / "run",
         sim,
@@ -60,15 +60,7 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     sim = InputFile(reference_data / "closure" / "sim.lh5")
     data = InputFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
-    recipe = load_recipe(
-        "small",
-        [
-            "training.iterations=20",
-            "training.decay_start=10",
-            "chain.training.start_factors=[1]",
-            "chain.training.ringing_mhz=[]",
-        ],
-    )
+    recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
     info = train_run(
         sim, data, tmp_path / "run", recipe, TrainOptions(peak="300-", device="cpu")
     )

@@ -66,7 +66,7 @@ def npz(path: Path, hits: Hits) -> Path:
 
 
 def gammas(**changed: object) -> GammaSource:
-    lines = energy_windows("FEP,SEP,DEP", load_recipe("small").peaks, 0.5)
+    lines = energy_windows("FEP,SEP,DEP", load_recipe("fast").peaks, 0.5)
     source = GammaSource(tuple(lines), (30, 3, 3), height_mm=20, radius_mm=5, seed=4)
     return replace(source, **changed)
 
@@ -78,7 +78,7 @@ def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     assert (summary.n_events, summary.mode) == (36, "exact")
     assert summary.n_written + summary.without_signal == 36
     assert summary.hits < summary.hits_before_merging
-    recipe = load_recipe("small")
+    recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     used = load_simulated(InputFile(out), recipe, selection, Monitor()).prepared
     assert len(used) >= summary.lines["FEP"] > 10

@@ -27,7 +27,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
-from synthetic import KEV, SMALL_NETWORK, WITHOUT_CHAIN, Files, write_files
+from synthetic import KEV, SMALL_NETWORK, Files, write_files
 
 SPACE = (
     "search={generator.width: {choices: [2, 4]}, "
@@ -35,7 +35,6 @@ SPACE = (
 )
 TINY = [
     *SMALL_NETWORK,
-    *WITHOUT_CHAIN,
     "discriminator.samples_per_step=80",
     "training.iterations=4",
     "scores.bootstraps=10",
@@ -44,7 +43,7 @@ TINY = [
 
 
 def tiny(*more: str) -> Recipe:
-    return load_recipe("small", [*TINY, *more])
+    return load_recipe("paper", [*TINY, *more])
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +125,7 @@ def test_what_cannot_be_searched_is_told_by_its_key(space, words):
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("name", ["fast", "small", "paper"])
+@pytest.mark.parametrize("name", ["fast", "paper"])
 def test_the_recipes_own_spaces_can_be_searched(name):
     recipe = load_recipe(name)
     space = search_space(recipe)
@@ -248,7 +247,7 @@ def test_networks_are_searched_on_the_command_line(files, tmp_path, monkeypatch,
     folder = tmp_path / "tune"
     values = [word for value in TINY for word in ("--set", value)]
     inputs = ["--sim", files.sim.path, "--data", files.data.path, "--out", folder]
-    words = ["cpunet", "tune", *inputs, "--recipe", "small", *values, "--trials", 2]
+    words = ["cpunet", "tune", *inputs, "--recipe", "paper", *values, "--trials", 2]
     monkeypatch.setattr(sys, "argv", [*map(str, words)])
     with pytest.raises(SystemExit) as stop:
         main()

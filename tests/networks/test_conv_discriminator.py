@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cpunet.networks.conv_discriminator import ConvDiscriminator
+from cpunet.networks.discriminators import ConvDiscriminator
 from cpunet.recipes.network_settings import ConvConfig
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")

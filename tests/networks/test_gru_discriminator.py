@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cpunet.networks.gru_discriminator import GruDiscriminator, InterpolatedEmbedding
+from cpunet.networks.discriminators import GruDiscriminator, InterpolatedEmbedding
 from cpunet.recipes import load_recipe
 from cpunet.recipes.network_settings import GruConfig
 

@@ -32,7 +32,7 @@ N = 5
 # Everything random, and everything that has a state.
 VARIANTS = {
     "paper": (),
-    "small": (
+    "everything": (
         "generator.residual=true",
         "generator.dropout=0.0",
         "training.average_decay=0.5",
@@ -82,15 +82,14 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
 # after which iteration each is stopped; those that are but other numbers of the others are slow
 STOPS = {
     "paper": 1,
-    "small": 2,
+    "everything": 2,
     "rare-judges": 3,
     "large-batches": 4,
     "fast-step": 2,
     "convolutional-judge": 3,
 }
 MARKS = dict.fromkeys(("paper", "convolutional-judge"), pytest.mark.thorough)
-# the fast step is that of `small`
-MARKS |= dict.fromkeys(("small", "rare-judges", "large-batches"), pytest.mark.slow)
+MARKS |= dict.fromkeys(("everything", "rare-judges", "large-batches"), pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
@@ -292,17 +291,6 @@ def test_a_training_that_died_is_finished(sets, recipe, out, whole):
     assert notes == ["going on after 4 iterations"]
     assert content(out) == whole
     assert not beside(out).exists()
-
-
-def test_a_training_that_stopped_on_pairs_goes_on_with_them(tmp_path):
-    def begun(notes: list[str], *, resume: bool) -> UnfinishedRun:
-        run = UnfinishedRun(tmp_path, {}, {}, notes.append)
-        run.begin(resume=resume)
-        return run
-
-    begun([], resume=False).save({"iteration": 0, "pairs": {"iteration": 7}})
-    begun(notes := [], resume=True)
-    assert notes == ["going on after 7 iterations on pairs"]
 
 
 def test_without_resume_nothing_is_lost(sets, recipe, out):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cpunet.training.judges import judges_noted
-from cpunet.training.loop import train
+from cpunet.training.loop import judges_noted, train
 
 
 def records(*of_data: float) -> list:

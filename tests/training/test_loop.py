@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.training.cyclegan import LOSS_NAMES
 from cpunet.training.loop import CheckpointHooks, StoppedError, train
+from synthetic import LOSS_NAMES
 
 
 def run(sets, recipe, seed=0):
@@ -95,7 +95,7 @@ def test_the_first_bad_iteration_is_named(tiny, sets, monkeypatch):
     from cpunet.training.cyclegan import Step
 
     class Diverging(Step):
-        def __call__(self, iteration, sim, data):
+        def __call__(self, iteration, sim, data, rows):
             value = float("inf") if iteration >= 4 else 1.0
             return {"identity_sim": torch.tensor(value)}
 
@@ -123,7 +123,7 @@ def test_without_an_average_the_last_weights_are_kept(tiny, sets, monkeypatch):
     history = []
 
     class Watched(Step):
-        def __call__(self, iteration, sim, data):
+        def __call__(self, iteration, sim, data, rows):
             losses = super().__call__(iteration, sim, data)
             history.append([p.detach().clone() for p in self.model.ren.parameters()])
             return losses
@@ -213,7 +213,7 @@ def test_what_diverged_is_not_kept(tiny, sets, monkeypatch):
     from cpunet.training.cyclegan import Step
 
     class Diverging(Step):
-        def __call__(self, iteration, sim, data):
+        def __call__(self, iteration, sim, data, rows):
             if iteration == 3:  # its losses are still those of the weights before
                 with torch.no_grad():
                     next(self.model.parameters())[:] = torch.nan

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cpunet.recipes import load_recipe
 from cpunet.recipes.training_settings import LossConfig
-from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
+from cpunet.training.cyclegan import fake_loss, real_loss, weighted_l1, window_weights
 
 PAPER = load_recipe("paper").training.losses
 

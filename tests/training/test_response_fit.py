@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from alignment import at_half_maximum
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
@@ -28,7 +29,6 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts, translated
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
-from cpunet.training.half_maximum_alignment import at_half_maximum
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
@@ -64,26 +63,6 @@ def test_everything_comes_back(run, model, recipe):
         assert not loaded.training
         saved = getattr(model, name).state_dict()
         assert all(torch.equal(saved[k], v) for k, v in loaded.state_dict().items())
-
-
-def test_recipes_of_earlier_versions_are_read(tmp_path):
-    recipe = load_recipe("fast")
-    write_run(tmp_path, nn.ModuleDict({"ren": nn.Linear(2, 2)}), recipe, INFO)
-    text = (tmp_path / "recipe.yaml").read_text()
-    for later in ("  free_decays: false\n", "  drift_terms: 0\n"):
-        assert later in text
-        text = text.replace(later, "")
-    (tmp_path / "recipe.yaml").write_text(text)
-    assert read_recipe(tmp_path) == recipe
-
-
-def test_chains_of_earlier_versions_of_small_are_read(tmp_path):
-    recipe = load_recipe("small")
-    write_run(tmp_path, nn.ModuleDict({"ren": nn.Linear(2, 2)}), recipe, INFO)
-    text = (tmp_path / "recipe.yaml").read_text()
-    assert text.count("    drift_terms: 0\n") == 2
-    (tmp_path / "recipe.yaml").write_text(text.replace("    drift_terms: 0\n", ""))
-    assert read_recipe(tmp_path) == recipe
 
 
 def test_ren_and_iren_are_not_confused(run, recipe):
@@ -150,7 +129,6 @@ def test_missing_weights(run, recipe):
 @given(part=st.floats(0, 1, exclude_max=True))
 def test_truncated_weights(tmp_path_factory, part):
     # made once, cut anew each time: hypothesis keeps function-scoped fixtures
-    from cpunet.recipes import load_recipe
 
     folder = tmp_path_factory.mktemp("run")
     network = torch.nn.Linear(3, 2)
@@ -210,12 +188,14 @@ def test_facts_of_other_types(run, key, value):
     one_line(error, str(run), "run.json: damaged (", key)
 
 
-def test_a_run_of_a_newer_version_is_not_called_damaged(run):
-    (run / "run.json").write_text(json.dumps(INFO | {"format": FORMAT + 1}))
+@pytest.mark.parametrize("version", [FORMAT - 1, FORMAT + 1])
+def test_a_run_of_another_version_is_not_called_damaged(run, version):
+    (run / "run.json").write_text(json.dumps(INFO | {"format": version}))
     with pytest.raises(CpunetError) as error:
         read_info(run)
-    text = f"of a newer version of cpunet (format {FORMAT + 1}); read it with that one"
-    assert str(error.value) == f"{run / 'run.json'}: {text}"
+    assert f"{run / 'run.json'}: of another version of cpunet (format {version}" in str(
+        error.value
+    )
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1" * 400, "1" * 5000, "1e400"])
@@ -224,12 +204,6 @@ def test_facts_beyond_all_numbers(run, number):
     with pytest.raises(CpunetError) as error:
         read_info(run)
     one_line(error, str(run), "run.json: damaged (")
-
-
-def test_runs_of_the_previous_release_load(run):
-    """Which said nothing of a format, and may have more keys than are known now."""
-    (run / "run.json").write_text(json.dumps(INFO | {"other": {"kept": [1]}}))
-    assert read_info(run)["other"] == {"kept": [1]}
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.training import loop
-from cpunet.training.cyclegan import LOSS_NAMES, Step
-from cpunet.training.loop import train
-from cpunet.training.sampling import EpochSampler
+from cpunet.training.cyclegan import Step
+from cpunet.training.loop import EpochSampler, train
+from synthetic import LOSS_NAMES
 
 
 def numbered(n: int, samples: int = 3) -> torch.Tensor:
@@ -77,7 +77,7 @@ def test_in_a_training_every_pulse_meets_every_other(monkeypatch, tiny, n_sim, n
     pairs: Counter[tuple[int, int]] = Counter()
 
     class Watched(Step):
-        def __call__(self, iteration, sim, data):
+        def __call__(self, iteration, sim, data, rows):
             # data are numbered from 100, so that the sides cannot be taken for each other
             pairs.update(zip(numbers(sim), numbers(data), strict=True))
             return dict.fromkeys(LOSS_NAMES, torch.zeros(()))

@@ -7,9 +7,8 @@ import torch
 from torch import nn
 
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.sampling import EpochSampler
+from cpunet.training.loop import EpochSampler, refresh_batch_statistics
 from cpunet.training.start import match_skips
-from cpunet.training.statistics import refresh_batch_statistics
 
 
 def edges(

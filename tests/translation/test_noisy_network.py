@@ -20,11 +20,12 @@ from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.outside import Outside
 from cpunet.training.run_folder import write_run
-from cpunet.training.surroundings import Surroundings
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 
-RECIPE = load_recipe("paper-noise", ["generator.width=2", "generator.residual=true"])
+RECIPE = load_recipe(
+    "paper", ["training.noise=baselines", "generator.width=2", "generator.residual=true"]
+)
 DT_NS, RMS_KEV = 16.0, 6.0
 
 
@@ -34,11 +35,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), 2 * (NOISE_BINS - 1), DT_NS, 100)
     outside = Outside(TraceNoise(noise), np.ones(1), RECIPE.preparation)
     torch.manual_seed(0)
-    model = CycleGan(RECIPE, Surroundings(outside))
+    model = CycleGan(RECIPE, outside)
     decay = np.exp(-np.clip(np.arange(800) - 400, 0, None) / 1800)
     model.ren.skip.set(torch.from_numpy(decay).float(), 0)
     folder = tmp_path_factory.mktemp("run")
-    info = {"recipe": "paper-noise", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
+    info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
     drawn = DrawnRemains(RemainsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
     fit = {"remains": {"rate_khz": 2.0, "drawn": drawn.describe()}}
     write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu", "fit": fit})

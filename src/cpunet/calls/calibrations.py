@@ -141,7 +141,7 @@ def calibrate(
     peak
         Peak, or ranges of energy, to calibrate on.
     recipe
-        ``"fast"`` or ``"best"``, a YAML file, or a `Recipe`.
+        ``"fast"``, a YAML file, or a `Recipe`.
     events
         Maximum number of simulated events that are drifted repeatedly.
     seed

@@ -208,7 +208,7 @@ def train(
     out
         Folder of the run; it appears when the training is done.
     recipe
-        ``"fast"`` (a readout chain), ``"best"``, ``"paper"``, ``"small"``, a YAML file, or a
+        ``"fast"`` (a readout chain), ``"paper"`` (networks), a YAML file, or a
         `Recipe`.
     settings
         Values that override those of a named recipe, such as ``{"training.steps": 20}``.

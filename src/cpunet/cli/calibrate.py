@@ -96,9 +96,7 @@ Plan = Annotated[
 Peak = Annotated[
     str, typer.Option(help="Energies to calibrate on: FEP, SEP, DEP or ranges in keV.")
 ]
-RecipeName = Annotated[
-    str, typer.Option("--recipe", help="fast, best, or a YAML file of your own.")
-]
+RecipeName = Annotated[str, typer.Option("--recipe", help="fast, or a YAML file of your own.")]
 Events = Annotated[
     int,
     typer.Option(

@@ -16,7 +16,7 @@ from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
 RecipeName = Annotated[
-    str, typer.Option("--recipe", help="fast, best, small, paper, or a YAML file of your own.")
+    str, typer.Option("--recipe", help="fast, paper, or a YAML file of your own.")
 ]
 Set = Annotated[
     list[str] | None,

@@ -185,7 +185,7 @@ Peak = Annotated[
 ]
 RecipeName = Annotated[
     str,
-    typer.Option("--recipe", help="fast, best, small, paper, paper-noise, or a YAML file."),
+    typer.Option("--recipe", help="fast, paper, or a YAML file of your own."),
 ]
 Overrides = Annotated[
     list[str] | None,

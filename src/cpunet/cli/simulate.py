@@ -247,7 +247,7 @@ def simulate(
             "libraries are made by cpunet library make"
         )
     refuse_inputs(out_file, detector, crystal, settings_file)
-    peaks = load_recipe("small").peaks
+    peaks = load_recipe("fast").peaks
     source: HitSource
     if hits is not None:
         chosen = energy_windows(peak, peaks, window_kev) if peak else []

@@ -127,7 +127,7 @@ def stand(
     summary = make_stand(
         electronics,
         read_detector(detector, overrides, crystal),
-        tuple(energy_windows(",".join(names), load_recipe("small").peaks, window_kev)),
+        tuple(energy_windows(",".join(names), load_recipe("fast").peaks, window_kev)),
         numbers,
         out_folder,
         kind=kind.value,

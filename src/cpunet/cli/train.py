@@ -23,9 +23,7 @@ Resume = Annotated[
 ]
 Init = Annotated[
     Path | None,
-    typer.Option(
-        help="Run to start from, as of another detector or period; a matched one makes pairs."
-    ),
+    typer.Option(help="Run of the same kind to start from, as of another detector or period."),
 ]
 
 

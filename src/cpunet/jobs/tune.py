@@ -31,7 +31,7 @@ from cpunet.jobs.common.inputs import (
 )
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides, match
-from cpunet.jobs.training.network_start import network_start
+from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.outputs import refuse_inputs, written_aside
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
@@ -360,10 +360,9 @@ class HeldOut:
         if isinstance(recipe.training, MatchingConfig):
             model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, QUIET)
         else:
-            begun = network_start(self.fit, recipe, seed, None, QUIET)
-            recipe, around = begun.recipe, begun.surroundings
+            outside, _ = outside_noise(self.fit, recipe, QUIET)
             sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
-            model = train(*sides, recipe, seed=seed, device=device, surroundings=around)
+            model = train(*sides, recipe, seed=seed, device=device, outside=outside)
         info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}
         with TemporaryDirectory(prefix="cpunet-tune-") as folder:
             how = {"seconds": 0, "device": device, "seed": seed}

@@ -142,16 +142,5 @@ def stretch(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
     sample
         Sample from which is counted, shape (n,).
     """
-    return pulses.gather(1, _index(pulses, sample, first, stop))
-
-
-def with_stretch(
-    pulses: Tensor, sample: Tensor, first: int, stop: int, added: Tensor
-) -> Tensor:
-    """Pulses with values added to the samples that `stretch` takes, shape (n, samples)."""
-    return pulses.scatter_add(1, _index(pulses, sample, first, stop), added)
-
-
-def _index(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
     index = sample[:, None] + torch.arange(first, stop, device=pulses.device)
-    return index.clamp(0, pulses.shape[1] - 1)
+    return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))

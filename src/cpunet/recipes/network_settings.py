@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
+from cpunet.settings import Config, Fraction, Positive, Samples, Width
 
 # parameters that stretch the simulated drift, see `cpunet.networks.drift_clock`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]
@@ -55,36 +55,6 @@ class ResponseConfig(Config):
         return times
 
 
-class ResidualConfig(Config):
-    """A small network that corrects a matched response, see `cpunet.training.residual`.
-
-    ``width`` is that of its first layer.  It is trained for ``iterations`` of ``batch_size``
-    pulses, with a learning ``rate`` that falls to zero and a ``weight_decay``; the final
-    weights are a running average with ``average_decay`` per iteration.  The loss is a
-    chi-square per function, plus ``roughness_weight`` times the mean square of the second
-    differences of the correction in thousandths of a pulse's height.  A ``held_out`` part of
-    both sets is the test: its chi-square must fall by the fraction ``least_fall``, and by more
-    than chance.
-    """
-
-    width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
-    iterations: Count
-    batch_size: Annotated[int, Field(ge=16, le=100_000)]
-    rate: Positive
-    weight_decay: NonNegative
-    average_decay: Fraction
-    roughness_weight: NonNegative
-    held_out: Annotated[float, Field(gt=0, lt=1)]
-    least_fall: Fraction
-
-
-class HybridConfig(ResponseConfig):
-    """A readout chain corrected by a small network, see `cpunet.networks.hybrid`."""
-
-    name: Literal["hybrid"]  # type: ignore[assignment]
-    residual: ResidualConfig
-
-
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
@@ -109,7 +79,7 @@ class GruConfig(Config):
 
 
 class ConvConfig(Config):
-    """A discriminator of convolutions, see `cpunet.networks.conv_discriminator`.
+    """A discriminator of convolutions, see `cpunet.networks.discriminators`.
 
     Each of ``layers`` halves the pulse; the first has ``width`` channels, each further one
     twice as many, up to eight times ``width``.  ``current_gain`` scales the differences between

@@ -14,9 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.recipes.network_settings import (
     ConvConfig,
     GruConfig,
-    HybridConfig,
     PunetConfig,
-    ResidualConfig,
     ResponseConfig,
 )
 from cpunet.recipes.training_settings import MatchingConfig, TrainingConfig
@@ -126,18 +124,6 @@ class SearchConfig(Config):
         return self
 
 
-class ChainConfig(Config):
-    """A readout chain that is matched before a CycleGAN is trained, and precedes its networks.
-
-    ``generator`` and ``training`` are those of a recipe for a matched response.  The U-Nets
-    then see pulses from ``training.before`` to ``training.after`` samples around their half
-    maximum, and correct what the chain leaves.
-    """
-
-    generator: ResponseConfig
-    training: MatchingConfig
-
-
 class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
@@ -161,12 +147,9 @@ class Recipe(Config):
     peaks: Annotated[dict[str, PeakConfig], Field(min_length=1, max_length=1000)]
     preparation: PreparationConfig
     cuts: CutConfig
-    generator: Annotated[
-        PunetConfig | ResponseConfig | HybridConfig, Field(discriminator="name")
-    ]
+    generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
     discriminator: Annotated[GruConfig | ConvConfig, Field(discriminator="name")] | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
-    chain: ChainConfig | None = None
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
 
@@ -203,93 +186,37 @@ class Recipe(Config):
             raise CpunetError(f"recipe {self.name}: does not match a response")
         return MatchingSettings(self.generator, self.training)
 
-    @property
-    def residual(self) -> ResidualConfig:
-        """The settings of a network that corrects a response.
-
-        Raises
-        ------
-        CpunetError
-            If the recipe has none.
-        """
-        if not isinstance(self.generator, HybridConfig):
-            raise CpunetError(f"recipe {self.name}: has no residual")
-        return self.generator.residual
-
-    @property
-    def network_length(self) -> int:
-        """Samples that the networks of a CycleGAN see."""
-        if self.chain is None:
-            return self.preparation.length
-        return self.chain.training.before + self.chain.training.after
-
-    @property
-    def of_chain(self) -> Recipe:
-        """The recipe for matching the chain before a CycleGAN.
-
-        Raises
-        ------
-        CpunetError
-            If there is none.
-        """
-        if self.chain is None:
-            raise CpunetError(f"recipe {self.name}: has no chain")
-        parts = {"generator": self.chain.generator, "training": self.chain.training}
-        return self.model_copy(
-            update=parts | {"discriminator": None, "chain": None, "search": None}
-        )
-
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:
         network = isinstance(self.generator, PunetConfig)
         if network != isinstance(self.training, TrainingConfig):
             raise ValueError(
-                "generator punet goes with training method cyclegan, the others with matching"
+                "generator punet goes with training method cyclegan, response with matching"
             )
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
-        if self.chain is not None and not (
-            isinstance(self.generator, PunetConfig)
-            and self.generator.residual
-            and isinstance(self.training, TrainingConfig)
-            and self.training.noise == "baselines"
-        ):
-            raise ValueError(
-                "a chain stands before a CycleGAN of residual generators with noise from "
-                "baselines"
-            )
-        return self
-
-    @property
-    def _seen(self) -> str:
-        return "a prepared pulse has" if self.chain is None else "behind the chain a pulse has"
-
-    @model_validator(mode="after")
-    def _windows_cover(self) -> Recipe:
-        if not isinstance(self.training, TrainingConfig):
-            return self
-        losses = self.training.losses
-        covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
-        if covered != self.network_length:
-            raise ValueError(
-                f"the loss windows cover {covered} samples, {self._seen} {self.network_length}"
-            )
         return self
 
     @model_validator(mode="after")
     def _networks_fit(self) -> Recipe:
-        if self.discriminator is None:
+        if not isinstance(self.training, TrainingConfig):
             return self
-        length = self.network_length
+        losses, length = self.training.losses, self.preparation.length
+        covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
+        if covered != length:
+            raise ValueError(
+                f"the loss windows cover {covered} samples, a prepared pulse has {length}"
+            )
         if length % 16:
             raise ValueError(
-                f"{self._seen} {length} samples, no multiple of 16 (the generators halve it "
-                "four times)"
+                f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
+                "halve it four times)"
             )
         if isinstance(self.discriminator, GruConfig):
             step = self.discriminator.samples_per_step
             if length % step:
                 raise ValueError(
-                    f"{self._seen} {length} samples, no multiple of samples_per_step ({step})"
+                    f"a prepared pulse has {length} samples, no multiple of samples_per_step "
+                    f"({step})"
                 )
         return self

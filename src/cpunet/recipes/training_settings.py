@@ -33,17 +33,6 @@ class LossConfig(Config):
     gradient_penalty: NonNegative
 
 
-class PairsConfig(Config):
-    """Supervised steps before the adversarial ones, see `cpunet.training.pairs`.
-
-    With a chain, or a matched run to start from, simulated pulses are translated by it, and the
-    networks learn these pairs in ``iterations`` with a ``rate`` that falls to zero.
-    """
-
-    iterations: Count
-    rate: Positive
-
-
 class TrainingConfig(Config):
     """Settings of the training loop.
 
@@ -59,8 +48,6 @@ class TrainingConfig(Config):
     ``precision`` is that of the generators' passes; ``compiled`` fuses them by torch.compile.
     With ``noise`` from ``baselines``, the generators do not make noise: noise drawn from the
     data's own baselines is added to all that a discriminator or a score sees.
-    With a chain, a ``held_out`` part of both sets is the test after the training: unless REN's
-    network improves these pulses, which it has not seen, it is left out (0: it is always kept).
     """
 
     method: Literal["cyclegan"]
@@ -82,9 +69,7 @@ class TrainingConfig(Config):
     precision: Literal["float32", "bf16"]
     compiled: bool
     noise: Literal["none", "baselines"]
-    pairs: PairsConfig
     losses: LossConfig
-    held_out: Annotated[float, Field(ge=0, le=0.5)]
 
 
 class MatchingConfig(Config):
@@ -127,11 +112,6 @@ class MatchingConfig(Config):
     ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]
     drift_terms: DriftTerms
     noise_sets: _Number
-
-    @property
-    def iterations(self) -> int:
-        """Maximum number of steps: all starts, stretches, a ringing, and two last fits."""
-        return self.steps * (len(self.start_factors) + self.drift_terms + 3)
 
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:

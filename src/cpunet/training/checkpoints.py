@@ -24,7 +24,7 @@ from cpunet.errors import CpunetError
 from cpunet.training.loop import State
 
 CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
-FORMAT = 2
+FORMAT = 3
 _ASIDE = ".checkpoint.partial"  # a fixed name: the file of a killed process is overwritten
 _TENSOR = "tensor"
 _ABSENT = "none"

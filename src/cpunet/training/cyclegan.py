@@ -1,88 +1,106 @@
-"""The four networks of CPU-Net and one step of their training (paper, section 3.4)."""
+"""CPU-Net's training, one step of it (paper, section 3.4): networks, losses, optimisers.
+
+Two generators and two discriminators on unpaired batches of both sides::
+
+    sim  ── REN ──▶ fake data ── IREN ──▶ cycled sim       data ── IREN ──▶ same data, …
+                        │
+             discriminator of data: real or translated?
+
+What calls this, batch by batch, is `cpunet.training.loop`.  All pulses in this module have
+the shape (batch, 1, samples).
+"""
 
 from __future__ import annotations
 
-from itertools import chain
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
-from cpunet.networks.conv_discriminator import ConvDiscriminator
-from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.discriminators import Discriminator, discriminator
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.recipes.network_settings import ConvConfig, GruConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import TrainingConfig
-from cpunet.training.chain_step import ChainStep
-from cpunet.training.compared import Compared, Judged
-from cpunet.training.generator_pass import generator_pass
-from cpunet.training.losses import fake_loss, real_loss, weighted_l1, window_weights
+from cpunet.recipes.training_settings import LossConfig, TrainingConfig
 from cpunet.training.outside import Outside, tolerance
-from cpunet.training.surroundings import NONE, Surroundings
-
-LOSS_NAMES = (
-    "identity_data",
-    "identity_sim",
-    "cycle_forward",
-    "cycle_backward",
-    "adversarial_ren",
-    "adversarial_iren",
-    "discriminator_data",
-    "discriminator_sim",
-)
-
-
-Discriminator = GruDiscriminator | ConvDiscriminator
 
 
 class CycleGan(nn.Module):
     """REN (sim → data), IREN (data → sim) and a discriminator for each side.
 
-    Saved with them for translations, but not trained, are a matched chain and its inverse, or
-    the noise that is added outside the generators.
+    Noise that is added outside the generators is saved with them, for translations.
     """
 
-    def __init__(self, recipe: Recipe, surroundings: Surroundings = NONE) -> None:
+    def __init__(self, recipe: Recipe, outside: Outside | None = None) -> None:
         super().__init__()
-        length, (generator, discriminator, _) = recipe.network_length, recipe.cyclegan
-        self.ren = PositionalUNet(generator, length)
-        self.iren = PositionalUNet(generator, length)
-        self.discriminator_data = _discriminator(discriminator)
-        self.discriminator_sim = _discriminator(discriminator)
-        if surroundings.chain is not None:
-            chain, inverse = surroundings.chain
-            self.chain, self.inverse = chain.requires_grad_(False), inverse
-        elif surroundings.outside is not None:
-            self.noise = KeptNoise(surroundings.outside.noise.dt_ns)
-            self.noise.set_noise(surroundings.outside.noise.noise)
+        config, length = recipe.cyclegan, recipe.preparation.length
+        self.ren = PositionalUNet(config.generator, length)
+        self.iren = PositionalUNet(config.generator, length)
+        self.discriminator_data = discriminator(config.discriminator)
+        self.discriminator_sim = discriminator(config.discriminator)
+        if outside is not None:
+            self.noise = KeptNoise(outside.noise.dt_ns)
+            self.noise.set_noise(outside.noise.noise)
 
     def generator_parameters(self) -> list[nn.Parameter]:
         """Parameters of REN and IREN."""
-        return list(chain(self.ren.parameters(), self.iren.parameters()))
+        return [*self.ren.parameters(), *self.iren.parameters()]
+
+    def judges(self) -> dict[str, Discriminator]:
+        """The discriminators by side."""
+        return {"data": self.discriminator_data, "sim": self.discriminator_sim}
 
 
-def _discriminator(config: GruConfig | ConvConfig) -> Discriminator:
-    if isinstance(config, ConvConfig):
-        return ConvDiscriminator(config)
-    return GruDiscriminator(config)
+def window_weights(config: LossConfig) -> Tensor:
+    """Weight of each sample in the L1 losses, shape (samples,).
+
+    Baseline, rising edge and tail each count as their weight times the *mean*
+    absolute difference in their window, whatever its length.
+    """
+    windows = (
+        (config.baseline_len, config.baseline_weight),
+        (config.rising_edge_len, config.rising_edge_weight),
+        (config.tail_len, config.tail_weight),
+    )
+    return torch.cat([torch.full((length,), weight / length) for length, weight in windows])
 
 
-def load_optimiser(optimiser: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Restore an optimiser from a file, whose keys are text instead of numbers."""
-    by_number = {int(number): value for number, value in state["state"].items()}
-    optimiser.load_state_dict(state | {"state": by_number})
+def weighted_l1(
+    pulses: Tensor, others: Tensor, weights: Tensor, ignored: Tensor | None = None
+) -> Tensor:
+    """Weighted absolute difference, per pulse, then averaged over the batch.
+
+    `weights` has shape (samples,); `ignored` is a part of each difference that does not count,
+    shape (batch, 1, 1).
+    """
+    apart = (pulses - others).abs()  # (batch, 1, samples)
+    if ignored is not None:
+        apart = (apart - ignored).clamp_min(0)
+    return (apart * weights).sum(dim=-1).mean()
+
+
+def real_loss(logits: Tensor) -> Tensor:
+    """Binary cross-entropy of calling these pulses real."""
+    return binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
+
+
+def fake_loss(logits: Tensor) -> Tensor:
+    """Binary cross-entropy of calling these pulses translated."""
+    return binary_cross_entropy_with_logits(logits, torch.zeros_like(logits))
+
+
+def mean_square_slope(logits: Tensor, pulses: Tensor) -> Tensor:
+    """Mean over pulses of the squared gradient of a discriminator, to be penalised."""
+    (slope,) = torch.autograd.grad(logits.sum(), pulses, create_graph=True)
+    return slope.square().sum(dim=(1, 2)).mean()
 
 
 class Step:
     """One training iteration: generators always, discriminators at their interval.
-
-    The learning rates of all three optimisers follow the iteration number, even between
-    updates of the discriminators.
 
     Parameters
     ----------
@@ -90,12 +108,9 @@ class Step:
         Networks to train, and settings of the training.
     outside
         Noise and preparation of translations before a discriminator sees them; None for none.
-    chain
-        Passes with a matched chain, if there is one.
     warmup
-        Number of iterations in which the learning rates rise from zero, for networks that
-        start near their goal: the first steps of Adam are as long as its rate, whatever the
-        gradients (Ma and Yarats 2021, arXiv:1910.04209).
+        Iterations in which the learning rates rise from zero, for networks that start near
+        their goal: Adam's first steps are as long as its rate (arXiv:1910.04209).
     """
 
     def __init__(
@@ -104,122 +119,80 @@ class Step:
         config: TrainingConfig,
         *,
         outside: Outside | None = None,
-        chain: ChainStep | None = None,
         warmup: int = 0,
     ) -> None:
-        self.model = model
-        self.outside, self.chain = outside, chain
-        # of the discriminators, if this iteration updates them
-        self.accuracy: dict[str, Tensor] = {}
-        self.config, self.warmup = config, warmup
-        device = next(model.parameters()).device
-        self.weights = window_weights(config.losses).to(device)
+        self.model, self.config = model, config
+        self.outside, self.warmup = outside, warmup
+        self.accuracy: dict[str, Tensor] = {}  # of the discriminators, if updated
+        self.weights = window_weights(config.losses).to(next(model.parameters()).device)
         self.noise = config.instance_noise
-        self.ren, self.iren = (
-            generator_pass(network, config.precision, compiled=config.compiled)
-            for network in (model.ren, model.iren)
-        )
+        self.ren, self.iren = (_pass(network, config) for network in (model.ren, model.iren))
 
-        def optimiser(parameters: list[nn.Parameter], rate: float) -> AdamW:
-            return AdamW(
-                parameters,
-                lr=rate,
-                betas=config.betas,
-                weight_decay=config.weight_decay,
-                fused=True,
-            )
+        def adamw(parameters: list[nn.Parameter], rate: float) -> AdamW:
+            decay = config.weight_decay
+            return AdamW(parameters, rate, config.betas, weight_decay=decay, fused=True)
 
-        self.generators = optimiser(model.generator_parameters(), config.rate_generators)
-        self.discriminators = [
-            optimiser(list(network.parameters()), config.rate_discriminators)
-            for network in (model.discriminator_data, model.discriminator_sim)
-        ]
-        self.schedules = [
-            LambdaLR(o, self._rising) for o in (self.generators, *self.discriminators)
-        ]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state of optimisers and schedules; the networks have their own."""
-        return {
-            "optimisers": [o.state_dict() for o in (self.generators, *self.discriminators)],
-            "schedules": [schedule.state_dict() for schedule in self.schedules],
+        rate = config.rate_discriminators
+        self.generators = adamw(model.generator_parameters(), config.rate_generators)
+        self.discriminators = {
+            side: adamw(list(judge.parameters()), rate)
+            for side, judge in model.judges().items()
         }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of a step with the same settings."""
-        optimisers = (self.generators, *self.discriminators)
-        for optimiser, own in zip(optimisers, state["optimisers"], strict=True):
-            load_optimiser(optimiser, own)
-        for schedule, own in zip(self.schedules, state["schedules"], strict=True):
-            schedule.load_state_dict(own)
-
-    def _rate_factor(self, iteration: int) -> float:
-        """Constant, then linear to zero at the end (paper, section 3.4.2)."""
-        decay = max(1, self.config.iterations - self.config.decay_start)
-        return min(1.0, max(0.0, (self.config.iterations - iteration) / decay))
-
-    def _rising(self, iteration: int) -> float:
-        """The factor above, after a linear rise in the first iterations."""
-        rise = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
-        return rise * self._rate_factor(iteration)
+        self.optimisers = [self.generators, *self.discriminators.values()]
+        # of the discriminators, too, the rates follow the iterations, not their own updates
+        self.schedules = [LambdaLR(o, self._rate_factor) for o in self.optimisers]
 
     def __call__(
         self, iteration: int, sim: Tensor, data: Tensor, rows: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Train on one batch of each side, shapes (batch, 1, samples); return the losses.
+        """Train on one batch of each side; return the losses, a discriminator's if updated.
 
         With noise outside the generators, `rows` are the indices of the simulated pulses.
-        Discriminator losses are included only in iterations that update the discriminators.
         """
-        self.noise = self.config.instance_noise * self._rate_factor(iteration)
-        losses, *judged = self._update_generators(sim, data, rows)
+        model, limit = self.model, self.config.max_grad_norm
+        self.noise = self.config.instance_noise * self._falling(iteration)
+        for judge in model.judges().values():  # they are fixed here
+            judge.requires_grad_(False)
+            judge.fix_statistics()
+        losses, fakes = self.generator_losses(sim, data, rows)
+        self.generators.zero_grad(set_to_none=True)
+        self.total(losses).backward()  # type: ignore[no-untyped-call]
+        clip_grad_norm_(model.generator_parameters(), limit)
+        self.generators.step()
+        for judge in model.judges().values():
+            judge.requires_grad_(True).train()
         self.accuracy = {}
         if iteration % self.config.discriminator_interval == 0:
-            names = ("discriminator_data", "discriminator_sim")
-            losses |= self._update_discriminators(dict(zip(names, judged, strict=True)))
+            for side, real in (("data", data), ("sim", sim)):
+                losses[f"discriminator_{side}"] = self._judge(side, real, fakes[side].detach())
         for schedule in self.schedules:
             schedule.step()
         return {name: loss.detach() for name, loss in losses.items()}
 
     def generator_losses(
         self, sim: Tensor, data: Tensor, rows: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], Judged, Judged]:
-        """Return the six losses of the generators and the pulses for each discriminator."""
-        model, weights = self.model, self.weights
-        done = self._compared(sim, data, rows)
-        judged_data = model.discriminator_data(self._noisy(done.judged_data.fake))
-        judged_sim = model.discriminator_sim(self._noisy(done.judged_sim.fake))
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The six losses of the generators, and translated pulses by side."""
+        ren, iren, weights = self.ren, self.iren, self.weights
+        fake_data, fake_sim = ren(sim), iren(data)
+        same_data, same_sim = ren(data), iren(sim)
+        cycled_sim, cycled_data = iren(fake_data), ren(fake_sim)
+        ignored = None
+        if self.outside is not None and rows is not None:
+            # generators make no noise: discriminators see it, and cycles of data lack it
+            fake_data = self.outside.dress_windows(fake_data, rows)
+            ignored = tolerance(data, self.outside.preparation)
+        judged_data = self.model.discriminator_data(self._noisy(fake_data))  # (batch,)
+        judged_sim = self.model.discriminator_sim(self._noisy(fake_sim))
         losses = {
-            "identity_data": weighted_l1(*done.identity_data, weights),
-            "identity_sim": weighted_l1(*done.identity_sim, weights),
-            "cycle_forward": weighted_l1(*done.cycle_forward, weights),
-            "cycle_backward": weighted_l1(*done.cycle_backward, weights, done.tolerance),
+            "identity_data": weighted_l1(same_data, data, weights),
+            "identity_sim": weighted_l1(same_sim, sim, weights),
+            "cycle_forward": weighted_l1(cycled_sim, sim, weights),
+            "cycle_backward": weighted_l1(cycled_data, data, weights, ignored),
             "adversarial_ren": real_loss(judged_data),
             "adversarial_iren": real_loss(judged_sim),
         }
-        return losses, done.judged_data, done.judged_sim
-
-    def _compared(self, sim: Tensor, data: Tensor, rows: Tensor | None) -> Compared:
-        """Run the generators, and add noise to translations if it is added outside of them."""
-        outside = self.outside
-        if self.chain is not None and outside is not None and rows is not None:
-            return self.chain(sim, data, rows, outside)
-        fake_data, fake_sim = self.ren(sim), self.iren(data)
-        same_data, same_sim = self.ren(data), self.iren(sim)
-        cycled_sim, cycled_data = self.iren(fake_data), self.ren(fake_sim)
-        noise = None
-        if outside is not None and rows is not None:
-            fake_data = outside.dress_windows(fake_data, rows)
-            noise = tolerance(data, outside.preparation)
-        return Compared(
-            (same_data, data),
-            (same_sim, sim),
-            (cycled_sim, sim),
-            (cycled_data, data),
-            Judged(data, fake_data),
-            Judged(sim, fake_sim),
-            noise,
-        )
+        return losses, {"data": fake_data, "sim": fake_sim}
 
     def total(self, losses: dict[str, Tensor]) -> Tensor:
         """Weighted sum of the generators' six losses."""
@@ -230,58 +203,48 @@ class Step:
             + c.adversarial_weight * (losses["adversarial_ren"] + losses["adversarial_iren"])
         )
 
-    def _update_generators(
-        self, sim: Tensor, data: Tensor, rows: Tensor | None
-    ) -> tuple[dict[str, Tensor], Judged, Judged]:
-        model = self.model
-        discriminators = (model.discriminator_data, model.discriminator_sim)
-        for network in discriminators:  # they are fixed here
-            network.requires_grad_(False)
-            network.fix_statistics()
-        losses, judged_data, judged_sim = self.generator_losses(sim, data, rows)
-        self.generators.zero_grad(set_to_none=True)
-        self.total(losses).backward()  # type: ignore[no-untyped-call]
-        clip_grad_norm_(model.generator_parameters(), self.config.max_grad_norm)
-        self.generators.step()
-        for network in discriminators:
-            network.requires_grad_(True).train()
-        return losses, judged_data, judged_sim
-
-    def _noisy(self, pulses: Tensor) -> Tensor:
-        """Add the instance noise of this iteration, if any."""
-        if not self.noise:
-            return pulses
-        return pulses + self.noise * torch.randn_like(pulses)
-
-    def _discriminator_loss(
-        self, network: Discriminator, real: Tensor, fake: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the adversarial loss, the gradient penalty, and the accuracy."""
+    def _judge(self, side: str, real: Tensor, fake: Tensor) -> Tensor:
+        """Update the discriminator of a side; return its loss without the gradient penalty."""
+        network, optimiser = self.model.judges()[side], self.discriminators[side]
         weight = self.config.losses.gradient_penalty
         # in one batch: the batch norm must see both kinds together
         pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
         # cuDNN's GRU has no second derivative
         with torch.backends.cudnn.flags(enabled=weight == 0):
-            found = network(pulses)
-        loss = real_loss(found[: len(real)]) + fake_loss(found[len(real) :])
-        right = torch.cat([found[: len(real)] > 0, found[len(real) :] < 0])
-        accuracy = right.float().mean()
-        if not weight:
-            return loss, torch.zeros_like(loss), accuracy
-        (slope,) = torch.autograd.grad(found.sum(), pulses, create_graph=True)
-        return loss, weight * slope.square().sum(dim=(1, 2)).mean(), accuracy
+            logits = network(pulses)  # (2 batch,)
+        of_real, of_fake = logits[: len(real)], logits[len(real) :]
+        loss = real_loss(of_real) + fake_loss(of_fake)
+        penalty = weight * mean_square_slope(logits, pulses) if weight else 0.0
+        optimiser.zero_grad(set_to_none=True)
+        (loss + penalty).backward()  # type: ignore[no-untyped-call]
+        clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
+        optimiser.step()
+        self.accuracy[side] = torch.cat([of_real > 0, of_fake < 0]).float().mean()
+        return loss
 
-    def _update_discriminators(self, judged: dict[str, Judged]) -> dict[str, Tensor]:
-        losses = {}
-        for (name, pulses), optimiser in zip(judged.items(), self.discriminators, strict=True):
-            network = getattr(self.model, name)
-            loss, penalty, accuracy = self._discriminator_loss(
-                network, pulses.real.detach(), pulses.fake.detach()
-            )
-            optimiser.zero_grad(set_to_none=True)
-            (loss + penalty).backward()  # type: ignore[no-untyped-call]
-            clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
-            optimiser.step()
-            losses[name] = loss
-            self.accuracy[name.removeprefix("discriminator_")] = accuracy
-        return losses
+    def _noisy(self, pulses: Tensor) -> Tensor:
+        """Add the instance noise of this iteration, if any."""
+        return pulses + self.noise * torch.randn_like(pulses) if self.noise else pulses
+
+    def _falling(self, iteration: int) -> float:
+        """Constant, then linear to zero at the end (paper, section 3.4.2)."""
+        last = self.config.iterations
+        return min(1.0, max(0, last - iteration) / max(1, last - self.config.decay_start))
+
+    def _rate_factor(self, iteration: int) -> float:
+        """The factor above, after a linear rise in the first iterations."""
+        rise = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
+        return rise * self._falling(iteration)
+
+
+def _pass(network: nn.Module, config: TrainingConfig) -> Callable[[Tensor], Tensor]:
+    """A generator's forward pass; weights, losses and discriminators stay in float32."""
+    run: Callable[[Tensor], Tensor] = torch.compile(network) if config.compiled else network
+    if config.precision == "float32":
+        return run
+
+    def in_bf16(pulses: Tensor) -> Tensor:
+        with torch.autocast(pulses.device.type, torch.bfloat16):
+            return run(pulses).to(pulses.dtype)
+
+    return in_bf16

@@ -47,8 +47,6 @@ ONSET_PART = Part(
     "no readout shapes it: the physics simulated are not those of the detector",
     "cpunet calibrate finds temperature and impurities",
 )
-# a remedy that comes before it, in recipes that do not stretch by themselves
-STRETCH = "--recipe best stretches the drift; "
 PARTS = {
     "onset": ONSET_PART,
     "edge": Part(
@@ -103,19 +101,16 @@ def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
     return {part: off[part] for part in sorted(off, key=order, reverse=True)}
 
 
-def diagnosis(pulls: Mapping[str, float], *, stretches: bool = False) -> list[str]:
+def diagnosis(pulls: Mapping[str, float]) -> list[str]:
     """One line for each part that is off: by how much, why, and what to try.
 
     Parameters
     ----------
     pulls
         Pulls of the moments by name, from a fit.
-    stretches
-        Whether the fit could stretch the drift.
     """
     return [
         f"{PARTS[part].name} is off by {size:.0f} σ: {PARTS[part].cause}; try: "
-        + (STRETCH if part == "onset" and not stretches else "")
         + PARTS[part].remedy
         for part, size in parts_off(pulls).items()
     ]

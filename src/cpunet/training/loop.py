@@ -1,33 +1,37 @@
-"""The training loop: batch, step, log, checkpoint, and stop if a loss is not finite."""
+"""The training loop: batch, step, log, checkpoint, and stop if a loss is not finite.
+
+One step is in `cpunet.training.cyclegan`.  The final generators are running averages of the
+trained ones, with batch-norm statistics of the side that each of them translates.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, update_bn
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
-from cpunet.training.chain_step import ChainStep
 from cpunet.training.cyclegan import CycleGan, Step
-from cpunet.training.pairs import Pairs
-from cpunet.training.sampling import EpochSampler
+from cpunet.training.outside import Outside
 from cpunet.training.start import match_skips
-from cpunet.training.statistics import refresh_batch_statistics
-from cpunet.training.surroundings import NONE, Surroundings
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
-Entry = tuple[int, float, dict[str, Tensor], dict[str, Tensor]]
-# dicts and lists of tensors, numbers and text; has "iteration", and "pairs" while these last
+# dicts and lists of tensors, numbers and text; has "iteration"
 State = dict[str, Any]
+
+LAST = 0.25  # last fraction of the updates, over which accuracies are averaged
+MIN_N = 20  # minimum number of updates
+WON, LOST = 0.95, 0.52  # accuracy of a discriminator from which a generator learns nothing
 
 
 class StoppedError(CpunetError):
@@ -42,20 +46,17 @@ class CheckpointHooks:
     ----------
     save
         Called with the state every ``checkpoint_interval`` iterations, after the last one and
-        before a stop, always after the listener has received all earlier records; on the way
-        through `pairs` as well.  The tensors change again once it returns.
+        before a stop, always after the listener has received all earlier records.  The tensors
+        change again once it returns.
     start
         State to continue from.
     stop
         Called after each iteration; True to stop there.
-    paired
-        Called with the number of iterations on pairs since the last call.
     """
 
     save: Callable[[State], None]
     start: State | None = None
     stop: Callable[[], bool] = lambda: False
-    paired: Callable[[int], None] = lambda _steps: None
 
 
 NOTHING_KEPT = CheckpointHooks(lambda _state: None)
@@ -69,7 +70,7 @@ def train(
     seed: int,
     device: str = "cpu",
     init: Callable[[CycleGan], None] | None = None,
-    surroundings: Surroundings = NONE,
+    outside: Outside | None = None,
     listener: Listener | None = None,
     hooks: CheckpointHooks = NOTHING_KEPT,
 ) -> CycleGan:
@@ -90,8 +91,8 @@ def train(
         ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
         Fills the networks with initial weights, instead of the closed-form start.
-    surroundings
-        Noise outside the generators, a chain before them, a teacher; as the recipe requires.
+    outside
+        Noise outside the generators, if the recipe requires it.
     listener
         Called every ``log_interval`` iterations, and before each state is saved, with the
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
@@ -111,56 +112,116 @@ def train(
             raise CpunetError(f"no {name} pulses to train on")
     config = recipe.cyclegan.training
     with _seeded(seed, device):
-        model = CycleGan(recipe, surroundings).to(device).train()
-        behind = None
-        if surroundings.chain is not None:
-            behind = ChainStep(*surroundings.chain, model.ren, model.iren, recipe)
+        model = CycleGan(recipe, outside).to(device).train()
+        # far apart, so that neighbouring seeds share no sampler
+        seeds = 2 * seed + 1_000_003, 2 * seed + 2_000_004
         samplers = [
-            EpochSampler(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, side)
-            for side, pulses in zip(_sampler_seeds(seed), (sim, data), strict=True)
+            EpochSampler(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, own)
+            for pulses, own in zip((sim, data), seeds, strict=True)
         ]
-        if hooks.start is None:
-            _begin(model, samplers, recipe, behind, init)
-        step = Step(
-            model,
-            config,
-            outside=surroundings.outside,
-            chain=behind,
-            warmup=0 if init is None and surroundings.teacher is None else config.warmup,
-        )
-        pairs = Pairs(model, samplers[0], recipe, surroundings, behind)
-        training = _Training(step, samplers, device, pairs)
+        if hooks.start is None and init is not None:
+            init(model)
+        elif hooks.start is None:
+            at = recipe.preparation.samples_before
+            match_skips(model, samplers[0].pulses, samplers[1].pulses, at)
+        warmup = 0 if init is None else config.warmup
+        step = Step(model, config, outside=outside, warmup=warmup)
+        training = _Training(step, samplers, device)
         if hooks.start is not None:
             training.load_state_dict(hooks.start)
         try:
-            if training.iteration == 0:
-                _learn_pairs(training, hooks)
             _iterate(training, listener, hooks)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
                 "the seed, and begin again"
             ) from error
-        training.take_averages()
-        runs = (None, None) if behind is None else (behind.records, behind.iren)
-        for network, sampler, run in zip((model.ren, model.iren), samplers, runs, strict=True):
-            refresh_batch_statistics(network, sampler, config.statistics_batches, run)
+        for averaged, network, sampler in zip(
+            training.averages, training.generators, samplers, strict=True
+        ):
+            network.load_state_dict(averaged.module.state_dict())
+            refresh_batch_statistics(network, sampler, config.statistics_batches)
     return model.eval()
 
 
-def _begin(
-    model: CycleGan,
-    samplers: list[EpochSampler],
-    recipe: Recipe,
-    behind: ChainStep | None,
-    init: Callable[[CycleGan], None] | None,
-) -> None:
-    """Initialise the generators: from given weights or in closed form."""
-    if init is not None:
-        init(model)
-    elif behind is None:
-        sim, data = (sampler.pulses for sampler in samplers)
-        match_skips(model, sim, data, recipe.preparation.samples_before)
+class EpochSampler:
+    """Batches of a set of pulses without replacement, reshuffled when too few are left.
+
+    Each side has its own, so no simulated pulse is tied to one measured pulse, and the surplus
+    of the larger set is not thrown away.  Sets smaller than a batch are drawn with replacement.
+    """
+
+    def __init__(self, pulses: Tensor, batch_size: int, seed: int) -> None:
+        self.pulses = pulses
+        self.batch_size = batch_size
+        self._random = torch.Generator().manual_seed(seed)
+        self._order = torch.empty(0, dtype=torch.long)
+        self.last_rows = torch.empty(0, dtype=torch.long)
+        """Rows of the pulses of the last batch."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the rows still to be drawn and the state of the random numbers."""
+        return {"order": self._order.clone(), "random": self._random.get_state()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the state of a sampler of the same pulses."""
+        self._order = state["order"]
+        self._random.set_state(state["random"])
+
+    def next_batch(self) -> Tensor:
+        """Return the next batch, shape (batch, 1, samples)."""
+        n = len(self.pulses)
+        if n < self.batch_size:
+            chosen = torch.randint(n, (self.batch_size,), generator=self._random)
+        else:
+            if len(self._order) < self.batch_size:
+                self._order = torch.randperm(n, generator=self._random)
+            chosen = self._order[: self.batch_size]
+            self._order = self._order[self.batch_size :]
+        self.last_rows = chosen
+        return self.pulses[chosen.to(self.pulses.device)]
+
+
+def refresh_batch_statistics(network: nn.Module, sampler: EpochSampler, batches: int) -> None:
+    """Replace the running statistics of all batch norms by averages over one side's pulses.
+
+    In training a generator sees pulses of both sides (identity and cycle losses).  For one side
+    alone, the running averages of both shift the tail slope of a translation by more than its
+    spread (Wu and Johnson 2021, arXiv:2105.07576, section 3).  Dropout is off meanwhile, as in
+    a translation: it raises the variance at the batch norms behind it, here by up to a sixth
+    (Li et al. 2019, CVPR, "variance shift").
+    """
+    # `update_bn` switches every module to training mode
+    layers = [module for module in network.modules() if isinstance(module, nn.Dropout)]
+    fractions = [layer.p for layer in layers]
+    for layer in layers:
+        layer.p = 0.0
+    update_bn((sampler.next_batch() for _ in range(batches)), network)
+    for layer, fraction in zip(layers, fractions, strict=True):
+        layer.p = fraction
+
+
+def judges_noted(records: Sequence[Record]) -> list[str]:
+    """One line for each discriminator that has won or lost in the last part of a training."""
+    told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
+    last = told[-max(1, round(LAST * len(told))) :]
+    if len(last) < MIN_N:
+        return []
+    lines = []
+    for side in last[0]:
+        mean = float(np.mean([accuracy[side] for accuracy in last]))
+        if mean > WON:
+            lines.append(
+                f"the judge of {side} has won: it is right {100 * mean:.0f} % of the time, so "
+                "translations are still easily distinguished; train longer or lower "
+                "training.rate_discriminators"
+            )
+        elif mean < LOST:
+            lines.append(
+                f"the judge of {side} has lost: it is right {100 * mean:.0f} % of the time, so "
+                "it finds nothing to teach; see the scores whether there is nothing left"
+            )
+    return lines
 
 
 class _DivergenceError(Exception):
@@ -170,93 +231,59 @@ class _DivergenceError(Exception):
 class _Training:
     """Everything that changes from iteration to iteration."""
 
-    def __init__(
-        self, step: Step, samplers: list[EpochSampler], device: str, pairs: Pairs
-    ) -> None:
-        self.step, self.samplers, self.pairs = step, samplers, pairs
-        self.model, self.config = step.model, step.config
+    def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
+        self.step, self.samplers, self.config = step, samplers, step.config
+        self.model, self.generators = step.model, (step.model.ren, step.model.iren)
         self.device = torch.device(device)
-        model, config = self.model, self.config
-        average = get_ema_multi_avg_fn(config.average_decay)  # type: ignore[no-untyped-call]
-        self.generators = (model.ren, model.iren)
+        average = get_ema_multi_avg_fn(self.config.average_decay)  # type: ignore[no-untyped-call]
         self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
+        self.parts: dict[str, Sequence[Any]] = {
+            "averages": self.averages,
+            "optimisers": step.optimisers,
+            "schedules": step.schedules,
+            "decks": samplers,
+        }
         self.iteration = 0  # number of completed iterations
 
-    def advance(self) -> Entry:
-        """Do an iteration; return its number, learning rate, losses and accuracies."""
+    def advance(self) -> dict[str, Any]:
+        """Do an iteration; return its record, with tensors for numbers."""
         iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
-        batches = [sampler.next_batch() for sampler in self.samplers]
-        rows = () if self.step.outside is None else (self.samplers[0].last_rows,)
-        losses = self.step(iteration, *batches, *rows)
+        sim, data = (sampler.next_batch() for sampler in self.samplers)
+        losses = self.step(iteration, sim, data, self.samplers[0].last_rows)
         for averaged, network in zip(self.averages, self.generators, strict=True):
             averaged.update_parameters(network)
         self.iteration += 1
-        return iteration, rate, losses, self.step.accuracy
-
-    def take_averages(self) -> None:
-        """Give the generators their averaged weights."""
-        for averaged, network in zip(self.averages, self.generators, strict=True):
-            network.load_state_dict(averaged.module.state_dict())
+        told = {"iteration": iteration, "rate": rate, "losses": losses}
+        return told | ({"accuracy": self.step.accuracy} if self.step.accuracy else {})
 
     def state_dict(self) -> State:
         """Return all that the next iterations depend on, except pulses and settings."""
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        pairs = {} if self.iteration else {"pairs": self.pairs.state_dict()}
-        return pairs | {
+        return {
             "iteration": self.iteration,
             "model": self.model.state_dict(),
-            "averages": [averaged.state_dict() for averaged in self.averages],
-            "step": self.step.state_dict(),
-            "decks": [sampler.state_dict() for sampler in self.samplers],
             "random": random,
-        }
+        } | {name: [part.state_dict() for part in parts] for name, parts in self.parts.items()}
 
     def load_state_dict(self, state: State) -> None:
         """Restore the state of a training with the same pulses and settings."""
         self.iteration = state["iteration"]
-        if "pairs" in state:
-            self.pairs.load_state_dict(state["pairs"])
-        else:
-            self.pairs.skip()
         self.model.load_state_dict(state["model"])
-        for averaged, own in zip(self.averages, state["averages"], strict=True):
-            averaged.load_state_dict(own)
-        self.step.load_state_dict(state["step"])
-        for sampler, own in zip(self.samplers, state["decks"], strict=True):
-            sampler.load_state_dict(own)
-        random = state["random"]
-        torch.set_rng_state(random["cpu"])
-        if self.device.type == "cuda" and "cuda" in random:
-            torch.cuda.set_rng_state(random["cuda"], self.device)
-
-
-def _learn_pairs(training: _Training, hooks: CheckpointHooks) -> None:
-    """Do the supervised steps that are left, if there are any."""
-    pairs, interval = training.pairs, training.config.checkpoint_interval
-    while pairs.left:
-        pairs.advance()
-        hooks.paired(1)
-        stop = hooks.stop()
-        if stop or pairs.iteration % interval == 0:
-            _save(training, hooks)
-        if stop:
-            raise StoppedError(
-                f"stopped after {pairs.iteration} of {pairs.count} iterations on pairs; "
-                "continue with --resume"
-            )
-    pairs.skip()
-
-
-def _save(training: _Training, hooks: CheckpointHooks) -> None:
-    _require_finite_weights(training)
-    hooks.save(training.state_dict())
+        for name, parts in self.parts.items():
+            for part, own in zip(parts, state[name], strict=True):
+                if name == "optimisers":  # the keys of a file are text
+                    own = own | {"state": {int(n): v for n, v in own["state"].items()}}
+                part.load_state_dict(own)
+        torch.set_rng_state(state["random"]["cpu"])
+        if self.device.type == "cuda" and "cuda" in state["random"]:
+            torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
 
 
 def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHooks) -> None:
     config = training.config
-    pending: list[Entry] = []
+    pending: list[dict[str, Any]] = []
     while training.iteration < config.iterations:
         pending.append(training.advance())
         done = training.iteration
@@ -265,13 +292,16 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
         keep = last or stop or done % config.checkpoint_interval == 0
         # several iterations are fetched at once: each transfer makes a GPU wait
         if keep or len(pending) == config.log_interval:
-            records = [_record(*entry) for entry in pending]
+            records = [_finite(record) for record in pending]
             pending.clear()
-            _require_finite(records)
             if listener is not None:
                 listener(records)
         if keep:
-            _save(training, hooks)
+            # losses are one iteration behind the weights
+            for name, value in training.model.state_dict().items():
+                if not bool(torch.isfinite(value).all()):
+                    raise _DivergenceError(f"{name} is not finite after iteration {done - 1}")
+            hooks.save(training.state_dict())
         if stop:
             raise StoppedError(
                 f"stopped after {done} of {config.iterations} iterations; "
@@ -279,40 +309,15 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
             )
 
 
-def _record(
-    iteration: int, rate: float, losses: dict[str, Tensor], accuracy: dict[str, Tensor]
-) -> Record:
-    told: Record = {
-        "iteration": iteration,
-        "rate": rate,
-        "losses": {name: float(value) for name, value in losses.items()},
-    }
-    if accuracy:
-        told["accuracy"] = {side: float(value) for side, value in accuracy.items()}
-    return told
-
-
-def _require_finite(records: list[Record]) -> None:
-    for record in records:
-        losses = record["losses"]
-        assert isinstance(losses, dict)
-        for name, value in losses.items():
-            if not math.isfinite(value):
-                raise _DivergenceError(f"{name} is {value} in iteration {record['iteration']}")
-
-
-def _require_finite_weights(training: _Training) -> None:
-    """Do not save a state with non-finite weights: losses are one iteration behind them."""
-    for name, value in training.model.state_dict().items():
-        if not bool(torch.isfinite(value).all()):
-            done, on_pairs = training.iteration, training.pairs.iteration
-            where = f"iteration {done - 1}" if done else f"iteration {on_pairs - 1} on pairs"
-            raise _DivergenceError(f"{name} is not finite after {where}")
-
-
-def _sampler_seeds(seed: int) -> Iterator[int]:
-    # far apart, so that neighbouring seeds share no sampler
-    yield from (2 * seed + 1_000_003, 2 * seed + 2_000_004)
+def _finite(record: dict[str, Any]) -> Record:
+    """The record in numbers; a `_DivergenceError` if a loss is not finite."""
+    for part in ("losses", "accuracy"):
+        if part in record:
+            record[part] = {name: float(value) for name, value in record[part].items()}
+    for name, value in record["losses"].items():
+        if not math.isfinite(value):
+            raise _DivergenceError(f"{name} is {value} in iteration {record['iteration']}")
+    return record
 
 
 @contextmanager

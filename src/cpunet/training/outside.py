@@ -9,7 +9,6 @@ the window is found without gradients; baseline and scale are differentiable.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,29 +18,12 @@ from torch import Tensor
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.extension import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.linear_inverse import stretch
-from cpunet.networks.response_layer import PADDING_AFTER as RESPONSE_ROOM
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
 MIN_SCALE = 1e-3
-PLATEAU = 100  # samples after the window whose mean gives the height of a record
 TOLERATED = 3.0  # deviation of a cycle that is ignored, in RMS of the pulse's own baseline
-
-
-class Dressed(NamedTuple):
-    """Prepared pulses with noise.
-
-    Parameters
-    ----------
-    windows
-        Shape (batch, 1, samples).
-    start
-        Sample of its record at which each window begins, shape (batch,).
-    """
-
-    windows: Tensor
-    start: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +44,8 @@ class Outside:
     energy_kev: npt.NDArray[np.float64]
     preparation: PreparationConfig
 
-    def dress(self, records: Tensor, rows: Tensor) -> Dressed:
-        """Add noise to records of prepared height, and prepare them.
+    def dress(self, records: Tensor, rows: Tensor) -> Tensor:
+        """Add noise to records of prepared height, and prepare them, shape (batch, 1, samples).
 
         Parameters
         ----------
@@ -81,7 +63,7 @@ class Outside:
 
     def dress_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
         """The same for windows as a network makes them, shape (batch, 1, samples)."""
-        return self.dress(in_room(windows[:, 0], self.preparation), rows).windows
+        return self.dress(in_room(windows[:, 0], self.preparation), rows)
 
 
 def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:
@@ -104,7 +86,7 @@ def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:
     )
 
 
-def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dressed:
+def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Tensor:
     """Prepare records like measured traces, with gradients for all but the alignment.
 
     A record that cannot be prepared, as may happen early in a training, is cut at the nominal
@@ -121,7 +103,7 @@ def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Dre
     windows = windows - windows[:, : config.baseline_samples].mean(dim=1, keepdim=True)
     level = windows[:, -config.tail_samples :].mean(dim=1, keepdim=True)
     scale = (level / config.tail_level).clamp_min(MIN_SCALE)
-    return Dressed((windows / scale)[:, None], start)
+    return (windows / scale)[:, None]
 
 
 def tolerance(data: Tensor, config: PreparationConfig) -> Tensor:
@@ -131,9 +113,3 @@ def tolerance(data: Tensor, config: PreparationConfig) -> Tensor:
     not make.  Deviations within this tolerance are therefore ignored.
     """
     return TOLERATED * data[..., : config.baseline_samples].std(dim=-1, keepdim=True)
-
-
-def of_height(records: Tensor, tail_level: float) -> Tensor:
-    """Scale records so that the mean of the first samples after the window is `tail_level`."""
-    plateau = records[:, -RESPONSE_ROOM : PLATEAU - RESPONSE_ROOM].mean(dim=1, keepdim=True)
-    return records * (tail_level / plateau.clamp_min(MIN_SCALE))

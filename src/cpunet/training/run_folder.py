@@ -78,7 +78,7 @@ def read_info(run: Path) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If the folder is not a finished run, or of a newer version.
+        If the folder is not a finished run, or of another version.
     """
     path = Path(run) / INFO
     if not path.is_file():
@@ -92,43 +92,7 @@ def read_info(run: Path) -> dict[str, Any]:
 def read_recipe(run: Path) -> Recipe:
     """Return the resolved recipe of a run."""
     path = Path(run) / RECIPE
-    return checked(Recipe, _completed(read_values(path)), str(path))
-
-
-def _completed(settings: Any) -> Any:
-    """Add settings that recipes of earlier versions do not have."""
-    for part, known_by, added in _LATER:
-        own = settings.get(part) if isinstance(settings, dict) else None
-        if isinstance(own, dict) and known_by in own:
-            settings = settings | {part: added | own}
-    if isinstance(settings, dict) and isinstance(settings.get("chain"), dict):
-        settings = settings | {"chain": _completed(settings["chain"])}
-    if isinstance(settings, dict) and isinstance(own := settings.get("generator"), dict):
-        residual = own.get("residual")
-        if isinstance(residual, dict) and residual.keys() >= _FORMER_RESIDUAL:
-            kept = {k: v for k, v in residual.items() if k not in _FORMER_RESIDUAL}
-            later = {"weight_decay": 0.0, "roughness_weight": 0.0}
-            settings = settings | {"generator": own | {"residual": later | kept}}
-    return settings
-
-
-# part of a recipe, a setting that identifies its kind, and settings added later
-_LATER: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("generator", "fast_decays_us", {"free_decays": False, "drift_terms": 0}),
-    ("training", "conditional_bins", {"drift_terms": 0}),
-    (
-        "training",
-        "discriminator_interval",
-        {
-            "noise": "none",
-            "pairs": {"iterations": 1, "rate": 1e-3},
-            "held_out": 0.0,
-            "warmup": 0,
-        },
-    ),
-)
-# settings of a former loss for networks that correct a chain
-_FORMER_RESIDUAL = {"projections", "amplitude_weight", "size_weight", "slope_weight"}
+    return checked(Recipe, read_values(path), str(path))
 
 
 def read_losses(run: Path) -> list[Record]:

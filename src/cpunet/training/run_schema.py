@@ -1,7 +1,7 @@
 """Required content of ``run.json``, with types, so that readers of a run can rely on it.
 
-Users edit, truncate and mix up files of runs.  Additional keys are accepted, since every
-version may add some; ``format`` defines the meaning of the keys.
+Users edit, truncate and mix up files of runs.  Additional keys are accepted; ``format`` defines
+the meaning of the keys and the settings of the recipe.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cpunet.pulses.cuts import CutWindows
 
-FORMAT = 1
-"""Format of new run folders; older ones that do not state a format can also be loaded."""
+FORMAT = 2
+"""Format of run folders; those of other versions cannot be loaded."""
 
 _Number = Annotated[float, Field(ge=0, le=1e15)]
 
@@ -62,6 +62,7 @@ def problem(info: Mapping[str, Any]) -> str:
     Examples
     --------
     >>> facts = {"recipe": "fast", "peak": "FEP", "seed": 0, "device": "cpu", "seconds": 9.5}
+    >>> facts |= {"format": FORMAT}
     >>> problem(facts | {"dt_ns": 16}), problem(facts | {"dt_ns": "16"})
     ('', 'damaged (dt_ns: Input should be a valid number); train again')
     """
@@ -72,6 +73,9 @@ def problem(info: Mapping[str, Any]) -> str:
         key = ".".join(map(str, first["loc"]))
         wrong = f"no {key}" if first["type"] == "missing" else f"{key}: {first['msg']}"
         return f"damaged ({wrong}); train again"
-    if found.format > FORMAT:
-        return f"of a newer version of cpunet (format {found.format}); read it with that one"
+    if found.format != FORMAT:
+        return (
+            f"of another version of cpunet (format {found.format}, not {FORMAT}); read it with "
+            "that one, or train again"
+        )
     return ""

@@ -224,8 +224,8 @@ class UnfinishedRun:
             write_checkpoint(self.folder, Checkpoint(state, facts))
         except OSError as error:
             self._note(
-                f"warning: {self.folder}: no checkpoint after {_progress(state)} "
-                f"({error.strerror or error}); the one before is kept"
+                f"warning: {self.folder}: no checkpoint after {state['iteration']} "
+                f"iterations ({error.strerror or error}); the one before is kept"
             )
 
     def finish(self) -> None:
@@ -247,7 +247,7 @@ class UnfinishedRun:
             if damaged:
                 self._note(
                     f"warning: {self.folder / CHECKPOINT}: damaged; going on from the previous "
-                    f"one, after {_progress(checkpoint.state)}"
+                    f"one, after {checkpoint.state['iteration']} iterations"
                 )
             return checkpoint
         if damaged:
@@ -264,13 +264,7 @@ class UnfinishedRun:
         self.started, self._seconds_before = facts["started"], facts["seconds"]
         self.resumed_at = [*facts["resumed_at"], state["iteration"]]
         self._log.cut(facts["log_bytes"])
-        self._note(f"going on after {_progress(state)}")
-
-
-def _progress(state: State) -> str:
-    if "pairs" in state:
-        return f"{state['pairs']['iteration']} iterations on pairs"
-    return f"{state['iteration']} iterations"
+        self._note(f"going on after {state['iteration']} iterations")
 
 
 def _fits(checkpoint: Checkpoint, log_bytes: int) -> bool:

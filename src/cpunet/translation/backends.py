@@ -15,7 +15,6 @@ from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
 from cpunet.electronics.finishing import finish_with_codes
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
-from cpunet.networks.chain_unet import InverseUNet
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
@@ -236,9 +235,7 @@ class ResponseBackend(Backend):
 class InverseBackend(Backend):
     """A linear inverse, followed by the preparation of simulated pulses."""
 
-    def __init__(
-        self, inverse: LinearInverse | InverseUNet, config: PreparationConfig, dt_ns: float
-    ) -> None:
+    def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
         self.network = inverse.eval()
         self.config = config
         self.dt_ns = dt_ns

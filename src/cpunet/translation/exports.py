@@ -23,7 +23,6 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.hybrid import HybridGenerator, RecordCorrection
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -60,7 +59,7 @@ class NetworkGraph(PositionalUNet):
 
 
 class ChainGraph(nn.Module):
-    """A readout chain as a matrix, with a stretch of the drift and a residual if there are any.
+    """A readout chain as a matrix, with a stretch of the drift if there is one.
 
     The chain is linear.  A product with its responses to single samples gives the same
     records as its Fourier transforms, which few formats support.
@@ -76,19 +75,12 @@ class ChainGraph(nn.Module):
         with torch.inference_mode():
             matrix = readout(torch.eye(length, device=readout.dt_ns.device))
         self.register_buffer("matrix", matrix.clone().cpu())
-        self.residual: RecordCorrection | None = None
-        if isinstance(chain, HybridGenerator) and bool(chain.residual.used):
-            self.residual = copy.deepcopy(chain.residual)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
         if self.drift is not None:
             windows = self.drift(windows, dt_ns=self.dt_ns)
-        records = windows @ self.matrix
-        if self.residual is None:
-            return records
-        corrected: Tensor = self.residual.corrected(records)[0]
-        return corrected
+        return windows @ self.matrix
 
 
 @dataclass(frozen=True)

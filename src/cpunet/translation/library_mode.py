@@ -16,7 +16,6 @@ import scipy.ndimage
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
@@ -79,16 +78,13 @@ class TemplateTranslator:
         self.ren = ren
         self.dt_ns = dt_ns
         self.chain: ResponseGenerator | None = None
-        same = bool(np.isclose(dt_ns, ren.dt_ns))
         backend = ren.backend
-        network = not isinstance(backend, ResponseBackend)
         if isinstance(backend, ResponseBackend):
             self.chain = copy.deepcopy(backend.chain)
-            network = isinstance(self.chain, HybridGenerator) and bool(self.chain.residual.used)
             self.chain.response.dt_ns.fill_(dt_ns)
             if self.chain.response.drift is not None:
                 self.chain.response.drift.keeps_begin = True  # templates are summed by time
-        if network and not same:
+        elif not np.isclose(dt_ns, ren.dt_ns):
             raise CpunetError(
                 f"templates sampled every {dt_ns:g} ns, but the run's network knows "
                 f"{ren.dt_ns:g} ns alone; give a run without a network (recipe fast), or "

@@ -21,15 +21,13 @@ import torch
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
-from cpunet.networks.chain_unet import InverseUNet, UNetCorrection
-from cpunet.networks.hybrid import EdgeResidual, HybridGenerator
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
-from cpunet.recipes.network_settings import HybridConfig, PunetConfig
+from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 from cpunet.translation.backends import (
@@ -46,9 +44,7 @@ from cpunet.translation.learned_remains import remains_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
-RESIDUAL = "residual"  # its weights are stored beside those of the chain
-# names of other weights stored with those of a CycleGAN, for its translations
-CHAIN, INVERSE, NOISE = "chain", "inverse", "noise"
+NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
 
@@ -113,12 +109,10 @@ class Translator:
 
     @classmethod
     def _backend(cls, run: Path, recipe: Recipe, dt_ns: float, device: str) -> Backend:
-        generator, length = recipe.generator, recipe.network_length
+        generator, length = recipe.generator, recipe.preparation.length
         if isinstance(generator, PunetConfig):
             network = PositionalUNet(generator, length)
             load_network(run, cls.part, network, device)
-            if recipe.chain is not None:
-                return cls._behind_chain(run, network, recipe, dt_ns, device)
             if cls.part == IREN.part or recipe.cyclegan.training.noise == "none":
                 return NetworkBackend(network)
             noise = KeptNoise(dt_ns)
@@ -128,32 +122,11 @@ class Translator:
         if cls.part == REN.part:
             response = ResponseGenerator(generator, dt_ns)
             load_network(run, cls.part, response, device)
-            if isinstance(generator, HybridConfig):
-                residual = EdgeResidual(generator.residual)
-                load_network(run, RESIDUAL, residual, device)
-                response = HybridGenerator(response, residual)
             response.remains = remains_of(read_info(run))
             return ResponseBackend(response, recipe.preparation)
         inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
         load_network(run, cls.part, inverse, device)
         return InverseBackend(inverse, recipe.preparation, dt_ns)
-
-    @classmethod
-    def _behind_chain(
-        cls, run: Path, unet: PositionalUNet, recipe: Recipe, dt_ns: float, device: str
-    ) -> Backend:
-        config, matching = recipe.of_chain.matching
-        before, after, preparation = matching.before, matching.after, recipe.preparation
-        if cls.part == REN.part:
-            chain = ResponseGenerator(config, dt_ns)
-            load_network(run, CHAIN, chain, device)
-            chain.remains = remains_of(read_info(run))
-            added = UNetCorrection(unet, before, after, preparation.tail_level).to(device)
-            return ResponseBackend(HybridGenerator(chain, added), preparation)
-        inverse = LinearInverse(Sizes.of(preparation.length, matching))
-        load_network(run, INVERSE, inverse, device)
-        whole = InverseUNet(inverse, unet, before, after)
-        return InverseBackend(whole, preparation, dt_ns)
 
     def translate(
         self,

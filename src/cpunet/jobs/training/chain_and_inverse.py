@@ -15,18 +15,14 @@ from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.networks.hybrid import HybridGenerator
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
-from cpunet.training.held_out import NOT_TESTED
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.levenberg_marquardt import Listener
-from cpunet.training.moments import TooFewPulsesError
-from cpunet.training.residual import fit_residual, no_residual
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run_folder import load_network, read_recipe
@@ -45,15 +41,6 @@ class Sides:
     data_set: InputSet | None = None
 
 
-def _with_config(recipe: Recipe, response: ResponseConfig) -> Recipe:
-    """The recipe with the configuration of a fitted response, which can include ringing."""
-    if not isinstance(recipe.generator, ResponseConfig):
-        return recipe
-    own = {name: getattr(response, name) for name in ResponseConfig.model_fields}
-    del own["name"]
-    return recipe.model_copy(update={"generator": recipe.generator.model_copy(update=own)})
-
-
 def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
     """The response of a run, as a starting point.
 
@@ -62,16 +49,14 @@ def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
     CpunetError
         If the run has no response.
     """
-    recipe, part = read_recipe(run), "ren"
-    if recipe.chain is not None:
-        recipe, part = recipe.of_chain, "chain"
+    recipe = read_recipe(run)
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
             f"{run}: a network ({recipe.name}), from which no readout chain can start; give a "
-            "run of fast or best"
+            "run of fast"
         )
     generator = ResponseGenerator(recipe.generator, dt_ns)
-    load_network(run, part, generator)
+    load_network(run, "ren", generator)
     return generator.response
 
 
@@ -120,7 +105,7 @@ def match(
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
             known = with_drift_terms(known, allowed)
-        recipe = _with_config(recipe, known.config)
+        recipe = recipe.model_copy(update={"generator": known.config})
     response, fit = fit_response(
         sides.sim,
         sides.data,
@@ -131,47 +116,30 @@ def match(
         remains=drawn,
         listener=listen,
     )
-    told = _described(fit, response, noise, sides, recipe)
+    told = _described(fit, response, noise, sides)
     _note(fit, told, monitor)
     if told_of_remains is not None:
         told["remains"] = told_of_remains
-    recipe = _with_config(recipe, response.config)
-    chain = ResponseGenerator(recipe.matching.generator, sides.sim.dt_ns)
+    # as fitted: a ringing or a stretch may have been added
+    recipe = recipe.model_copy(update={"generator": response.config})
+    chain = ResponseGenerator(response.config, sides.sim.dt_ns)
     chain.response = response
     chain.set_noise(noise)
     chain.remains = drawn
-    ren, parts = chain, {}
-    windows, energy_kev = sides.sim.waveforms, sides.sim.energy_kev
-    if isinstance(recipe.generator, HybridConfig):
-        try:
-            residual, kept = fit_residual(
-                chain, windows, sides.data.waveforms, energy_kev, recipe, seed=seed
-            )
-        except TooFewPulsesError as error:
-            residual, kept = no_residual(recipe, seed).eval(), NOT_TESTED
-            share = f"{100 * recipe.residual.held_out:.0f} %"
-            monitor.note(f"the residual is left out: without the {share} for its test, {error}")
-        else:
-            if not kept.kept:
-                monitor.note("the residual does not help held-out pulses and is left out")
-        # stored beside the chain, which stays in its usual place for readers of chains
-        ren, parts = HybridGenerator(chain, residual), {"residual": residual}
-        told["residual"] = asdict(kept)
-    iren = fit_inverse(ren, windows, energy_kev, recipe, seed=seed)
-    return nn.ModuleDict({"ren": chain, "iren": iren} | parts), {"fit": told}, recipe
+    iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
+    return nn.ModuleDict({"ren": chain, "iren": iren}), {"fit": told}, recipe
 
 
 def _described(
-    fit: Fit, response: ElectronicsResponse, noise: BaselineNoise, sides: Sides, recipe: Recipe
+    fit: Fit, response: ElectronicsResponse, noise: BaselineNoise, sides: Sides
 ) -> dict[str, Any]:
     """Entry on the fit for ``run.json``."""
     parameters = response.describe()
-    stretches = recipe.matching.training.drift_terms > 0
     return {
         "parameters": parameters,
         **asdict(fit),
         "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
-        "causes": diagnosis(fit.pulls, stretches=stretches) if fit.poor else [],
+        "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
             "sim": len(sides.sim) - sum(n for n, _ in fit.bands.values()),
             "data": len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
-from torch import nn
 
+from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.errors import CpunetError
+from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.jobs.training.network_start import NetworkStart, network_start
+from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
+from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.held_out import Kept
-from cpunet.training.judges import judges_noted
-from cpunet.training.loop import CheckpointHooks, Listener, Record, State, train
-from cpunet.training.network_gate import NetworkGate
-from cpunet.training.pairs import number_of_pairs
-from cpunet.training.run_folder import read_losses, weights_sha256
+from cpunet.training.cyclegan import CycleGan
+from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
+from cpunet.training.outside import Outside
+from cpunet.training.run_folder import fill_networks, read_losses, read_recipe, weights_sha256
 from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
 # settings of logs and checkpoints, which do not affect the weights
@@ -32,8 +33,6 @@ class CycleGanTrainer:
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
-        self.config = recipe.cyclegan.training
-        self.steps = self.config.iterations
 
     def workplace(
         self,
@@ -47,96 +46,86 @@ class CycleGanTrainer:
 
     def train(self, job: TrainingJob) -> Trained:
         """Train or resume."""
+        recipe, how = self.recipe, job.options
         run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job), job.monitor.note)
-        state = run.begin(resume=job.options.resume)
-        how = job.options
-        start = network_start(job.sides, self.recipe, how.seed, how.init, job.monitor)
-        with _Stages(job.monitor, start, self.steps, state) as stages:
+        state = run.begin(resume=how.resume)
+        outside, told = outside_noise(job.sides, recipe, job.monitor)
+        left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
+        with job.monitor.stage("Training", left) as advance:
 
             def listen(records: list[Record]) -> None:
                 run.log(records)
-                stages.trained(len(records))
+                advance(len(records))
 
-            hooks = CheckpointHooks(run.save, state, job.stop, stages.paired)
-            model, kept = self._trained(job, start, hooks, listen)
-        run.finish()
-        if kept is not None and not kept.kept:
-            job.monitor.note(
-                "the network does not help held-out pulses and is left out; the chain stays"
+            model = train(
+                job.sim.prepared.pulses.waveforms,
+                job.data.prepared.pulses.waveforms,
+                recipe,
+                seed=how.seed,
+                device=how.device,
+                init=None if how.init is None else weights_of(how.init, recipe),
+                outside=outside,
+                listener=listen,
+                hooks=CheckpointHooks(run.save, state, job.stop),
             )
+        run.finish()
         for line in judges_noted(read_losses(job.folder)):
             job.monitor.note(f"warning: {line}")
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-        info = job.info(run.started, run.seconds) | resumed | start.told
-        if kept is not None:
-            info["network"] = asdict(kept)
-        return Trained(model, info, start.recipe)
+        return Trained(model, job.info(run.started, run.seconds) | resumed | told, recipe)
 
-    def _trained(
-        self,
-        job: TrainingJob,
-        start: NetworkStart,
-        hooks: CheckpointHooks,
-        listener: Listener,
-    ) -> tuple[nn.Module, Kept | None]:
-        """Train; with a chain, also check whether the network improves held-out pulses."""
-        sim, data = job.sim.prepared.pulses, job.data.prepared.pulses
-        surroundings, recipe, gate = start.surroundings, start.recipe, None
-        windows = sim.waveforms, data.waveforms
-        if surroundings.chain is not None and recipe.cyclegan.training.held_out:
-            gate = NetworkGate(*windows, sim.energy_kev, recipe, job.options.seed)
-            windows = sim.waveforms[gate.own], data.waveforms[gate.own_data]
-            surroundings = surroundings.of_pulses(gate.own)
-        model = train(
-            *windows,
-            recipe,
-            seed=job.options.seed,
-            device=job.options.device,
-            init=start.fill,
-            surroundings=surroundings,
-            listener=listener,
-            hooks=hooks,
+
+def outside_noise(
+    sides: Sides, recipe: Recipe, monitor: Monitor
+) -> tuple[Outside | None, dict[str, Any]]:
+    """Noise for the translations of the simulated pulses, and its entry for ``run.json``.
+
+    Raises
+    ------
+    CpunetError
+        If the recipe requires noise, and there are no baselines to draw it from.
+    """
+    if recipe.cyclegan.training.noise == "none":
+        return None, {}
+    try:
+        found = remains_of_sides(sides, recipe, monitor)
+        noise, note = measured_noise(
+            sides.data_file, sides.data, recipe.preparation, found.measured
         )
-        if gate is None or surroundings.chain is None:
-            return model, None
-        return model, gate.judge(model, surroundings.chain)
+    except CpunetError as error:
+        raise CpunetError(
+            f"{sides.data_file.path}: no baselines to draw noise from ({error}); or train "
+            "without it (--set training.noise=none)"
+        ) from error
+    if note is not None:
+        monitor.note(f"warning: {note}")
+    drawn = TraceNoise(noise, found.drawn)
+    outside = Outside(drawn, sides.sim.energy_kev, recipe.preparation)
+    return outside, {} if found.told is None else {"fit": {"remains": found.told}}
 
 
-class _Stages(ExitStack):
-    """Show the stages of a training one after the other: iterations on pairs, and its own."""
+def weights_of(init: Path, recipe: Recipe) -> Callable[[CycleGan], None]:
+    """Function that fills networks with the weights of another run.
 
-    def __init__(
-        self, monitor: Monitor, start: NetworkStart, steps: int, state: State | None
-    ) -> None:
-        super().__init__()
-        self._monitor = monitor
-        self._steps = steps - (state["iteration"] if state else 0)
-        self._pairs = number_of_pairs(start.recipe, start.surroundings)
-        if state is not None:
-            done = state["pairs"]["iteration"] if "pairs" in state else self._pairs
-            self._pairs -= done
-
-    def __enter__(self) -> Self:
-        super().__enter__()
-        self._begin()
-        return self
-
-    def _begin(self) -> None:
-        of_pairs = ("Learning pairs", self._pairs)
-        stage = of_pairs if self._pairs else ("Training", self._steps)
-        self._advance = self.enter_context(self._monitor.stage(*stage))
-
-    def paired(self, steps: int) -> None:
-        """Count iterations on pairs; after the last one the next stage begins."""
-        self._advance(steps)
-        self._pairs -= steps
-        if not self._pairs:
-            self.close()
-            self._begin()
-
-    def trained(self, steps: int) -> None:
-        """Count iterations of the training."""
-        self._advance(steps)
+    Raises
+    ------
+    CpunetError
+        If that run has no networks, or they were trained on other windows.
+    """
+    other = read_recipe(init)
+    if not isinstance(other.generator, PunetConfig):
+        raise CpunetError(
+            f"{init}: a readout chain ({other.name}), from which no network can start; give a "
+            "run of networks"
+        )
+    theirs, own = other.preparation, recipe.preparation
+    if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
+        raise CpunetError(
+            f"{init}: its networks know windows of {theirs.samples_before} + "
+            f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
+            f"{own.samples_after}; start from a run of the same windows"
+        )
+    return partial(fill_networks, init)
 
 
 def _fingerprint(job: TrainingJob) -> dict[str, Any]:

@@ -49,8 +49,7 @@ class TrainOptions:
     device
         ``"cpu"``, ``"cuda"``, or ``"auto"`` for a GPU if there is one.
     init
-        Folder of a run to start from, e.g. of another detector or period: of the same kind, or
-        a fitted chain, whose pulse pairs the networks learn first.
+        Folder of a run of the same kind to start from, e.g. of another detector or period.
     resume
         Whether to resume an unfinished training, if any; all else must be unchanged.
     force

@@ -16,7 +16,7 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
-from cpunet.recipes.network_settings import HybridConfig, ResponseConfig
+from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.settings import read_json
 from cpunet.training.run_folder import read_info
 from cpunet.translation.backends import (
@@ -199,9 +199,6 @@ def _fitted(run: Path, translator: Translator) -> list[str]:
     lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
     if rms := told["values"].get("noise_rms_kev"):
         lines.append(f"* noise of the data: {rms:.3g} keV RMS")
-    if isinstance(generator, HybridConfig):
-        settings = generator.residual.model_dump(mode="json")
-        lines.append(f"* network beside it: `{json.dumps(settings)}`")
     return lines
 
 
@@ -238,8 +235,8 @@ def _interface(translator: Translator) -> list[str]:
         )
     else:
         lines.append(
-            f"* out: `pulses`, float32 (batch, {translator.recipe.network_length}), within "
-            "0 … 1; afterwards scaled and aligned as simulated pulses.\n"
+            f"* out: `pulses`, float32 (batch, {n}), within 0 … 1; afterwards scaled and "
+            "aligned as simulated pulses.\n"
         )
     return lines
 

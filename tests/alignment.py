@@ -1,9 +1,4 @@
-"""Align pulses at half maximum, in the same way for measured and translated ones.
-
-The 99.9 % alignment of the preparation jitters by tens of samples on a flat, noisy top.
-Pulses in a fit are therefore aligned where they are steepest.  Both sides go through the same
-code, so that its effects on a pulse cancel.
-"""
+"""Align pulses at half maximum, in plain tensors: what compiled loops are compared with."""
 
 from __future__ import annotations
 
