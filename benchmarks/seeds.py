@@ -1,6 +1,6 @@
 """Train a recipe on one stand with many seeds, one file of scores each; can be resumed.
 
-Run with ``python benchmarks/seeds.py STAND FOLDER --recipe small --seeds 20``; a stand is a
+Run with ``python benchmarks/seeds.py STAND FOLDER --recipe fast --seeds 20``; a stand is a
 folder of ``cpunet stand``, or any with sim.lh5, data.lh5 and perhaps truth.npz.  Seeds whose
 file is in FOLDER are not trained again.  With ``--sim`` the simulated pulses are those of
 another stand.  A seed has failed if a score is below 0.9 of the median.
@@ -52,8 +52,6 @@ def one_seed(
             Monitor(),
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
-    if "network" in info:
-        found["network kept"] = float(info["network"]["kept"])
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():
@@ -74,7 +72,7 @@ def summary(runs: list[dict[str, Any]]) -> str:
             continue
         values = np.array([run.get(name, np.nan) for run in runs], float)
         middle = np.median(values)
-        score = not name.endswith(("seconds", "cpu", "kept", "AUC", "RMSE"))
+        score = not name.endswith(("seconds", "cpu", "AUC", "RMSE"))
         failed = str(int((~(values >= FAILED * middle)).sum())) if score else ""
         lines.append(
             f"{name:<36}{middle:>10.4g}{values.min():>10.4g}{values.max():>10.4g}{failed:>8}"
@@ -87,7 +85,7 @@ def main() -> None:
     parser.add_argument("stand", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sim", type=Path)
-    parser.add_argument("--recipe", default="small")
+    parser.add_argument("--recipe", default="fast")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--seeds", type=int, default=20)
     given = parser.parse_args()

@@ -42,7 +42,7 @@ def work(
     torch.manual_seed(0)
     keep_freed_memory()
     recipe = load_recipe(recipe_name, settings)
-    batch, length = recipe.cyclegan.training.batch_size, recipe.network_length
+    batch, length = recipe.cyclegan.training.batch_size, recipe.preparation.length
     rng = np.random.default_rng(0)
     ramps = (np.arange(length) - length / 2) / rng.uniform(20, 90, (2, batch, 1, 1)) + 1
     sim, data = torch.from_numpy(np.clip(ramps, 0, 1).astype(np.float32)).to(device)

@@ -1,4 +1,4 @@
-"""The program, whose trainings wait after two iterations for a signal.
+"""The program, whose trainings wait after an iteration for a signal.
 
 So a test can stop or kill a training that is neither too young nor done, on any machine.  A
 file to be run: processes that the program starts are held in the same way.
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.cli.main import main
-from cpunet.training.unfinished import UnfinishedRun
+from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
 
-AFTER = 2  # iterations
+AFTER = 1  # iterations
 # so that a checkpoint is there to go on from
 SETTINGS = ["training.checkpoint_interval=1", "training.log_interval=1"]
 
@@ -46,7 +46,7 @@ def forked(file: str, given: dict[str, Any], name: str = "__main__") -> Any:
 def wait_until_held(is_running: Callable[[], bool], *unfinished: Path) -> None:
     """Wait until the trainings of these folders have stored where they wait."""
     for folder in unfinished:
-        while not (folder / "checkpoint.previous.safetensors").exists():
+        while not (folder / CHECKPOINT).exists():
             assert is_running(), "it ended before"
             time.sleep(0.02)
 

@@ -23,7 +23,7 @@ from cpunet.outputs import (
     require_replaceable,
     written_aside,
 )
-from cpunet.training.unfinished import unfinished_folder
+from cpunet.training.checkpoints import unfinished_folder
 
 RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]")
 REPORT = FolderKind("report", "cpunet validate", "metrics.json", r"metrics\.json")

@@ -33,14 +33,14 @@ def test_a_training_that_was_ended_goes_on(
     errors.unlink()
     if how == signal.SIGTERM:
         assert job.exitcode == 128 + how
-        assert told.splitlines()[-1].startswith("error: stopped after 3 of 4 iterations")
+        assert told.splitlines()[-1].startswith("error: stopped after 2 of 4 iterations")
     else:
         assert job.exitcode == -how
     assert "Traceback" not in told
     assert [path.name for path in tmp_path.iterdir()] == [unfinished.name]
-    assert (unfinished / "checkpoint.safetensors").is_file()
+    assert (unfinished / "checkpoint.pt").is_file()
     assert command(*words, "--resume").code == 0
     info = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert info["resumed_at"] == [3 if how == signal.SIGTERM else held.AFTER]
+    assert info["resumed_at"] == [2 if how == signal.SIGTERM else held.AFTER]
     for name in ("weights.safetensors", "losses.jsonl"):
         assert (tmp_path / "run" / name).read_bytes() == (trained / name).read_bytes()

@@ -16,9 +16,9 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes import load_recipe
-from cpunet.training.checkpoints import CHECKPOINT
+from cpunet.training import checkpoints
+from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
 from cpunet.training.run_folder import LOSSES
-from cpunet.training.unfinished import UnfinishedRun
 from synthetic import digests
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
@@ -132,7 +132,7 @@ def test_force_begins_again(command, words, trained, tmp_path, monkeypatch):
         command(*words, "--seed", 8)
     # input that cannot be used costs nothing of it
     assert command(*words, "--force", "--data-table", "none").code == 2
-    assert (tmp_path / "run.unfinished" / "checkpoint.safetensors").is_file()
+    assert (tmp_path / "run.unfinished" / CHECKPOINT).is_file()
     assert command(*words, "--force").code == 0
     assert digests(tmp_path / "run") == digests(trained)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -145,7 +145,7 @@ MOMENTS = [
     ("its line is written", 2),
     ("its checkpoint is in place", 2),
     ("its line is half written", 4),
-    ("its checkpoint is not in place", 5),  # and the one before is the previous one
+    ("its checkpoint is not in place", 5),
     ("the run is not in place", 6),
 ]
 PROCESS = "a training that is killed"  # the name of this module in its process
@@ -153,7 +153,7 @@ PROCESS = "a training that is killed"  # the name of this module in its process
 
 def die_at(moment: str, iteration: int) -> None:
     """Have this process killed by force at a moment of its training."""
-    log, save, finish = UnfinishedRun.log, UnfinishedRun.save, UnfinishedRun.finish
+    log, save, put = UnfinishedRun.log, UnfinishedRun.save, checkpoints._put_in_place
     replace, logged = Path.replace, [0]
 
     def is_now(name: str) -> bool:
@@ -181,12 +181,12 @@ def die_at(moment: str, iteration: int) -> None:
         save(self, state)
         die_if(is_now("its checkpoint is in place"))
 
-    def watched_finish(self):
-        finish(self)
+    def watched_put(*given, **options):
         die_if(is_now("the run is not in place"))
+        put(*given, **options)
 
     UnfinishedRun.log, UnfinishedRun.save = watched_log, watched_save
-    UnfinishedRun.finish, Path.replace = watched_finish, watched_replace
+    checkpoints._put_in_place, Path.replace = watched_put, watched_replace
 
 
 @pytest.mark.thorough

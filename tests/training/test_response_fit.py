@@ -212,7 +212,6 @@ def test_what_a_fit_tells(near: Told) -> None:
     assert steps == tuple(range(1, near.fit.steps + 1))
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
     assert chi_square[-1] < near.fit.moments < chi_square[0]
-    assert near.fit.steps <= RECIPE.training.iterations
     assert len(near.fit.pulls) == near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
     assert set(near.fit.errors) == labels

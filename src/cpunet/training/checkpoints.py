@@ -1,142 +1,286 @@
-"""Checkpoints: the state of a training as a file, verified and without pickle.
+"""A training on its way: ``RUN.unfinished``, next to the run folder that it becomes.
 
-Tensors are stored as safetensors, everything else as JSON in their header, with a SHA-256 of
-both.  A checkpoint is written to a temporary file, which then replaces the last one.  The last
-one is kept as the previous one, so that one of the two is complete at any moment.
+``unfinished.json``
+    Recipe, seed and pulses, for information; locked by the process that trains.
+``losses.jsonl``
+    The log of the losses, cut to the checkpoint's iteration when a training is resumed.
+``checkpoint.pt``
+    All that the next iterations depend on, replaced as a whole; reading it executes nothing.
+
+The folder is visible, so that nobody wonders where a day of GPU time went.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
+import fcntl
+import io
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import pickle
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor
+import torch
 
 from cpunet.errors import CpunetError
-from cpunet.training.loop import State
+from cpunet.outputs import (
+    FolderKind,
+    Given,
+    copy_own,
+    folder_written_aside,
+    mark,
+    not_written,
+    refuse_existing,
+    refuse_inputs,
+    remove_own,
+    require_kind,
+    require_replaceable,
+)
+from cpunet.training.loop import Record, State
+from cpunet.training.run_folder import LOSSES, RUN
 
-CHECKPOINT, PREVIOUS = "checkpoint.safetensors", "checkpoint.previous.safetensors"
 FORMAT = 3
-_ASIDE = ".checkpoint.partial"  # a fixed name: the file of a killed process is overwritten
-_TENSOR = "tensor"
-_ABSENT = "none"
+MARKER, CHECKPOINT, ASIDE = "unfinished.json", "checkpoint.pt", ".checkpoint.partial"
+UNFINISHED = FolderKind(
+    name="unfinished run",
+    command="cpunet train",
+    known_by=MARKER,
+    own=rf"{RUN.own}|unfinished\.json|checkpoint\.pt|\.[^/]*\.partial.*",
+)
 
 
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """The state of a training, and facts that identify the training."""
-
-    state: State
-    facts: dict[str, Any]
+def unfinished_name(out: Path) -> Path:
+    """Folder of the unfinished training that will become the run `out`."""
+    return out.parent / f"{out.name}.unfinished"
 
 
-def has_checkpoint(folder: Path) -> bool:
-    """Whether there is a checkpoint in a folder, readable or not."""
-    return any((folder / name).exists() for name in (CHECKPOINT, PREVIOUS))
+@contextmanager
+def unfinished_folder(
+    out: Path,
+    *inputs: Given,
+    resume: bool = False,
+    force: bool = False,
+) -> Iterator[Path]:
+    """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
 
+    On an exception the folder is kept if it contains a checkpoint.
 
-def remove_checkpoints(folder: Path) -> None:
-    """Remove the checkpoints of a folder, if there are any."""
-    for name in (_ASIDE, CHECKPOINT, PREVIOUS):
-        (folder / name).unlink(missing_ok=True)
-
-
-def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Store a state; the one stored before becomes the previous one.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written, for example on a full disk; the last checkpoint is kept.
-    """
-    tensors: dict[str, Tensor] = {}
-    plain = _parted(checkpoint.state, "", tensors)
-    text = json.dumps({"format": FORMAT, "facts": checkpoint.facts, "state": plain})
-    metadata = {"json": text, "sha256": _digest(text, tensors)}
-    aside = folder / _ASIDE
-    try:
-        _save_durably(aside, tensors, metadata)
-        if (folder / CHECKPOINT).exists():
-            (folder / CHECKPOINT).replace(folder / PREVIOUS)
-        aside.replace(folder / CHECKPOINT)
-    except OSError:
-        aside.unlink(missing_ok=True)  # free the space on a full disk
-        raise
-    _sync_folder(folder)
-
-
-def _save_durably(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    try:
-        save_file(tensors, path, metadata)
-    except SafetensorError as error:  # only the writing can fail here
-        raise OSError(str(error)) from error
-    with path.open("r+b") as stream:
-        os.fsync(stream.fileno())
-
-
-def read_checkpoints(folder: Path) -> Iterator[Checkpoint | None]:
-    """Read the checkpoints of a folder, latest first; None for a damaged one.
+    Parameters
+    ----------
+    out
+        Run folder to be made.
+    inputs
+        Files and folders that are read.
+    resume
+        Whether an unfinished training may exist; it is kept for `UnfinishedRun` to continue.
+    force
+        Replace an existing run folder, and allow an unfinished training to be replaced.
 
     Raises
     ------
     CpunetError
-        If one was written in another format.
+        If `out` exists and may not be replaced, an unfinished training exists and is neither
+        to be resumed nor replaced, another process is training there, or the folder cannot
+        be written to.
     """
-    for name in (CHECKPOINT, PREVIOUS):
-        if (folder / name).exists():
-            yield _read(folder / name)
-
-
-def _read(path: Path) -> Checkpoint | None:
+    refuse_existing(out, *inputs, force=force)
+    require_replaceable(out, RUN)
+    folder = unfinished_name(out)
+    refuse_inputs(folder, *inputs)
+    require_kind(folder, UNFINISHED)
+    checkpoint, finished = folder / CHECKPOINT, False
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata()
-            # copies: an optimiser must not continue with views of the file
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-        text = metadata["json"]
-        if metadata["sha256"] != _digest(text, tensors):
-            return None
-        content = json.loads(text)
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder):
+            mark(folder, UNFINISHED, listed=False)
+            if checkpoint.exists() and not (resume or force):
+                raise CpunetError(
+                    f"{folder}: an unfinished training; continue with --resume, or begin again "
+                    "with --force"
+                )
+            try:
+                yield folder
+                _put_in_place(folder, out, force=force)
+                finished = True
+            finally:
+                if finished or not checkpoint.exists():
+                    remove_own(folder, UNFINISHED)
+    except OSError as error:
+        raise CpunetError(
+            f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
+            "--resume"
+        ) from error
+
+
+def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
+    # a copy: until it is in place, the training can be resumed from the original folder
+    try:
+        with folder_written_aside(out, RUN, force=force) as whole:
+            copy_own(folder, whole, RUN)
+    except CpunetError as error:
+        raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock out other processes, whose weights would be mixed with those of this one."""
+    with (folder / MARKER).open("a") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CpunetError(
+                f"{folder}: another process is training there; wait for it, or choose another "
+                "--out"
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
+class UnfinishedRun:
+    """Log and checkpoint of a training in its folder.
+
+    Parameters
+    ----------
+    folder
+        From `unfinished_folder`.
+    fingerprint
+        Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …).
+    environment
+        Facts that may change their last bits: device, threads, version.
+    note
+        Called with messages for the user.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        fingerprint: dict[str, Any],
+        environment: dict[str, Any],
+        note: Callable[[str], None],
+    ) -> None:
+        self.folder = folder
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
+        self.resumed_at: list[int] = []
+        self._fingerprint, self._environment = fingerprint, environment
+        self._note = note
+        self._waiting: list[str] = []  # lines of the log, which has so many bytes before them
+        self._logged = 0
+        self._seconds_before = 0.0
+        self._clock = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time taken so far, without lost iterations and pauses."""
+        return self._seconds_before + time.perf_counter() - self._clock
+
+    def begin(self, *, resume: bool) -> State | None:
+        """Clear the folder, or find the state to continue from (None if there is none).
+
+        Raises
+        ------
+        CpunetError
+            If the training was begun with other settings or pulses, or the checkpoint is
+            damaged.
+        """
+        path, state = self.folder / CHECKPOINT, None
+        if resume and path.exists():
+            state = self._take_up(_read(path))
+        else:
+            if resume:
+                self._note("no checkpoint to go on from; beginning at the beginning")
+            path.unlink(missing_ok=True)
+        with (self.folder / LOSSES).open("ab") as stream:
+            stream.truncate(self._logged)
+        told = {"started": self.started} | self._fingerprint | self._environment
+        (self.folder / MARKER).write_text(json.dumps(told, indent=2) + "\n")
+        return state
+
+    def _take_up(self, then: dict[str, Any]) -> State:
+        for kind, now in self._fingerprint.items():
+            for difference in differences(then["fingerprint"].get(kind), now):
+                raise CpunetError(
+                    f"resumed with another {kind}: {difference}; give what the training was "
+                    "begun with, or begin again with --force"
+                )
+        for difference in differences(then["environment"], self._environment):
+            self._note(f"warning: resumed elsewhere: {difference}; the last bits may differ")
+        state: State = then["state"]
+        self.started, self._seconds_before = then["started"], then["seconds"]
+        self.resumed_at = [*then["resumed_at"], state["iteration"]]
+        self._logged = then["logged"]
+        self._note(f"going on after {state['iteration']} iterations")
+        return state
+
+    def log(self, records: Iterable[Record]) -> None:
+        """Add training records to the log; if the disk is full, they wait for a later call."""
+        self._waiting += (json.dumps(record) + "\n" for record in records)
+        with suppress(OSError):  # `save` reports it
+            self.finish()
+
+    def save(self, state: State) -> None:
+        """Store a checkpoint; if that fails, report it and keep the previous one."""
+        aside = self.folder / ASIDE
+        try:
+            self.finish()
+            stream = io.BytesIO()
+            facts = {
+                "format": FORMAT,
+                "fingerprint": self._fingerprint,
+                "environment": self._environment,
+                "started": self.started,
+                "seconds": self.seconds,
+                "resumed_at": self.resumed_at,
+                "logged": self._logged,
+            }
+            facts = json.loads(json.dumps(facts))  # no subclass of a number or a text
+            torch.save(facts | {"state": state}, stream)
+            with aside.open("wb") as file:
+                file.write(stream.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
+            aside.replace(self.folder / CHECKPOINT)
+        except OSError as error:
+            aside.unlink(missing_ok=True)  # free the space on a full disk
+            self._note(
+                f"warning: {self.folder}: no checkpoint after {state['iteration']} iterations "
+                f"({error.strerror or error}); the one before is kept"
+            )
+
+    def finish(self) -> None:
+        """Write the rest of the log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; the next call writes it in the same place.
+        """
+        content = "".join(self._waiting).encode()
+        with (self.folder / LOSSES).open("r+b") as stream:
+            stream.seek(self._logged)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        self._logged += len(content)
+        self._waiting.clear()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         made_by = content["format"]
-        state, facts = _joined(content["state"], tensors), content["facts"]
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError):
-        return None  # RecursionError is a RuntimeError
+    except (RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.PickleError):
+        raise CpunetError(f"{path}: damaged; begin again with --force") from None
     if made_by != FORMAT:
         raise CpunetError(
             f"{path}: written by another version of cpunet; go on with that one, or begin "
             "again with --force"
         )
-    return Checkpoint(state, facts)
-
-
-def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to resume with other settings or pulses.
-
-    Parameters
-    ----------
-    then, now
-        Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …): values,
-        or nested mappings of values.
-
-    Raises
-    ------
-    CpunetError
-        If they differ; the message names the first difference.
-    """
-    for kind in now:
-        for difference in differences(then.get(kind), now[kind]):
-            raise CpunetError(
-                f"resumed with another {kind}: {difference}; give what the training was begun "
-                "with, or begin again with --force"
-            )
+    return content
 
 
 def differences(then: Any, now: Any) -> Iterator[str]:
@@ -144,13 +288,13 @@ def differences(then: Any, now: Any) -> Iterator[str]:
     # as read back from a file: without tuples
     old, new = (dict(_leaves("", json.loads(json.dumps(value)))) for value in (then, now))
     for key in old | new:
-        before, after = old.get(key, _ABSENT), new.get(key, _ABSENT)
+        before, after = old.get(key, "none"), new.get(key, "none")
         if before != after:
             yield f"{key} {_short(before)} → {_short(after)}".strip()
 
 
 def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if not isinstance(value, dict):
+    if not isinstance(value, Mapping):
         yield key, value
         return
     for name, part in value.items():
@@ -160,44 +304,3 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
 def _short(value: Any) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= 24 else f"{text[:12]}…"
-
-
-def _parted(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
-    """Move the tensors of nested dicts and lists to `tensors`; return the rest, as JSON."""
-    if isinstance(value, Tensor):
-        tensors[name] = value.detach().cpu().contiguous()
-        return {_TENSOR: name}
-    if isinstance(value, Mapping):
-        return {str(k): _parted(part, f"{name}.{k}", tensors) for k, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_parted(part, f"{name}.{k}", tensors) for k, part in enumerate(value)]
-    return value
-
-
-def _joined(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Undo `_parted`."""
-    if isinstance(value, dict):
-        if value.keys() == {_TENSOR}:
-            return tensors[value[_TENSOR]]
-        return {key: _joined(part, tensors) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_joined(part, tensors) for part in value]
-    return value
-
-
-def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(tensors):
-        digest.update(name.encode())
-        digest.update(tensors[name].numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the renames survive a power failure, if the file system supports it."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

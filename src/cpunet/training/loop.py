@@ -273,8 +273,6 @@ class _Training:
         self.model.load_state_dict(state["model"])
         for name, parts in self.parts.items():
             for part, own in zip(parts, state[name], strict=True):
-                if name == "optimisers":  # the keys of a file are text
-                    own = own | {"state": {int(n): v for n, v in own["state"].items()}}
                 part.load_state_dict(own)
         torch.set_rng_state(state["random"]["cpu"])
         if self.device.type == "cuda" and "cuda" in state["random"]:

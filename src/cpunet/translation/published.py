@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cpunet.errors import CpunetError
-from cpunet.networks.gru_discriminator import GruDiscriminator
+from cpunet.networks.discriminators import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
 from cpunet.recipes.network_settings import GruConfig, PunetConfig
 

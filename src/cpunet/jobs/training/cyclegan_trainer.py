@@ -18,11 +18,11 @@ from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
+from cpunet.training.checkpoints import UnfinishedRun, unfinished_folder
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
 from cpunet.training.run_folder import fill_networks, read_losses, read_recipe, weights_sha256
-from cpunet.training.unfinished import UnfinishedRun, unfinished_folder
 
 # settings of logs and checkpoints, which do not affect the weights
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}

@@ -51,7 +51,7 @@ def train_run(
         Simulated and measured pulses.
     out
         Run folder; it appears when it is complete. Until then a CycleGAN writes to
-        ``OUT.unfinished``, see `cpunet.training.unfinished`.
+        ``OUT.unfinished``, see `cpunet.training.checkpoints`.
     stop
         Called after each iteration of a CycleGAN; returns whether to store its state and stop.
     monitor

@@ -13,9 +13,9 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
+from cpunet.training.checkpoints import unfinished_name
 from cpunet.training.loop import StoppedError
 from cpunet.training.run_folder import INFO, read_info
-from cpunet.training.unfinished import unfinished_name
 
 QUIET, AS_USUAL = Monitor(), TrainOptions()
 
