@@ -348,17 +348,6 @@ def test_a_foreign_folder_is_left_alone(tmp_path):
     assert [p.name for p in mine.iterdir()] == ["thesis.tex"]
 
 
-def test_two_processes_do_not_share_a_folder(tmp_path):
-    with unfinished_folder(tmp_path / "run") as folder:
-        kept(folder)
-        with (
-            pytest.raises(CpunetError, match="another process is training there"),
-            unfinished_folder(tmp_path / "run", resume=True, force=True),
-        ):
-            pass
-        assert (folder / CHECKPOINT).is_file()
-
-
 def test_differences_are_named_in_full():
     then = {"a": {"b": 1, "c": [1, 2]}, "d": None, "gone": 1}
     now = {"a": {"b": 1.0, "c": (1, 3)}, "d": 2, "new": "x" * 64}

@@ -1,7 +1,7 @@
 """A training on its way: ``RUN.unfinished``, next to the run folder that it becomes.
 
 ``unfinished.json``
-    Recipe, seed and pulses, for information; locked by the process that trains.
+    Recipe, seed and pulses, for information.
 ``losses.jsonl``
     The log of the losses, cut to the checkpoint's iteration when a training is resumed.
 ``checkpoint.pt``
@@ -12,7 +12,6 @@ The folder is visible, so that nobody wonders where a day of GPU time went.
 
 from __future__ import annotations
 
-import fcntl
 import io
 import json
 import os
@@ -84,36 +83,33 @@ def unfinished_folder(
     ------
     CpunetError
         If `out` exists and may not be replaced, an unfinished training exists and is neither
-        to be resumed nor replaced, another process is training there, or the folder cannot
-        be written to.
+        to be resumed nor replaced, or the folder cannot be written to.
     """
     refuse_existing(out, *inputs, force=force)
     require_replaceable(out, RUN)
     folder = unfinished_name(out)
     refuse_inputs(folder, *inputs)
     require_kind(folder, UNFINISHED)
-    checkpoint, finished = folder / CHECKPOINT, False
+    checkpoint = folder / CHECKPOINT
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder):
-            mark(folder, UNFINISHED, listed=False)
-            if checkpoint.exists() and not (resume or force):
-                raise CpunetError(
-                    f"{folder}: an unfinished training; continue with --resume, or begin again "
-                    "with --force"
-                )
-            try:
-                yield folder
-                _put_in_place(folder, out, force=force)
-                finished = True
-            finally:
-                if finished or not checkpoint.exists():
-                    remove_own(folder, UNFINISHED)
+        mark(folder, UNFINISHED, listed=False)
+        if checkpoint.exists() and not (resume or force):
+            raise CpunetError(
+                f"{folder}: an unfinished training; continue with --resume, or begin again "
+                "with --force"
+            )
+        yield folder
+        _put_in_place(folder, out, force=force)
+        checkpoint.unlink(missing_ok=True)
     except OSError as error:
         raise CpunetError(
             f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
             "--resume"
         ) from error
+    finally:
+        if not checkpoint.exists():
+            remove_own(folder, UNFINISHED)
 
 
 def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
@@ -123,22 +119,6 @@ def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
             copy_own(folder, whole, RUN)
     except CpunetError as error:
         raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock out other processes, whose weights would be mixed with those of this one."""
-    with (folder / MARKER).open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CpunetError(
-                f"{folder}: another process is training there; wait for it, or choose another "
-                "--out"
-            ) from None
-        except OSError:  # a file system without locks
-            pass
-        yield
 
 
 class UnfinishedRun:
