@@ -274,7 +274,7 @@ def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     assert learned_rise_ns(response) == pytest.approx(true_rise, rel=0.02)
     assert numbers["slow_400_ns"] == pytest.approx(0.065, rel=0.1)
 
-    alone, poor = problem.fit(0, *DRIFT[1:], sim=short)  # as in fast
+    alone, poor = problem.fit(0, "training.drift_terms=0", *DRIFT[1:], sim=short)
     assert alone.drift is None
     assert poor.chi_square > 3 * GOOD_FIT * poor.moments
 
