@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cpunet import outputs
 from cpunet.errors import CpunetError
@@ -153,6 +155,21 @@ def test_a_damaged_checkpoint_is_told(tmp_path, content):
     path.write_bytes(path.read_bytes()[:-200] if content is None else content)
     with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with --force"):
         unfinished(tmp_path).begin(resume=True)
+
+
+@settings(max_examples=40)
+@given(part=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_changed_bit_is_told_or_changes_nothing(tmp_path_factory, part, bit):
+    folder = tmp_path_factory.mktemp("damaged")
+    kept(folder, 1.0)
+    content = bytearray((folder / CHECKPOINT).read_bytes())
+    content[int(part * len(content))] ^= 1 << bit
+    (folder / CHECKPOINT).write_bytes(content)
+    try:
+        found = unfinished(folder).begin(resume=True)
+    except CpunetError:
+        return  # one line, as above
+    assert same_tree(found, state(1.0))  # such as a bit of the padding between two tensors
 
 
 def test_a_checkpoint_executes_nothing(tmp_path):

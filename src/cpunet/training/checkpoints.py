@@ -17,6 +17,7 @@ import json
 import os
 import pickle
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -251,9 +252,20 @@ class UnfinishedRun:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
+        with zipfile.ZipFile(path) as parts:  # torch writes checksums, but does not read them
+            if part := parts.testzip():
+                raise zipfile.BadZipFile(part)
         content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         made_by = content["format"]
-    except (RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.PickleError):
+    except (
+        zipfile.BadZipFile,
+        RuntimeError,
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        pickle.PickleError,
+    ):
         raise CpunetError(f"{path}: damaged; begin again with --force") from None
     if made_by != FORMAT:
         raise CpunetError(
