@@ -46,11 +46,10 @@ PREPARATION = PreparationConfig(
     max_padding_after=0,
     saturation_run=4,
 )
-# settings of the narrowest networks, which begin with the identity
+# settings of the narrowest networks
 SMALL_NETWORK = (
     "generator.width=2",
     "generator.dropout=0",
-    "generator.residual=true",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",
     "training.batch_size=4",

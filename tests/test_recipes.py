@@ -101,12 +101,12 @@ def test_values_are_overridden_in_turn():
             "training.batch_size=16",
             "discriminator.value_range=[-0.1, 1.2]",
             "training.batch_size=8",
-            "generator.residual=true",
+            "generator.width=8",
         ],
     )
     assert recipe.training.batch_size == 8
     assert recipe.discriminator.value_range == (-0.1, 1.2)
-    assert recipe.generator.residual is True
+    assert recipe.generator.width == 8
     assert load_recipe("paper").training.batch_size == 32
 
 

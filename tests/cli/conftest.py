@@ -25,7 +25,6 @@ PER_PEAK = 24
 # The narrowest networks and the shortest training there are.
 TINY = [
     "generator.width=2",
-    "generator.residual=true",
     "discriminator.embedding_rows=20",
     "discriminator.embedding_dim=2",
     "discriminator.hidden=2",

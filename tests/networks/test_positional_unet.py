@@ -8,29 +8,21 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cpunet.networks.positional_unet import PositionalUNet, Skip, positional_map
+from cpunet.networks.positional_unet import PositionalUNet, positional_map
 from cpunet.recipes import load_recipe
 from cpunet.recipes.network_settings import PunetConfig
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
-def narrow(residual: bool = False, width: int = 4, dropout: float = 0.0) -> PunetConfig:
-    return PunetConfig(name="punet", width=width, dropout=dropout, residual=residual)
+def narrow(width: int = 4, dropout: float = 0.0) -> PunetConfig:
+    return PunetConfig(name="punet", width=width, dropout=dropout)
 
 
 def test_the_paper_network_has_the_published_number_of_parameters():
     recipe = load_recipe("paper")
     network = PositionalUNet(recipe.generator, recipe.preparation.length)
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == 7_213_781
-
-
-def test_a_residual_start_adds_no_parameter():
-    count = [
-        sum(p.numel() for p in PositionalUNet(narrow(r), 800).parameters())
-        for r in (False, True)
-    ]
-    assert count[0] == count[1]
 
 
 def test_every_stage_has_the_shape_of_the_layer_table():
@@ -125,19 +117,6 @@ def test_a_map_is_added_before_the_dropout():
     assert 0.3 < float(dropped.float().mean()) < 0.7
 
 
-def test_a_residual_network_starts_as_the_identity():
-    network = PositionalUNet(narrow(residual=True), 800)
-    pulses = torch.randn(3, 1, 800)
-    for mode in (True, False):
-        assert torch.equal(network.train(mode)(pulses), pulses)
-
-
-def test_the_paper_network_does_not():
-    network = PositionalUNet(narrow(), 800).eval()
-    pulses = torch.randn(3, 1, 800)
-    assert float((network(pulses) - pulses).detach().abs().mean()) > 0.1
-
-
 def test_a_seeded_draw_comes_again():
     network = PositionalUNet(narrow(), 64).eval()
     pulses = torch.randn(2, 1, 64)
@@ -188,15 +167,3 @@ def test_in_evaluation_pulses_do_not_influence_each_other():
 def test_lengths_that_cannot_be_halved_four_times(length):
     with pytest.raises(ValueError, match=f"the pulse length {length} is no multiple of 16"):
         PositionalUNet(narrow(), length)
-
-
-@pytest.mark.parametrize("advance", [-3, 0, 4])
-def test_a_skip_moves_and_weighs(advance):
-    skip = Skip(16)
-    gain = torch.linspace(0.5, 2, 16)
-    skip.set(gain, advance)
-    pulses = torch.randn(2, 1, 16)
-    for sample in range(16):
-        source = min(max(sample + advance, 0), 15)
-        expected = gain[sample] * pulses[:, 0, source]
-        assert torch.equal(skip(pulses)[:, 0, sample], expected)

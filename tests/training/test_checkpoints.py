@@ -32,22 +32,16 @@ N = 5
 VARIANTS = {
     "paper": (),
     "everything": (
-        "generator.residual=true",
         "generator.dropout=0.0",
         "training.average_decay=0.5",
         "training.instance_noise=0.1",
         "training.discriminator_interval=1",
         "training.losses.gradient_penalty=1.0",
-    ),
-    "rare-judges": ("training.discriminator_interval=4", "training.average_decay=0.9"),
-    "large-batches": ("training.batch_size=10", "generator.residual=true"),
-    "fast-step": ("generator.width=16", "training.discriminator_interval=2"),
-    "convolutional-judge": (
-        "discriminator={name: conv, width: 2, layers: 2, kernel: 3, current_gain: 5.0}",
-        "training.losses.gradient_penalty=1.0",
-        "training.discriminator_interval=1",
         "training.precision=bf16",
     ),
+    "rare-judges": ("training.discriminator_interval=4", "training.average_decay=0.9"),
+    "large-batches": ("training.batch_size=10",),
+    "fast-step": ("generator.width=16", "training.discriminator_interval=2"),
 }
 
 
@@ -90,9 +84,8 @@ STOPS = {
     "rare-judges": 3,
     "large-batches": 4,
     "fast-step": 2,
-    "convolutional-judge": 3,
 }
-MARKS = dict.fromkeys(("paper", "convolutional-judge"), pytest.mark.thorough)
+MARKS = {"paper": pytest.mark.thorough}
 MARKS |= dict.fromkeys(("everything", "rare-judges", "large-batches"), pytest.mark.slow)
 
 

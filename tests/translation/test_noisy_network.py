@@ -14,6 +14,7 @@ from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
@@ -23,27 +24,30 @@ from cpunet.training.run_folder import write_run
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 
-RECIPE = load_recipe(
-    "paper", ["training.noise=baselines", "generator.width=2", "generator.residual=true"]
-)
+RECIPE = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
+DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
 DT_NS, RMS_KEV = 16.0, 6.0
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A residual network that was not trained: it leaves a pulse as it is, but for a level."""
+    """A network that was not trained."""
     noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), 2 * (NOISE_BINS - 1), DT_NS, 100)
     outside = Outside(TraceNoise(noise), np.ones(1), RECIPE.preparation)
     torch.manual_seed(0)
     model = CycleGan(RECIPE, outside)
-    decay = np.exp(-np.clip(np.arange(800) - 400, 0, None) / 1800)
-    model.ren.skip.set(torch.from_numpy(decay).float(), 0)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
     drawn = DrawnRemains(RemainsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
     fit = {"remains": {"rate_khz": 2.0, "drawn": drawn.describe()}}
     write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu", "fit": fit})
     return folder
+
+
+@pytest.fixture(autouse=True)
+def only_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let networks leave a pulse as it is, but for a decay."""
+    monkeypatch.setattr(PositionalUNet, "forward", lambda _, pulses, **_options: pulses * DECAY)
 
 
 @pytest.fixture(scope="module")

@@ -1,31 +1,23 @@
-"""Discriminators: GRU with attention (paper, section 2.2.2), or strided convolutions.
+"""The discriminator: a GRU with attention (paper, section 2.2.2).
 
-In the GRU's, each sample of a pulse is looked up in a table of learned vectors, a
+Each sample of a pulse is looked up in a table of learned vectors, a
 bidirectional GRU reads them, and attention weighs the time steps.  With 1,000
 rows of 64 and 64 hidden units it has the published 130,817 trainable parameters.
-
-The other one sees the pulse and its current, halves their length layer by layer, and averages
-over the remaining samples.  Unlike in a GRU, no step waits for another, and it has second
-derivatives on every device, which a gradient penalty needs and cuDNN's GRU lacks.  There is no
-batch norm, so the result for a pulse does not depend on the rest of its batch.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.network_settings import ConvConfig, GruConfig
+from cpunet.recipes.network_settings import GruConfig
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so
 # that the slope at one value points towards distant ones; with 1 to 16 cycles the
 # generator's edge did not move.
 LOWEST, HIGHEST = 0.1, 2.0
-WIDEST = 8  # channels of convolutions, in units of the width of the first layer
-LEAK = 0.2
 
 
 class InterpolatedEmbedding(nn.Module):
@@ -110,39 +102,3 @@ class GruDiscriminator(nn.Module):
     def fix_statistics(self) -> None:
         """Use the running statistics until the next ``train()``."""
         self.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
-
-
-class ConvDiscriminator(nn.Module):
-    """Rate how measured (or simulated) a pulse looks; `forward` returns logits."""
-
-    def __init__(self, config: ConvConfig) -> None:
-        super().__init__()
-        self.current_gain = config.current_gain
-        widths = [2, *(config.width * min(2**n, WIDEST) for n in range(config.layers))]
-        self.layers = nn.ModuleList(
-            nn.Conv1d(a, b, config.kernel, stride=2, padding=config.kernel // 2)
-            for a, b in itertools.pairwise(widths)
-        )
-        self.outlet = nn.Linear(widths[-1], 1)
-
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Logits, shape (batch,), of pulses of shape (batch, 1, samples)."""
-        current = nn.functional.pad(pulses.diff(dim=2), (1, 0))
-        x = torch.cat([pulses, self.current_gain * current], dim=1)  # (batch, 2, samples)
-        for layer in self.layers:
-            x = nn.functional.leaky_relu(layer(x), LEAK)
-        logits = self.outlet(x.mean(dim=2))
-        return logits[:, 0]  # type: ignore[no-any-return]
-
-    def fix_statistics(self) -> None:
-        """Do nothing: no statistics of the batch are used."""
-
-
-Discriminator = GruDiscriminator | ConvDiscriminator
-
-
-def discriminator(config: GruConfig | ConvConfig) -> Discriminator:
-    """A discriminator with initial weights."""
-    if isinstance(config, ConvConfig):
-        return ConvDiscriminator(config)
-    return GruDiscriminator(config)

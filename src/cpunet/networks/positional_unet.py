@@ -8,8 +8,6 @@ bottom.  At width 40 it has the published 7,213,781 trainable parameters.
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from torch import Tensor, nn
 
@@ -60,49 +58,6 @@ class PositionalMap(nn.Module):
         return self.dropout(x + self.values)  # type: ignore[no-any-return]
 
 
-SKIP_KERNEL = 65  # samples; about 1 µs at 16 ns
-
-
-class Skip(nn.Module):
-    """Input of a residual generator, smoothed, shifted and scaled, which it corrects.
-
-    ``gain[t] * (kernel * pulse)[t + advance]``, with the edge values repeated beyond the
-    ends. It starts as the identity; `set` provides a better start.
-    """
-
-    gain: Tensor
-    advance: Tensor
-    kernel: Tensor
-    index: Tensor
-
-    def __init__(self, length: int) -> None:
-        super().__init__()
-        kernel = torch.zeros(SKIP_KERNEL)
-        kernel[SKIP_KERNEL // 2] = 1.0
-        self.register_buffer("gain", torch.ones(length))
-        self.register_buffer("advance", torch.zeros((), dtype=torch.long))
-        self.register_buffer("kernel", kernel)
-        self.register_buffer("index", torch.arange(length), persistent=False)
-
-    def set(self, gain: Tensor, advance: int, kernel: Tensor | None = None) -> None:
-        """Set the gain of each output sample, the advance in samples and the smoothing."""
-        self.gain.copy_(gain)
-        self.advance.fill_(advance)
-        if kernel is not None:
-            self.kernel.copy_(kernel)
-
-    def forward(self, pulses: Tensor) -> Tensor:
-        source = (self.index + self.advance).clamp(0, len(self.index) - 1)
-        return self.gain * smoothed(pulses, self.kernel)[..., source]
-
-
-def smoothed(pulses: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve pulses (batch, 1, samples) with a kernel of odd length, edges repeated."""
-    half = len(kernel) // 2
-    padded = nn.functional.pad(pulses, (half, half), mode="replicate")
-    return nn.functional.conv1d(padded, kernel[None, None])
-
-
 class PositionalUNet(nn.Module):
     """Translate pulses with a Positional U-Net.
 
@@ -142,11 +97,6 @@ class PositionalUNet(nn.Module):
             ]
         )
         self.outlet = nn.Conv1d(m // 2, 1, 1)
-        self.residual = config.residual
-        if config.residual:
-            self.skip = Skip(length)
-            nn.init.zeros_(self.outlet.weight)
-            nn.init.zeros_(cast(Tensor, self.outlet.bias))
 
         def maps(*levels: tuple[int, int, int]) -> nn.ModuleList:
             return nn.ModuleList(
@@ -190,8 +140,7 @@ class PositionalUNet(nn.Module):
             x = block(torch.cat([skips[3 - level], x], dim=1))
             if level < 3:
                 x = self.maps_up[level](x)
-        x = cast(Tensor, self.outlet(x))
-        return self.skip(pulses) + x if self.residual else x
+        return self.outlet(x)  # type: ignore[no-any-return]
 
     def _latent(self, x: Tensor, generator: torch.Generator | None, mean: bool) -> Tensor:
         """Draw from the latent normal distribution (reparameterised: gradients flow)."""

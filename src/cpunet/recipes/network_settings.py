@@ -1,4 +1,4 @@
-"""Settings of the networks: generators, discriminators, readout chains."""
+"""Settings of the networks: generators, discriminator, readout chains."""
 
 from __future__ import annotations
 
@@ -13,16 +13,11 @@ DriftTerms = Annotated[int, Field(ge=0, le=2)]
 
 
 class PunetConfig(Config):
-    """The Positional U-Net (paper, section 2.2.1).
-
-    ``residual`` makes the network a correction added to its input, zero at the
-    start of the training, instead of having it learn the identity first.
-    """
+    """The Positional U-Net (paper, section 2.2.1)."""
 
     name: Literal["punet"]
     width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
     dropout: Fraction
-    residual: bool
 
 
 class ResponseConfig(Config):
@@ -75,25 +70,4 @@ class GruConfig(Config):
     def _range_is_not_empty(self) -> GruConfig:
         if self.value_range is not None and not self.value_range[0] < self.value_range[1]:
             raise ValueError("value_range must go from a lower to a higher value")
-        return self
-
-
-class ConvConfig(Config):
-    """A discriminator of convolutions, see `cpunet.networks.discriminators`.
-
-    Each of ``layers`` halves the pulse; the first has ``width`` channels, each further one
-    twice as many, up to eight times ``width``.  ``current_gain`` scales the differences between
-    samples, which are a second input.
-    """
-
-    name: Literal["conv"]
-    width: Width
-    layers: Annotated[int, Field(ge=1, le=9)]
-    kernel: Annotated[int, Field(ge=3, le=1025)]
-    current_gain: Positive
-
-    @model_validator(mode="after")
-    def _kernel_has_a_middle(self) -> ConvConfig:
-        if self.kernel % 2 == 0:
-            raise ValueError("kernel must be odd")
         return self

@@ -11,12 +11,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, model_validator
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.network_settings import (
-    ConvConfig,
-    GruConfig,
-    PunetConfig,
-    ResponseConfig,
-)
+from cpunet.recipes.network_settings import GruConfig, PunetConfig, ResponseConfig
 from cpunet.recipes.training_settings import MatchingConfig, TrainingConfig
 from cpunet.settings import Config, Positive, Samples
 
@@ -128,7 +123,7 @@ class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
     generator: PunetConfig
-    discriminator: GruConfig | ConvConfig
+    discriminator: GruConfig
     training: TrainingConfig
 
 
@@ -148,7 +143,7 @@ class Recipe(Config):
     preparation: PreparationConfig
     cuts: CutConfig
     generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
-    discriminator: Annotated[GruConfig | ConvConfig, Field(discriminator="name")] | None
+    discriminator: GruConfig | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
@@ -212,7 +207,7 @@ class Recipe(Config):
                 f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
                 "halve it four times)"
             )
-        if isinstance(self.discriminator, GruConfig):
+        if self.discriminator is not None:
             step = self.discriminator.samples_per_step
             if length % step:
                 raise ValueError(

@@ -21,7 +21,7 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
-from cpunet.networks.discriminators import Discriminator, discriminator
+from cpunet.networks.discriminators import GruDiscriminator
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes.schema import Recipe
@@ -40,8 +40,8 @@ class CycleGan(nn.Module):
         config, length = recipe.cyclegan, recipe.preparation.length
         self.ren = PositionalUNet(config.generator, length)
         self.iren = PositionalUNet(config.generator, length)
-        self.discriminator_data = discriminator(config.discriminator)
-        self.discriminator_sim = discriminator(config.discriminator)
+        self.discriminator_data = GruDiscriminator(config.discriminator)
+        self.discriminator_sim = GruDiscriminator(config.discriminator)
         if outside is not None:
             self.noise = KeptNoise(outside.noise.dt_ns)
             self.noise.set_noise(outside.noise.noise)
@@ -50,7 +50,7 @@ class CycleGan(nn.Module):
         """Parameters of REN and IREN."""
         return [*self.ren.parameters(), *self.iren.parameters()]
 
-    def judges(self) -> dict[str, Discriminator]:
+    def judges(self) -> dict[str, GruDiscriminator]:
         """The discriminators by side."""
         return {"data": self.discriminator_data, "sim": self.discriminator_sim}
 

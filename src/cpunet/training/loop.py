@@ -22,7 +22,6 @@ from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.outside import Outside
-from cpunet.training.start import match_skips
 
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
@@ -90,7 +89,7 @@ def train(
     device
         ``"cpu"``, ``"cuda"``, or one of several GPUs.
     init
-        Fills the networks with initial weights, instead of the closed-form start.
+        Fills the networks with initial weights, instead of random ones.
     outside
         Noise outside the generators, if the recipe requires it.
     listener
@@ -121,9 +120,6 @@ def train(
         ]
         if hooks.start is None and init is not None:
             init(model)
-        elif hooks.start is None:
-            at = recipe.preparation.samples_before
-            match_skips(model, samplers[0].pulses, samplers[1].pulses, at)
         warmup = 0 if init is None else config.warmup
         step = Step(model, config, outside=outside, warmup=warmup)
         training = _Training(step, samplers, device)

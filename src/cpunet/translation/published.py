@@ -82,7 +82,7 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
             f"{path}: no Positional U-Net (inc.double_conv.0.weight is missing or has an odd "
             "number of channels); give a file such as fep_REN.pt"
         )
-    config = PunetConfig(name="punet", width=width, dropout=0.1, residual=False)
+    config = PunetConfig(name="punet", width=width, dropout=0.1)
     with torch.device("meta"):
         expected = PositionalUNet(config, length).state_dict()
     maps = {name: state.pop(name) for name in MAPS if name in state}

@@ -1,4 +1,4 @@
-"""The closed-form start and the batch-norm statistics, on sets whose answer is known."""
+"""The batch-norm statistics, on sets whose answer is known."""
 
 from __future__ import annotations
 
@@ -6,51 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import EpochSampler, refresh_batch_statistics
-from cpunet.training.start import match_skips
-
-
-def edges(
-    n: int, at: float, level: torch.Tensor | float = 1.0, width: float = 2
-) -> torch.Tensor:
-    pulse = torch.sigmoid((torch.arange(64) - at) / width) * level
-    return pulse.expand(n, 1, 64).clone()
-
-
-@pytest.mark.parametrize("delay", [-7, 0, 5])
-@pytest.mark.parametrize("height", [0.8, 1.0, 1.2])
-def test_a_known_delay_and_level_are_found(tiny, delay, height):
-    model = CycleGan(tiny("generator.residual=true")).eval()
-    sim = edges(5, 25.5)
-    # flat up to the alignment, then falling
-    level = height * torch.exp(-(torch.arange(64) - 48).clamp(min=0) / 100)
-    data = edges(8, 25.5 + delay, level)
-    match_skips(model, sim, data, align_sample=48)
-    torch.testing.assert_close(model.ren(sim), data[:5], atol=0.01, rtol=0)
-    torch.testing.assert_close(model.iren(data[:5]), sim, atol=0.01, rtol=0)
-
-
-def test_the_delay_is_that_of_the_medians(tiny):
-    model = CycleGan(tiny("generator.residual=true"))
-    sim = torch.cat([edges(3, 25.5), edges(2, 50.5)])
-    data = torch.cat([edges(3, 20.5), edges(2, 2.5)])
-    match_skips(model, sim, data, align_sample=32)
-    assert (int(model.ren.skip.advance), int(model.iren.skip.advance)) == (5, -5)
-
-
-def test_there_and_back_is_nearly_the_identity(tiny):
-    model = CycleGan(tiny("generator.residual=true")).eval()
-    sim, data = edges(5, 25.5), edges(5, 21.5, torch.linspace(0.9, 0.8, 64))
-    match_skips(model, sim, data, align_sample=32)
-    torch.testing.assert_close(model.iren(model.ren(sim)), sim, atol=0.03, rtol=0)
-
-
-def test_networks_without_a_skip_are_left_as_they_are(tiny):
-    model = CycleGan(tiny("generator.residual=false"))
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    match_skips(model, edges(3, 25.5), edges(3, 20.5), 32)
-    assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
 
 
 def test_statistics_are_plain_averages_over_the_batches():
