@@ -85,7 +85,8 @@ class Calibrated:
     @property
     def response(self) -> ElectronicsResponse:
         """The chain."""
-        return self.problem.parameters.chain.response
+        chain: ElectronicsResponse = self.problem.parameters.chain.response
+        return chain
 
     @property
     def errors(self) -> Values:
@@ -185,13 +186,14 @@ class Search:
 
     def _chain(self) -> ElectronicsResponse:
         """Fit of the chain alone to some of the pulses, with the physics as simulated."""
-        config, training = self.recipe.matching
+        config, training = self.recipe.chain, self.recipe.matching.training
         bands = self.sets.bands(training.search_pulses)
         dt_ns = self.simulator.physics.settings.dt_ns
         blank = ResponseProblem(ElectronicsResponse(config, dt_ns), bands, draws=1)
         problem = blank.of(start_response(config, dt_ns, 1.0, blank.slope))
         levenberg_marquardt(problem, FIRST_STEPS, None)
-        return problem.response
+        chain: ElectronicsResponse = problem.response
+        return chain
 
     def _problem(
         self,

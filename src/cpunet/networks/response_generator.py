@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor
 
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.networks.kept_noise import KeptNoise
+from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig
 
 
 class ResponseGenerator(KeptNoise):
@@ -24,9 +27,13 @@ class ResponseGenerator(KeptNoise):
     remains: DrawnRemains | None = None
     """Remains of earlier pulses, which are added to records with the noise."""
 
-    def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
+    def __init__(self, config: ResponseConfig | LearnedConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
-        self.response = ElectronicsResponse(config, dt_ns)
+        self.response: Any = (
+            LearnedResponse(config, dt_ns)
+            if isinstance(config, LearnedConfig)
+            else ElectronicsResponse(config, dt_ns)
+        )
 
     @property
     def noise_dt_ns(self) -> float:

@@ -22,11 +22,65 @@ from cpunet.recipes.network_settings import ResponseConfig
 
 # Charge is zero before a window and constant after it, but decays outlast the record: their
 # kernel is cut, and the transform is long enough to avoid wrap-around.
-_MIN_FACTOR = 1.6
+MIN_FACTOR = 1.6
 IMAGES = 3  # images of the spectrum on either side
 
 
-class ElectronicsResponse(nn.Module):
+class Readout(nn.Module):
+    """Charge pulses → noise-free records of any height.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period of the pulses in ns.
+    """
+
+    dt_ns: Tensor
+    drift: nn.Module | None
+    """What changes the simulated pulses before they enter the readout."""
+    decay_known: float | None = None
+    """Relative error of the main decay, if it is known from baselines."""
+
+    def __init__(self, dt_ns: float) -> None:
+        super().__init__()
+        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Apply the response to prepared simulated pulses.
+
+        Parameters
+        ----------
+        windows
+            Shape (batch, samples), 0 … 1.
+
+        Returns
+        -------
+        Tensor
+            Shape (batch, PADDING_BEFORE + samples + PADDING_AFTER).
+        """
+        length = record_length(windows.shape[1])
+        padded = padded_length(length)
+        windows = self.drifted(windows)
+        current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
+        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
+        spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
+        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
+        return signal
+
+    def drifted(self, windows: Tensor) -> Tensor:
+        """Simulated pulses as they enter the readout."""
+        raise NotImplementedError
+
+    def transfer(self, padded: int) -> Tensor:
+        """Response to a step of charge at sample 0, as a spectrum of `padded` samples."""
+        raise NotImplementedError
+
+    def describe(self) -> dict[str, float]:
+        """Fitted properties by name, with the unit at the end of the name."""
+        raise NotImplementedError
+
+
+class ElectronicsResponse(Readout):
     """Charge pulses → noise-free records of any height, by physical parameters.
 
     Times are kept as logarithms, so that they stay positive and steps are relative.
@@ -39,16 +93,13 @@ class ElectronicsResponse(nn.Module):
         Sampling period of the pulses in ns.
     """
 
-    dt_ns: Tensor
     slow_ns: Tensor
     fast_decays_us: Tensor
-    decay_known: float | None = None
-    """Relative error of the main decay, if it is known from baselines."""
+    drift: DriftClock | None
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
-        super().__init__()
+        super().__init__(dt_ns)
         self.config = config
-        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
 
         def log(values: list[float]) -> nn.Parameter:
             return nn.Parameter(torch.tensor(values, dtype=torch.float64).log())
@@ -74,28 +125,6 @@ class ElectronicsResponse(nn.Module):
         self.log_ringing = log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
 
-    def forward(self, windows: Tensor) -> Tensor:
-        """Apply the response to prepared simulated pulses.
-
-        Parameters
-        ----------
-        windows
-            Shape (batch, samples), 0 … 1.
-
-        Returns
-        -------
-        Tensor
-            Shape (batch, PADDING_BEFORE + samples + PADDING_AFTER).
-        """
-        length = record_length(windows.shape[1])
-        padded = padded_length(length)
-        windows = self.drifted(windows)
-        current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
-        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
-        spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
-        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
-        return signal
-
     def drifted(self, windows: Tensor) -> Tensor:
         """Simulated pulses with their drift stretched, as they enter the readout."""
         if self.drift is None:
@@ -119,7 +148,7 @@ class ElectronicsResponse(nn.Module):
         fast = (_spline(everywhere) * passed).sum(dim=0)
         time_us = torch.arange(padded, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
         step = self.decay(time_us)
-        kept = time_us < (padded / _MIN_FACTOR - PADDING_BEFORE) * dt_ns * 1e-3
+        kept = time_us < (padded / MIN_FACTOR - PADDING_BEFORE) * dt_ns * 1e-3
         whole: Tensor = fast * torch.fft.rfft(torch.where(kept, step, torch.zeros_like(step)))
         return whole
 
@@ -199,7 +228,7 @@ def _spline(frequency: Tensor) -> Tensor:
 
 def padded_length(length: int) -> int:
     """Length of the Fourier transform of a record of this length, in samples."""
-    return fast_length(math.ceil(_MIN_FACTOR * length))
+    return fast_length(math.ceil(MIN_FACTOR * length))
 
 
 def fast_length(least: int) -> int:

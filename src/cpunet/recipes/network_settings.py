@@ -50,6 +50,21 @@ class ResponseConfig(Config):
         return times
 
 
+class LearnedConfig(Config):
+    """A learned step response behind a U-Net, see `cpunet.networks.learned_response`.
+
+    ``coordinates`` is the number of parameters of the step response; with ``ringing`` there
+    are more, for a ringing.  ``width`` is that of the U-Net's first layer, which is there with
+    ``drift``.  Both are tried if the fit without them is poor.
+    """
+
+    name: Literal["learned"]
+    coordinates: Annotated[int, Field(ge=1, le=60)]
+    width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
+    ringing: bool
+    drift: bool
+
+
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 

@@ -11,7 +11,12 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, model_validator
 
 from cpunet.errors import CpunetError
-from cpunet.recipes.network_settings import GruConfig, PunetConfig, ResponseConfig
+from cpunet.recipes.network_settings import (
+    GruConfig,
+    LearnedConfig,
+    PunetConfig,
+    ResponseConfig,
+)
 from cpunet.recipes.training_settings import MatchingConfig, TrainingConfig
 from cpunet.settings import Config, Positive, Samples
 
@@ -130,7 +135,7 @@ class CycleGanSettings(NamedTuple):
 class MatchingSettings(NamedTuple):
     """The parts of a recipe that make a matched response."""
 
-    generator: ResponseConfig
+    generator: ResponseConfig | LearnedConfig
     training: MatchingConfig
 
 
@@ -142,7 +147,9 @@ class Recipe(Config):
     peaks: Annotated[dict[str, PeakConfig], Field(min_length=1, max_length=1000)]
     preparation: PreparationConfig
     cuts: CutConfig
-    generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
+    generator: Annotated[
+        PunetConfig | ResponseConfig | LearnedConfig, Field(discriminator="name")
+    ]
     discriminator: GruConfig | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
@@ -175,18 +182,33 @@ class Recipe(Config):
             If the recipe does not match a response.
         """
         if not (
-            isinstance(self.generator, ResponseConfig)
+            isinstance(self.generator, ResponseConfig | LearnedConfig)
             and isinstance(self.training, MatchingConfig)
         ):
             raise CpunetError(f"recipe {self.name}: does not match a response")
         return MatchingSettings(self.generator, self.training)
+
+    @property
+    def chain(self) -> ResponseConfig:
+        """The readout chain whose parameters are fitted.
+
+        Raises
+        ------
+        CpunetError
+            If the recipe has none.
+        """
+        if not isinstance(self.generator, ResponseConfig):
+            raise CpunetError(
+                f"recipe {self.name}: fits no readout chain; give the recipe fast"
+            )
+        return self.generator
 
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:
         network = isinstance(self.generator, PunetConfig)
         if network != isinstance(self.training, TrainingConfig):
             raise ValueError(
-                "generator punet goes with training method cyclegan, response with matching"
+                "generator punet goes with training method cyclegan, others with matching"
             )
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")

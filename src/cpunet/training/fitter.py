@@ -14,6 +14,7 @@ from cpunet.training.response_problem import ResponseProblem
 # Chi-square per moment, with as many pulses as are used to search for the valley, below which a
 # fit has found the right one.  Outliers in the data and the ridge keep it above 1.
 GOOD_FIT = 1.6
+FOLLOWING = 4  # steps of a fit after a small change
 
 
 class Fitted(NamedTuple):
@@ -65,13 +66,19 @@ class Fitter:
     listener: Listener | None = None
     steps: int = 0
 
-    def fit(self, problem: ResponseProblem, *, coarse: bool = True) -> Fitted:
+    def follow(self, problem: ResponseProblem) -> Fitted:
+        """Take a few steps from the current response, after a small change of the pulses."""
+        return self.fit(problem, coarse=False, steps=FOLLOWING)
+
+    def fit(
+        self, problem: ResponseProblem, *, coarse: bool = True, steps: int | None = None
+    ) -> Fitted:
         """Fit from the current response; `coarse` if it is far from the data."""
 
         def told(_step: int, chi_square: float) -> None:
             self.count(chi_square)
 
-        found = levenberg_marquardt(problem, self.training.steps, told, coarse=coarse)
+        found = levenberg_marquardt(problem, steps or self.training.steps, told, coarse=coarse)
         return Fitted(problem, found.cost, found.covariance)
 
     def count(self, chi_square: float) -> None:

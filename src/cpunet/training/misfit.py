@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import Readout
 from cpunet.training.moments import Readings, Values
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.response_problem import Band
@@ -32,9 +32,7 @@ class _Shift(NamedTuple):
     of_mean: float
 
 
-def amplitude_shift(
-    response: ElectronicsResponse, bands: Sequence[Band]
-) -> tuple[float, float]:
+def amplitude_shift(response: Readout, bands: Sequence[Band]) -> tuple[float, float]:
     """Relative shift that the translated current amplitudes need, and its error.
 
     It is a least-squares fit to the densities of its logarithm, with their covariance from the
@@ -54,7 +52,7 @@ def amplitude_shift(
     return found.shift, found.error
 
 
-def _linear_fit(response: ElectronicsResponse, bands: Sequence[Band], start: float) -> _Shift:
+def _linear_fit(response: Readout, bands: Sequence[Band], start: float) -> _Shift:
     """Fit from amplitudes that are already shifted by `start`."""
     chi_square = weight = weighted = weight_of_mean = weighted_mean = 0.0
     for band in bands:
@@ -75,7 +73,7 @@ def _linear_fit(response: ElectronicsResponse, bands: Sequence[Band], start: flo
 
 
 def _density(
-    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse, start: float
+    band: Band, functions: ConditionalFunctions, response: Readout, start: float
 ) -> tuple[Values, Values, Values]:
     """Mean densities of translated amplitudes, derivatives in the shift, and mean logarithm."""
 

@@ -188,8 +188,7 @@ class Moments:
             Readings of the pulses that can be aligned, and whether the tail slope of each is
             outside the range of the data.
         """
-        window = _window(self.config, self.preparation, self.level, last)
-        aligned, slopes, log_amplitude = _aligned(records, window)
+        aligned, slopes, log_amplitude = _aligned(records, self.window(last))
         linear = _linear(aligned, slopes, self.mean, self.components, self.config)
         linear = (linear - self.centres) / self.spreads
         beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
@@ -198,6 +197,10 @@ class Moments:
             linear, log_amplitude, np.ones(len(linear)) if weights is None else weights
         )
         return (readings, beyond) if counts.all() else (readings[counts], beyond[counts])
+
+    def window(self, last: int) -> Window:
+        """Where records are read whose half maxima are before a sample."""
+        return _window(self.config, self.preparation, self.level, last)
 
     def functions(self, readings: Readings, clip: float | None = None) -> Values:
         """Functions of each pulse, shape (pulses, moments).

@@ -25,8 +25,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
+import torch
 
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.learned_response import StepResponse
+from cpunet.networks.response_layer import Readout
+from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import BLOCK, Moments, Readings, Values, spread
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.smooth_parameters import SmoothParameters
@@ -177,7 +180,7 @@ class _Weighted:
     """Optimally weighted functions of one band."""
 
     def __init__(
-        self, band: Band, smooth: SmoothParameters, response: ElectronicsResponse, bins: int
+        self, band: Band, smooth: SmoothParameters, response: Readout, bins: int
     ) -> None:
         self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
         data = band.moments.data
@@ -188,7 +191,10 @@ class _Weighted:
         )
         measured = [Sums.of(self.functions(data[rows])) for rows in of_data]
         sim = band.sim.of(np.concatenate(of_sim))
-        simulated = _simulated(sim, self.functions, smooth, response)
+        if isinstance(response, StepResponse):
+            simulated = _exactly_simulated(sim, self.functions, response)
+        else:
+            simulated = _simulated(sim, self.functions, smooth, response)
         counts = (sum(part.n for part in side) for side in (simulated, measured))
         self.pairs = 1 / sum(1 / n for n in counts)
         self.parts = Parts(simulated, measured, band.pairs)
@@ -197,7 +203,7 @@ class _Weighted:
         total = sum(self.functions.sum(data[rows]) for rows in _blocks(len(data)))
         self.wanted = total / len(data) @ self.weights
 
-    def deviations(self, response: ElectronicsResponse) -> Values:
+    def deviations(self, response: Readout) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (self.functions.sum(readings),)
 
@@ -213,7 +219,7 @@ def _simulated(
     sim: Translated,
     functions: ConditionalFunctions,
     smooth: SmoothParameters,
-    response: ElectronicsResponse,
+    response: Readout,
 ) -> list[Sums]:
     """Sums over each part of the simulated pulses, including those of derivatives."""
 
@@ -244,3 +250,23 @@ def _simulated(
         Sums(n, total, products, column)
         for ((total, products), n), column in zip(here, columns, strict=True)
     ]
+
+
+def _exactly_simulated(
+    sim: Translated, functions: ConditionalFunctions, response: StepResponse
+) -> list[Sums]:
+    """The same with exact derivatives."""
+    exact, size = DifferentiableSet(sim), -(-len(sim) // PARTS)
+    centres, widths = (
+        torch.from_numpy(values).float() for values in (functions.centres, functions.widths)
+    )
+    of = exact.readings.conditional(centres, widths)
+    parts = [Sums() for _ in range(PARTS)]
+    for first, values, moved, weights in exact.blocks(response, of, draws=1):
+        # a block can lie in two parts
+        for part in range(first // size, (first + len(values) - 1) // size + 1):
+            rows = slice(max(part * size - first, 0), (part + 1) * size - first)
+            v, w = values[rows].double().numpy(), weights[rows].double().numpy()
+            column = (weights[rows] @ moved[:, rows]).double().numpy().T
+            parts[part] += Sums(w.sum(), w @ v, (w * v.T) @ v, column)
+    return parts

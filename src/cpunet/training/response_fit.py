@@ -160,7 +160,7 @@ def fit_response(
     CpunetError
         If there are too few pulses, or the fit does not find a finite chi-square.
     """
-    config, training = recipe.matching
+    config, training = recipe.chain, recipe.matching.training
     rng = np.random.default_rng(seed)
     sets = PulseSets(sim, data, noise, recipe, rng, remains)
     some = sets.bands(training.search_pulses)
@@ -208,13 +208,13 @@ def _determined(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fit:
     response = found.problem.response
     if response.drift is not None:
         whole = _with_more(found, bands, fitter)
-        return _fit(whole.problem, whole.covariance, fitter.steps)
+        return described(whole.problem, whole.covariance, fitter.steps)
     compared = ResponseProblem(response, bands)
     for _ in range(ROUNDS):
         covariance = refine(found.problem, bands, fitter.training.conditional_bins)
         deviations = compared.deviations(compared.parameters.vector())
         fitter.count(float(deviations @ deviations))
-    return _fit(compared, covariance, fitter.steps)
+    return described(compared, covariance, fitter.steps)
 
 
 def _with_more(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fitted:
@@ -229,11 +229,11 @@ def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:
     deviations = problem.deviations(problem.parameters.vector())
     problem.allow_for_model_error()
     again = fitter.fit(problem, coarse=False)
-    fit = _fit(problem, again.covariance, fitter.steps)
+    fit = described(problem, again.covariance, fitter.steps)
     return replace(fit, chi_square=float(deviations @ deviations))
 
 
-def _fit(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
+def described(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
     """Describe the fit of a response."""
     parameters = problem.parameters
     vector = parameters.vector()

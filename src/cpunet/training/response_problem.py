@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 import torch
+from torch import Tensor
 
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.learned_response import StepResponse
+from cpunet.networks.response_layer import Readout
+from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import Translated
 
@@ -21,6 +25,8 @@ TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # steps of the finite differences
 # The same for the stretch of the drift, and for its change per us.
 STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
 STRETCH = "drift.stretch"
+# Of a learned step response, whose coordinates have priors of width 1 around 0.
+COORDINATES, LONGEST = "coordinates", 2.0
 
 
 class Parameters:
@@ -32,7 +38,9 @@ class Parameters:
         Response with the parameters; their current values are the centres of the priors.
     """
 
-    def __init__(self, response: ElectronicsResponse) -> None:
+    response: Any  # an `ElectronicsResponse` or a `StepResponse`
+
+    def __init__(self, response: Readout) -> None:
         self.response = response
         named = [(n, p) for n, p in response.named_parameters() if p.numel()]
         self._parts = [part for _, part in named]
@@ -42,11 +50,14 @@ class Parameters:
             "decay_weights": DECAY_WIDTH,
             "ringing": RINGING_WIDTH,
             "slow_weights": WEIGHT_WIDTH,
+            COORDINATES: 1.0,
         }
         self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
         if response.decay_known is not None:
             self.widths[self.labels.index("log_decay_us")] = response.decay_known
-        self.longest = self.widths
+        learned = np.array([name == COORDINATES for name in self.labels])
+        self.centre[learned] = 0.0
+        self.longest = np.where(learned, LONGEST, self.widths)
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
         times = [label.startswith("log") for label in self.labels]
@@ -122,15 +133,15 @@ class ResponseProblem:
     """
 
     def __init__(
-        self, response: ElectronicsResponse, bands: Sequence[Band], draws: int | None = None
+        self, response: Readout, bands: Sequence[Band], draws: int | None = None
     ) -> None:
         self.parameters, self.bands, self.draws = Parameters(response), tuple(bands), draws
         self.clip: float | None = None
-        self._comparisons = [_Comparison(band, None, draws) for band in self.bands]
+        self._comparisons = [Comparison(band, draws=draws) for band in self.bands]
 
     @property
-    def response(self) -> ElectronicsResponse:
-        """The response that is fitted."""
+    def response(self) -> Any:
+        """The response that is fitted: an `ElectronicsResponse` or a `StepResponse`."""
         return self.parameters.response
 
     @property
@@ -171,12 +182,10 @@ class ResponseProblem:
         determine it, see `Moments.model_errors`.
         """
         self._comparisons = [
-            _Comparison(b, b.moments.model_errors, self.draws) for b in self.bands
+            Comparison(b, b.moments.model_errors, self.draws) for b in self.bands
         ]
 
-    def of(
-        self, response: ElectronicsResponse, bands: Sequence[Band] | None = None
-    ) -> ResponseProblem:
+    def of(self, response: Readout, bands: Sequence[Band] | None = None) -> ResponseProblem:
         """The same for another response, which the priors are centred on, or other pulses."""
         return ResponseProblem(response, bands or self.bands, self.draws)
 
@@ -205,7 +214,14 @@ class ResponseProblem:
     def derivatives(
         self, vector: Values, deviations: Values, parameters: Iterable[int]
     ) -> Values:
-        """Derivatives of the deviations by finite differences, one column per parameter."""
+        """Derivatives of the deviations, one column per parameter.
+
+        Those of a learned step response are exact, others are finite differences.
+        """
+        if isinstance(self.response, StepResponse):
+            self.parameters.set(vector)
+            found = [c.derivatives(self.response, self.clip) for c in self._comparisons]
+            return np.concatenate(found)[:, list(parameters)]
         columns = []
         for i in parameters:
             moved = vector.copy()
@@ -215,10 +231,12 @@ class ResponseProblem:
         return np.stack(columns, axis=1)
 
 
-class _Comparison:
+class Comparison:
     """Moments of the data in one band, and their covariance."""
 
-    def __init__(self, band: Band, model_errors: Values | None, draws: int | None) -> None:
+    def __init__(
+        self, band: Band, model_errors: Values | None = None, draws: int | None = None
+    ) -> None:
         self.sim, self.moments, self.draws = band.sim, band.moments, draws
         values = self.moments.values
         self.wanted = values.mean(axis=0)
@@ -231,7 +249,20 @@ class _Comparison:
             correlation = correlation + np.diag(model_errors**2)
         self.whiten = scipy.linalg.cholesky(np.linalg.inv(correlation))
 
-    def pulls(self, response: ElectronicsResponse, clip: float | None) -> Values:
+    def derivatives(self, response: StepResponse, clip: float | None) -> Values:
+        """Exact derivatives of the uncorrelated deviations, shape (moments, coordinates)."""
+        exact = DifferentiableSet(self.sim)
+
+        def functions(linear: Tensor, amplitude: Tensor) -> Tensor:
+            return exact.readings.functions(linear, amplitude, clip)
+
+        total, n = torch.zeros(()), 0.0
+        for _, _, moved, weights in exact.blocks(response, functions, draws=self.draws):
+            total = total + (weights @ moved).double()  # (coordinates, moments)
+            n += float(weights.sum())
+        return np.asarray(self.whiten @ (total.numpy() / n / self.sigma).T)
+
+    def pulls(self, response: Readout, clip: float | None) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (readings.weights @ self.moments.functions(readings, clip),)
 

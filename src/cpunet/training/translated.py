@@ -18,10 +18,11 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.networks.drift_clock import DriftClock
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
-    ElectronicsResponse,
+    Readout,
     padded_length,
     record_length,
 )
@@ -165,6 +166,11 @@ class Translated:
         """Samples of a record."""
         return record_length(self.sim.shape[1])
 
+    @property
+    def last(self) -> int:
+        """Sample of a record after all half maxima."""
+        return PADDING_BEFORE + self.moments.preparation.samples_before + DELAY
+
     def first(self, n: int) -> Translated:
         """The first `n` pulses, with their noise."""
         return self.of(slice(n))
@@ -176,7 +182,7 @@ class Translated:
 
     def sums(
         self,
-        response: ElectronicsResponse,
+        response: Readout,
         of: Callable[[Readings], tuple[Values, ...]],
         *,
         cut: bool = True,
@@ -205,7 +211,7 @@ class Translated:
 
     def sums_of_blocks(
         self,
-        response: ElectronicsResponse,
+        response: Readout,
         of: Callable[[Readings], tuple[Values, ...]],
         *,
         size: int = BLOCK,
@@ -214,7 +220,8 @@ class Translated:
     ) -> list[Total]:
         """Same as `sums`, for each block of `size` pulses in their order."""
         transfer = self._transfer(response)
-        stretch = [] if response.drift is None else response.drift.stretch.tolist()
+        drift = response.drift
+        stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
         if stretch != self._stretch:
             self._spectra.clear()
             self._stretch[:] = stretch
@@ -245,14 +252,14 @@ class Translated:
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
 
-    def _transfer(self, response: ElectronicsResponse) -> npt.NDArray[np.complex64]:
+    def _transfer(self, response: Readout) -> npt.NDArray[np.complex64]:
         with torch.no_grad():
             transfer = response.transfer(padded_length(self.length))
         return np.asarray(transfer.numpy(), np.complex64)
 
     def _block(
         self,
-        response: ElectronicsResponse,
+        response: Readout,
         transfer: npt.NDArray[np.complex64],
         first: int,
         size: int,
@@ -260,22 +267,19 @@ class Translated:
     ) -> Iterator[tuple[Readings, npt.NDArray[np.bool_]]]:
         """Result of `Moments.read` for one block of pulses, draw by draw."""
         preparation = self.moments.preparation
-        spectrum = self._spectrum(response, first, size) * transfer
+        spectrum = self.spectrum(response, first, size) * transfer
         padded = padded_length(self.length)
         records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
         plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(
             axis=1, keepdims=True
         )
         records *= preparation.tail_level / plateau
-        last = PADDING_BEFORE + preparation.samples_before + DELAY
         for draw in range(len(self.noise.factor))[:draws]:
             noisy = self.noise.add(records, draw, first)
             weights = self.weights[first : first + size]
-            yield self.moments.read(noisy, last, weights)
+            yield self.moments.read(noisy, self.last, weights)
 
-    def _spectrum(
-        self, response: ElectronicsResponse, first: int, size: int
-    ) -> npt.NDArray[np.complex64]:
+    def spectrum(self, response: Readout, first: int, size: int) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
         sim = self.sim[first : first + size]
         if (kept := self._spectra.get((first, len(sim)))) is not None:

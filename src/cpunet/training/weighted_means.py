@@ -23,6 +23,7 @@ import scipy.linalg
 from cpunet.training.moments import Values
 
 RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
+TINY = 1e-6  # the same in those of the weighted means, some of which may be alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +104,7 @@ class WeightedMeans:
         correlation = (1 - RIDGE) * covariance / sigma / sigma.T + RIDGE * np.eye(len(sigma))
         self.weights: Values = np.linalg.solve(correlation, slopes / sigma) / sigma
         spread = self.weights.T @ measured.covariance @ self.weights / pairs
+        spread += np.diag(TINY * spread.diagonal())
         self.whiten = np.asarray(scipy.linalg.cholesky(np.linalg.inv(spread)))
         weighing = self.whiten @ self.weights.T
         self.slopes = weighing @ slopes

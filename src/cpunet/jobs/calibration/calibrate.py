@@ -43,7 +43,6 @@ from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.pulse_sets import PulseSets
@@ -99,11 +98,7 @@ class Calibration:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.recipe.training, MatchingConfig):
-            raise CpunetError(
-                f"recipe {self.recipe.name}: a network, which has no readout chain to "
-                "calibrate with a detector; give fast"
-            )
+        _ = self.recipe.chain  # without one there is nothing to calibrate with a detector
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:

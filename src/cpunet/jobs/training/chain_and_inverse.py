@@ -10,18 +10,22 @@ from typing import Any
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.jobs.common.monitor import Monitor
+from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.drift_training import DriftFit
 from cpunet.training.inverse import fit_inverse
+from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
@@ -41,23 +45,25 @@ class Sides:
     data_set: InputSet | None = None
 
 
-def known_response(run: Path, dt_ns: float) -> ElectronicsResponse:
-    """The response of a run, as a starting point.
+def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
+    """The response of a run, as a starting point for a recipe.
 
     Raises
     ------
     CpunetError
-        If the run has no response.
+        If the run has no response of the recipe's kind.
     """
     recipe = read_recipe(run)
-    if not isinstance(recipe.generator, ResponseConfig):
+    generator = recipe.generator
+    if generator.name != like.generator.name or isinstance(generator, PunetConfig):
         raise CpunetError(
-            f"{run}: a network ({recipe.name}), from which no readout chain can start; give a "
-            "run of fast"
+            f"{run}: of recipe {recipe.name}, from which {like.name} cannot start; give a run "
+            f"of {like.name}"
         )
-    generator = ResponseGenerator(recipe.generator, dt_ns)
-    load_network(run, "ren", generator)
-    return generator.response
+    network = ResponseGenerator(generator, dt_ns)
+    load_network(run, "ren", network)
+    known: Readout = network.response
+    return known
 
 
 def match(
@@ -66,7 +72,7 @@ def match(
     seed: int,
     listen: Listener,
     monitor: Monitor,
-    known: ElectronicsResponse | None = None,
+    known: Readout | None = None,
 ) -> tuple[nn.Module, dict[str, Any], Recipe]:
     """Measure the noise, fit the response, and invert it.
 
@@ -101,23 +107,12 @@ def match(
     if note is not None:
         monitor.note(f"warning: {note}")
 
-    if known is not None:
-        allowed = recipe.matching.training.drift_terms
-        if known.config.drift_terms > allowed:
-            known = with_drift_terms(known, allowed)
-        recipe = recipe.model_copy(update={"generator": known.config})
-    response, fit = fit_response(
-        sides.sim,
-        sides.data,
-        noise,
-        recipe,
-        seed=seed,
-        known=known,
-        remains=drawn,
-        listener=listen,
-    )
+    response, fit, gained = _fitted(sides, noise, recipe, seed, known, drawn, listen)
     told = _described(fit, response, noise, sides)
     _note(fit, told, monitor)
+    if gained is not None:
+        told["drift"] = asdict(gained)
+        monitor.note(str(gained))
     if told_of_remains is not None:
         told["remains"] = told_of_remains
     # as fitted: a ringing or a stretch may have been added
@@ -130,8 +125,49 @@ def match(
     return nn.ModuleDict({"ren": chain, "iren": iren}), {"fit": told}, recipe
 
 
+def _fitted(
+    sides: Sides,
+    noise: BaselineNoise,
+    recipe: Recipe,
+    seed: int,
+    known: Readout | None,
+    remains: DrawnRemains | None,
+    listener: Listener,
+) -> tuple[ElectronicsResponse | LearnedResponse, Fit, DriftFit | None]:
+    """Fit the response of a recipe."""
+    if isinstance(recipe.generator, LearnedConfig):
+        assert known is None or isinstance(known, LearnedResponse)
+        return fit_learned(
+            sides.sim,
+            sides.data,
+            noise,
+            recipe,
+            seed=seed,
+            known=known,
+            remains=remains,
+            listener=listener,
+        )
+    if known is not None:
+        assert isinstance(known, ElectronicsResponse)
+        allowed = recipe.matching.training.drift_terms
+        if known.config.drift_terms > allowed:
+            known = with_drift_terms(known, allowed)
+        recipe = recipe.model_copy(update={"generator": known.config})
+    response, fit = fit_response(
+        sides.sim,
+        sides.data,
+        noise,
+        recipe,
+        seed=seed,
+        known=known,
+        remains=remains,
+        listener=listener,
+    )
+    return response, fit, None
+
+
 def _described(
-    fit: Fit, response: ElectronicsResponse, noise: BaselineNoise, sides: Sides
+    fit: Fit, response: Readout, noise: BaselineNoise, sides: Sides
 ) -> dict[str, Any]:
     """Entry on the fit for ``run.json``."""
     parameters = response.describe()

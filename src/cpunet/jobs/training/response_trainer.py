@@ -11,7 +11,7 @@ from pathlib import Path
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.chain_and_inverse import known_response, match
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import Readout
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
@@ -41,12 +41,12 @@ class ResponseTrainer:
     def train(
         self,
         job: TrainingJob,
-        known: ElectronicsResponse | None = None,
+        known: Readout | None = None,
     ) -> Trained:
         """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
         started, clock = datetime.now(UTC), time.perf_counter()
         if job.options.init is not None:
-            known = known_response(job.options.init, job.data.dt_ns)
+            known = known_response(job.options.init, job.data.dt_ns, self.recipe)
         # upper limit for one start; most fits need fewer steps
         steps = self.recipe.matching.training.steps
         with job.monitor.stage("Matching", steps) as advance:

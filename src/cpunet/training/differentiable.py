@@ -1,0 +1,278 @@
+"""The moments of translated pulses with exact derivatives.
+
+A fit of many parameters, and a network, need derivatives that differences do not give: noise
+moves a half maximum by a sample here and there, and each such jump is as large as what is
+looked for.  Here the samples at which a record is read are found first, by the rules of
+`cpunet.training._record_kernels` and without derivatives; all that is read there is then in the
+graph.  Where a window moves with the half maximum, by whole samples, the derivative is that of
+its mean position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from cpunet.networks.learned_response import StepResponse
+from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE, padded_length
+from cpunet.pulses.parameters import current_amplitude_kernel
+from cpunet.training.moments import Moments
+from cpunet.training.translated import PLATEAU, Translated
+
+BLOCK = 128  # pulses at a time: each has a record for every parameter
+AGAIN = 20  # samples after the half maximum from which it is searched for again
+
+# Functions of each pulse, from its linear readings and the logarithm of its current amplitude.
+Functions = Callable[[Tensor, Tensor], Tensor]
+
+
+class _Samples(NamedTuple):
+    """Samples at which records are read, each of shape (pulses,)."""
+
+    level: Tensor  # half maximum that baseline and level refer to
+    half: Tensor  # half maximum of the normalised record
+    tail: Tensor  # start of the tail
+    steepest: Tensor  # centre of the current amplitude, and its phase
+    phase: Tensor
+
+
+class DifferentiableReadings:
+    """`Moments.read` and `Moments.functions` in the graph of PyTorch.
+
+    Parameters
+    ----------
+    moments
+        Moments defined by the data.
+    last
+        Sample after all half maxima.
+    """
+
+    def __init__(self, moments: Moments, last: int) -> None:
+        self.moments, self.config = moments, moments.config
+        self.window = w = moments.window(last)
+        matrix = np.concatenate([moments.stretches, moments.components], axis=1)
+        self.matrix = torch.from_numpy(matrix)
+        offset = moments.mean.astype(float) @ moments.components
+        self.offset = torch.zeros(matrix.shape[1])
+        self.offset[-len(offset) :] = torch.from_numpy(offset)
+        self.centres, self.spreads, self.bins, self.bin_widths = (
+            torch.from_numpy(values).float()
+            for values in (
+                moments.centres,
+                moments.spreads,
+                moments.amplitude_centres,
+                moments.amplitude_widths,
+            )
+        )
+        self.weights = torch.from_numpy(np.asarray(current_amplitude_kernel(), np.float32))
+        lever = torch.arange(w.fit_samples) - 0.5 * (w.fit_samples - 1)
+        self.lever = lever / (lever @ lever)
+
+    def __call__(self, records: Tensor) -> tuple[Tensor, Tensor]:
+        """Read noisy records (pulses, samples): linear readings, and log current amplitudes."""
+        w = self.window
+        at = self._samples(records.detach())
+        normal, moved = self._normalised(records, at.level)
+        aligned = self._aligned(normal, at.half)
+        linear = aligned @ self.matrix - self.offset
+        logs = _stretch(normal, at.tail, 0, w.fit_samples + 1).clamp_min(1e-3).log()
+        slope = logs[:, :-1] @ self.lever
+        slope = slope + moved * (logs[:, 1:] @ self.lever - slope)
+        half = self.weights.shape[1] // 2
+        current = _stretch(torch.diff(aligned), at.steepest, -half, half + 1)
+        amplitude = (current * self.weights[at.phase]).sum(dim=1).clamp_min(1e-4).log()
+        whole = torch.cat([linear, slope[:, None]], dim=1)
+        return (whole - self.centres) / self.spreads, amplitude
+
+    def functions(self, linear: Tensor, amplitude: Tensor, clip: float | None = None) -> Tensor:
+        """Functions of each pulse as `Moments.functions`, shape (pulses, moments)."""
+        config, limit = self.config, clip or self.config.clip
+        linear = linear.clamp(-limit, limit)
+        first = len(config.segments) - 1
+        squared = torch.cat([linear[:, first : first + config.squares], linear[:, -1:]], dim=1)
+        density = _density(amplitude, self.bins, self.bin_widths)
+        return torch.cat([linear, squared.square(), density], dim=1)
+
+    def conditional(self, centres: Tensor, widths: Tensor) -> Functions:
+        """Functions as `ConditionalFunctions`, for its bins."""
+
+        def functions(linear: Tensor, amplitude: Tensor) -> Tensor:
+            values = self.functions(linear, amplitude)
+            first = len(self.config.segments) - 1
+            components = values[:, first : first + self.config.components]
+            bins = _density(amplitude, centres, widths)
+            both = components[:, :, None] * bins[:, None, :]
+            return torch.cat([values, bins, both.flatten(1)], dim=1)
+
+        return functions
+
+    def _samples(self, records: Tensor) -> _Samples:
+        w = self.window
+        first = self._crossing(records, torch.full_like(records[:, 0], w.last))
+        level = self._crossing(self._normalised(records, first)[0], first + AGAIN)
+        normal = self._normalised(records, level)[0]
+        half = self._crossing(normal, level + AGAIN)
+        begin = w.last - w.align_before
+        top = normal[:, begin : w.last + w.align_after]
+        before = torch.arange(top.shape[1]) < top.argmax(dim=1, keepdim=True)
+        below = (top < w.align_fraction * top.amax(dim=1, keepdim=True)) & before
+        tail = begin + _last(below) + 1 + w.align_after - w.fit_samples
+        current = torch.diff(self._aligned(normal, half))
+        from_sample = max(w.before - w.edge, 0)
+        steepest = from_sample + current[:, from_sample : w.before + w.edge].argmax(dim=1)
+        near, width = w.edge // 3, self.weights.shape[1]
+        around = _stretch(current, steepest, -near - width // 2, near + width // 2 + 1)
+        best = (around.unfold(1, width, 1) @ self.weights.T).flatten(1).argmax(dim=1)
+        phases = len(self.weights)
+        centre = steepest - near + torch.div(best, phases, rounding_mode="floor")
+        return _Samples(level, half, tail, centre, best % phases)
+
+    def _crossing(self, records: Tensor, last: Tensor) -> Tensor:
+        """Sample before the last upward crossing of the half height before `last`."""
+        low = records[:, :-1]
+        index = torch.arange(low.shape[1])
+        return _last((low < self.window.level) & (index < last[:, None])).clamp_min(0)
+
+    def _normalised(self, records: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
+        """Records with baseline 0 and nominal level, and the motion of the half maximum.
+
+        The latter is 0, but has the derivative of the time of the half maximum.
+        """
+        w = self.window
+        base = _stretch(records, sample, -w.base_first, -w.base_stop + 1)
+        tail = _stretch(records, sample, w.after - w.level_samples, w.after + 1)
+        zero, top = base[:, :-1].mean(dim=1), tail[:, :-1].mean(dim=1)
+        time = self._part(
+            (records - zero[:, None]) * (w.tail_level / (top - zero))[:, None], sample
+        )
+        moved = time - time.detach()
+        zero = zero + moved * (base[:, -1] - base[:, 0]) / (base.shape[1] - 1)
+        top = top + moved * (tail[:, -1] - tail[:, 0]) / (tail.shape[1] - 1)
+        return (records - zero[:, None]) * (w.tail_level / (top - zero))[:, None], moved
+
+    def _part(self, records: Tensor, sample: Tensor) -> Tensor:
+        """Time of the half maximum after a sample."""
+        low, high = _stretch(records, sample, 0, 2).unbind(dim=1)
+        return (self.window.level - low) / (high - low).clamp_min(1e-6)
+
+    def _aligned(self, records: Tensor, sample: Tensor) -> Tensor:
+        w = self.window
+        around = _stretch(records, sample, -w.before, w.after + 1)
+        return torch.lerp(around[:, :-1], around[:, 1:], self._part(records, sample)[:, None])
+
+
+class DifferentiableSet:
+    """A set of simulated pulses whose functions have derivatives in the step response.
+
+    Parameters
+    ----------
+    sim
+        The pulses, their noise, and the moments that they are compared by.
+    """
+
+    def __init__(self, sim: Translated) -> None:
+        self.sim, self.readings = sim, DifferentiableReadings(sim.moments, sim.last)
+        self.padded = padded_length(sim.length)
+        self.weights = torch.from_numpy(sim.weights).float()
+
+    def records(self, spectra: Tensor, transfer: Tensor) -> Tensor:
+        """Noise-free records of unit height, from spectra of the current, before `scaled`."""
+        records: Tensor = torch.fft.irfft(spectra * transfer, self.padded)
+        return records[..., : self.sim.length]
+
+    def scaled(self, records: Tensor) -> Tensor:
+        """Records of the height to which noise is added."""
+        plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(dim=1, keepdim=True)
+        return records * (self.sim.moments.preparation.tail_level / plateau)
+
+    def spectra(self, pulses: Tensor) -> Tensor:
+        """Spectra of the current of charge pulses, in the graph."""
+        current = torch.diff(pulses, dim=1, prepend=torch.zeros_like(pulses[:, :1]))
+        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
+        spectra: Tensor = torch.fft.rfft(current, self.padded)
+        return spectra
+
+    @torch.no_grad()
+    def values(self, response: StepResponse) -> npt.NDArray[np.float64]:
+        """Moments' functions of each pulse, means over the draws, shape (pulses, moments)."""
+        transfer = response.transfer(self.padded).to(torch.complex64)
+        out = []
+        for first in range(0, len(self.sim), BLOCK):
+            spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
+            clean = self.scaled(self.records(spectra, transfer))
+            draws = [
+                self.readings.functions(
+                    *self.readings(clean + self.noise(d, first, len(clean)))
+                )
+                for d in range(len(self.sim.noise.factor))
+            ]
+            out.append(torch.stack(draws).mean(dim=0))
+        return torch.cat(out).double().numpy()
+
+    def blocks(
+        self,
+        response: StepResponse,
+        functions: Functions,
+        *,
+        draws: int | None = None,
+        size: int = BLOCK,
+    ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """Functions of each pulse and their derivatives, block by block, draw by draw.
+
+        Yields
+        ------
+        tuple
+            First pulse; functions (pulses, functions); derivatives (coordinates, pulses,
+            functions); weights of the pulses.
+        """
+        with torch.no_grad():
+            transfer = response.transfer(self.padded).to(torch.complex64)
+        slopes = response.transfer_slopes(self.padded).to(torch.complex64)[:, None]
+        for first in range(0, len(self.sim), size):
+            spectra = torch.from_numpy(self.sim.spectrum(response, first, size))
+            clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
+            for draw in self._draws[:draws]:
+                noise = self.noise(draw, first, len(clean))
+
+                def of(records: Tensor, noise: Tensor = noise) -> Tensor:
+                    return functions(*self.readings(self.scaled(records) + noise))
+
+                def along(
+                    tangent: Tensor,
+                    of: Callable[[Tensor], Tensor] = of,
+                    clean: Tensor = clean,
+                ) -> Any:
+                    return torch.func.jvp(of, (clean,), (tangent,))
+
+                # the values are the same along all directions
+                values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
+                yield first, values, columns, self.weights[first : first + size]
+
+    @property
+    def _draws(self) -> range:
+        return range(len(self.sim.noise.factor))
+
+    def noise(self, draw: int, first: int, n: int) -> Tensor:
+        """Noise of `n` pulses from the first one on, shape (n, samples)."""
+        nothing = np.zeros((n, self.sim.length), np.float32)
+        return torch.from_numpy(self.sim.noise.add(nothing, draw, first))
+
+
+def _stretch(records: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
+    """Samples `first` to `stop`, counted from `sample` of each record; edges are repeated."""
+    index = sample[:, None] + torch.arange(first, stop)
+    return records.gather(1, index.clamp(0, records.shape[1] - 1))
+
+
+def _last(where: Tensor) -> Tensor:
+    """Last sample of each row for which a condition holds; -1 for none."""
+    return (where * torch.arange(1, where.shape[1] + 1)).amax(dim=1) - 1
+
+
+def _density(log_amplitude: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+    return torch.exp(-0.5 * ((log_amplitude[:, None] - centres) / widths).square())
