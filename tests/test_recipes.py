@@ -14,7 +14,7 @@ from cpunet.settings import checked
 
 
 def test_the_recipes_that_come_with_the_package():
-    assert recipe_names() == ["fast", "paper"]
+    assert recipe_names() == ["cpunet", "fast", "paper"]
     for name in recipe_names():
         recipe = load_recipe(name)
         assert recipe.name == name

@@ -11,11 +11,7 @@ import pytest
 import torch
 
 from alignment import at_half_maximum
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.finishing import finish
-from cpunet.electronics.noise_traces import coloured_noise
+from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
@@ -25,7 +21,6 @@ from cpunet.networks.response_layer import (
 )
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
-from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts, translated
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
@@ -34,54 +29,25 @@ from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
 from cpunet.training.response_starts import drift_if_needed, with_drift_terms
 from cpunet.training.translated import Noise, Translated
-from synthetic import drifting, two_sites
-
-DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
-KEV, NOISE_KEV = 2614.5, 1.95
-N = 600
-# Slow part and decays are such that the response can describe the chain exactly.
-CHAIN = Electronics.model_validate(
-    read_electronics("legend200").model_dump()
-    | {
-        "bandwidth_poles_ns": (55, 35),
-        "slow": {"fraction": 0.065, "tau_ns": 400.0},
-        "decays": [{"fraction": 1.0, "tau_us": 80.0}],
-    }
+from unpaired import (
+    CHAIN,
+    DT_NS,
+    N,
+    Unpaired,
+    charge,
+    edge_errors,
+    faster,
+    measured_with,
+    simulated,
 )
+
 STARTS = ["near", pytest.param("far", marks=pytest.mark.slow)]
 FEW = ("generator.slow_ns=[400]", "generator.fast_decays_us=[]")
 RECIPE = load_recipe("fast", FEW)
 
 
-def charge(n: int, seed: int, longest: float = 100, steepest: float = 5) -> Pulses:
-    """Charge of one or two sites, finely sampled: slow at first, then a steep end.
-
-    `longest` drift and `steepest` end are in samples of the digitiser.
-    """
-    rng = np.random.default_rng(seed)
-    time = (np.arange(240 * FINE_PER_SAMPLE, dtype=np.float32) + 0.5) / FINE_PER_SAMPLE
-
-    def site() -> np.ndarray:
-        drift = rng.uniform(10, longest, (n, 1))
-        steep = rng.uniform(steepest, steepest + 4, (n, 1))
-        return drifting(time - 30 - rng.uniform(0, 1, (n, 1)), drift, steep)
-
-    pulses = two_sites(rng, n, site)
-    return Pulses.of(pulses, dt_ns=FINE_NS, energy_kev=np.full(n, KEV))
-
-
-def simulated(fine: Pulses) -> Pulses:
-    means = fine.waveforms.reshape(len(fine), -1, FINE_PER_SAMPLE).mean(axis=2)
-    pulses = Pulses.of(means, dt_ns=DT_NS, energy_kev=fine.energy_kev)
-    return prepare(pulses, RECIPE.preparation, "simulated").pulses
-
-
-class Problem(NamedTuple):
-    """Unpaired sets, and the noise as it is measured on one of them."""
-
-    sim: Pulses
-    data: Pulses
-    noise: BaselineNoise
+class Problem(Unpaired):
+    """Unpaired sets that a chain of few parameters is fitted to."""
 
     def fit(self, seed: int, *overrides: str, sim: Pulses | None = None, **options):
         sim = self.sim if sim is None else sim
@@ -97,18 +63,7 @@ class Problem(NamedTuple):
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return measured_with(CHAIN)
-
-
-def measured_with(chain: Electronics) -> Problem:
-    clean = linear_response(charge(N, seed=2), chain)
-    rng = np.random.default_rng(3)
-    noise = coloured_noise(chain.noise.spectrum, N, chain.length, DT_NS, rng)
-    adc = 15_000 + chain.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
-    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
-    data = prepare(raw, RECIPE.preparation, "measured").pulses
-    measured = BaselineNoise.from_traces(raw, RECIPE.preparation)
-    return Problem(simulated(charge(N, seed=1)), data, measured)
+    return Problem(*measured_with(CHAIN))
 
 
 class Told(NamedTuple):
@@ -187,24 +142,9 @@ def test_seeds_and_starts_agree(near: Told, far: Told) -> None:
 
 
 def test_edges_are_those_of_the_true_chain(near: Told) -> None:
-    fine = charge(200, seed=9)
-    truth = finish(
-        linear_response(fine, CHAIN).astype(np.float32), RECIPE.preparation, dt_ns=DT_NS
-    )
-    with torch.no_grad():
-        records = near.response(torch.from_numpy(simulated(fine).waveforms)).numpy()
-    found = finish(records, RECIPE.preparation, dt_ns=DT_NS)
-    edge = slice(RECIPE.preparation.samples_before - 100, RECIPE.preparation.samples_before)
-    # the preparation aligns in whole samples; a pulse in between may go either way
-    best = np.min(
-        [
-            np.sqrt(((np.roll(found, k, axis=1) - truth)[:, edge] ** 2).mean(axis=1))
-            for k in (-1, 0, 1)
-        ],
-        axis=0,
-    )
-    assert np.median(best) < 1e-3
-    assert np.quantile(best, 0.95) < 5e-3
+    errors = edge_errors(near.response)
+    assert np.median(errors) < 1e-3
+    assert np.quantile(errors, 0.95) < 5e-3
 
 
 def test_what_a_fit_tells(near: Told) -> None:
@@ -240,17 +180,6 @@ def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> No
     per_moment = fit.chi_square / fit.moments
     assert per_moment > 2 * GOOD_FIT
     assert per_moment > 3 * near.fit.chi_square / near.fit.moments
-
-
-def faster(fine: Pulses, factor: float) -> Pulses:
-    """The same charge, collected in a time shorter by this factor."""
-    samples = np.arange(fine.waveforms.shape[1])
-    end = (fine.waveforms >= 0.999).argmax(axis=1)
-    values = [
-        np.interp(at + factor * (samples - at), samples, row)
-        for at, row in zip(end, fine.waveforms, strict=True)
-    ]
-    return fine.with_waveforms(np.array(values, np.float32))
 
 
 DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringing_mhz=[]")

@@ -108,9 +108,9 @@ class MatchingConfig(Config):
     search_pulses: Annotated[int, Field(ge=200, le=10_000_000)]
     conditional_bins: Annotated[int, Field(ge=2, le=1000)]
     steps: Count
-    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)] = (1.0,)
-    ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)] = ()
-    drift_terms: DriftTerms = 0
+    start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]
+    drift_terms: DriftTerms
     noise_sets: _Number
 
     @model_validator(mode="after")

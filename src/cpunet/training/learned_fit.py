@@ -95,7 +95,7 @@ def _fitted(
 ) -> tuple[LearnedResponse, Fitted]:
     """Fit a step response to some of the pulses, from the best base or a known response."""
     if known is not None:
-        found = fitter.fit(ResponseProblem(known.step, stages[-1]), coarse=True)
+        found = fitter.fit(ResponseProblem(known.step, stages[-1], draws=1), coarse=False)
         return known, found
     starts = [LearnedResponse(config, dt_ns) for _ in POLES_NS]
     problems = [ResponseProblem(start.step, stages[0], draws=1) for start in starts]

@@ -1,0 +1,167 @@
+"""The recipe cpunet: exact derivatives, a response from unpaired pulses, and its U-Net."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.networks.learned_response import StepResponse
+from cpunet.recipes import load_recipe
+from cpunet.training.differentiable import DifferentiableReadings, DifferentiableSet
+from cpunet.training.drift_training import _chosen, _HeldOut
+from cpunet.training.learned_fit import fit_learned
+from cpunet.training.optimal_weights import ConditionalFunctions
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.response_problem import Band, ResponseProblem
+from unpaired import (
+    CHAIN,
+    DT_NS,
+    N,
+    Unpaired,
+    charge,
+    edge_errors,
+    faster,
+    measured_with,
+    simulated,
+)
+
+RECIPE = load_recipe("cpunet", ["training.noise_sets=2"])
+DECAY_US = CHAIN.decays[0].tau_us
+
+
+@pytest.fixture(scope="module")
+def problem() -> Unpaired:
+    return measured_with(CHAIN)
+
+
+@pytest.fixture(scope="module")
+def band(problem: Unpaired) -> Band:
+    rng = np.random.default_rng(0)
+    sets = PulseSets(problem.sim, problem.data, problem.noise, RECIPE, rng)
+    (band,) = sets.bands(400)
+    return band
+
+
+def near() -> StepResponse:
+    response = StepResponse(RECIPE.generator, DT_NS)
+    response.set_base(48.0, -DT_NS * 1e-3 / DECAY_US)
+    return response
+
+
+def test_functions_are_those_of_the_moments(band):
+    exact, response = DifferentiableSet(band.sim), near()
+    mean = exact.values(response).mean(axis=0)
+    (total,), n = band.sim.sums(
+        response, lambda r: (r.weights @ band.moments.functions(r),), cut=False
+    )
+    spread = band.moments.values.std(axis=0)
+    np.testing.assert_allclose(mean / spread, total / n / spread, atol=2e-3)
+
+
+def test_functions_in_bins_of_the_amplitude_are_those_of_the_weights(band):
+    functions = ConditionalFunctions.of(band.moments, 16)
+    data = band.moments.data[:50]
+    bins = (torch.from_numpy(x).float() for x in (functions.centres, functions.widths))
+    found = DifferentiableReadings(band.moments, band.sim.last).conditional(*bins)(
+        torch.from_numpy(data.linear).float(), torch.from_numpy(data.log_amplitude).float()
+    )
+    np.testing.assert_allclose(found.numpy(), functions(data), atol=2e-4)
+
+
+@pytest.mark.parametrize("number", [0, 4, 10, 20])
+def test_derivatives_are_those_of_wide_differences(band, number):
+    """Of the compiled readings, whose windows jump: over a wide step, jumps are a motion."""
+    response = near()
+    compared = ResponseProblem(response, [band])
+    compared.clip = 16.0
+    start, step = np.zeros(len(response.coordinates)), 0.1
+    slopes = compared.derivatives(start, compared.deviations(start), range(len(start)))
+    sides = []
+    for sign in (1, -1):
+        moved = start.copy()
+        moved[number] = sign * step
+        sides.append(compared.deviations(moved))
+    wanted = (sides[0] - sides[1]) / (2 * step)
+    assert np.linalg.norm(slopes[:, number] - wanted) < 0.1 * np.linalg.norm(wanted)
+
+
+def test_a_delay_changes_nothing(band):
+    response = near()
+    basis, lags = response.basis.numpy(), response.lags
+    earlier, later = (response._base(lags + shift).numpy() for shift in (0.01, -0.01))
+    wanted = (later - earlier) / 0.02  # per sample of delay
+    delay = np.linalg.lstsq(basis, wanted, rcond=1e-4)[0]
+    assert np.abs(basis @ delay - wanted).max() < 0.15 * np.abs(wanted).max()
+    compared = ResponseProblem(response, [band])
+    start = np.zeros(len(delay))
+    slopes = compared.derivatives(start, compared.deviations(start), range(len(delay)))
+    assert np.linalg.norm(slopes @ delay) < 0.06 * np.linalg.norm(slopes * delay)
+
+
+@pytest.fixture(scope="module")
+def fitted(problem: Unpaired):
+    return fit_learned(problem.sim, problem.data, problem.noise, RECIPE, seed=0)
+
+
+def test_pulses_are_those_of_the_true_chain(problem, fitted):
+    """From unpaired pulses: others, which were not in the fit, have the shape of the truth."""
+    response, fit, tried = fitted
+    assert fit.chi_square / fit.moments < 1.6
+    assert tried is None
+    errors = edge_errors(response)
+    assert np.median(errors) < 3e-3
+    assert np.quantile(errors, 0.95) < 5e-3
+
+
+@pytest.mark.thorough
+def test_other_noise_ends_at_the_truth_too(problem):
+    again, _, _ = fit_learned(problem.sim, problem.data, problem.noise, RECIPE, seed=1)
+    assert np.median(edge_errors(again)) < 3e-3
+
+
+@pytest.mark.thorough
+def test_a_known_response_is_a_start(problem, fitted):
+    steps: list[int] = []
+    response, _, _ = fit_learned(
+        problem.sim,
+        problem.data,
+        problem.noise,
+        RECIPE,
+        seed=2,
+        known=fitted[0],
+        listener=lambda step, _: steps.append(step),
+    )
+    assert response.describe()["rise_ns"] == pytest.approx(fitted[0].describe()["rise_ns"])
+    assert steps[-1] < 25
+
+
+@pytest.mark.thorough
+def test_the_unet_makes_up_for_a_drift_simulated_too_short():
+    """Its clock then runs slower, and held-out pulses are closer to the data."""
+    true = measured_with(CHAIN)
+    short = simulated(faster(charge(N, seed=1), 1.25))
+    response, _, tried = fit_learned(short, true.data, true.noise, RECIPE, seed=0)
+    assert tried is not None
+    assert tried.mismatch[-1] < tried.mismatch[0]
+    assert tried.log_rate > 0
+    assert (response.drift is not None) == (tried.share > 0) == response.config.drift
+
+
+@pytest.mark.parametrize(("gain", "share"), [(0.0, 0), (0.02, 0), (0.5, 2)])
+def test_only_what_held_out_pulses_gain_is_kept(gain, share):
+    """Of two distances, one of them nearer to the data by `gain` of a standard deviation."""
+    rng = np.random.default_rng(0)
+    data, sim = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
+    of = SimpleNamespace(whiten=np.eye(3), sigma=np.full(3, 200**-0.5))
+    held = []
+    for part in (1.0, 0.5, 0.0):
+        one = object.__new__(_HeldOut)
+        one.sides, one.comparisons, one.scales = [(sim + part * gain, data)], [of], [1.0]
+        held.append(one)
+    found, mismatch, errors = _chosen(held, seed=0)
+    assert found == share
+    assert errors[0] == 0
+    assert len(mismatch) == 3
