@@ -264,6 +264,6 @@ def _chosen(held: Sequence[_HeldOut], seed: int) -> tuple[int, list[float], list
         ]
     )
     errors = (drawn - drawn[:, :1]).std(axis=0)
-    best = int(np.argmin(found))
-    sure = found[0] - found[best] > SURE * errors[best]
-    return (best if sure else 0), found, errors.tolist()
+    sure = found[0] - np.array(found) > SURE * errors
+    best = int(np.argmin(np.where(sure, found, found[0])))
+    return best, found, errors.tolist()

@@ -69,18 +69,15 @@ class ChainGraph(nn.Module):
 
     def __init__(self, chain: ResponseGenerator, length: int) -> None:
         super().__init__()
-        readout = copy.deepcopy(chain.response)
-        self.drift, readout.drift = readout.drift, None
-        self.dt_ns = float(readout.dt_ns)
+        self.readout, linear = chain.response, copy.deepcopy(chain.response)
+        linear.drift = None
         with torch.inference_mode():
-            matrix = readout(torch.eye(length, device=readout.dt_ns.device))
+            matrix = linear(torch.eye(length, device=linear.dt_ns.device))
         self.register_buffer("matrix", matrix.clone().cpu())
 
     def forward(self, windows: Tensor) -> Tensor:
         """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
-        if self.drift is not None:
-            windows = self.drift(windows, dt_ns=self.dt_ns)
-        return windows @ self.matrix
+        return cast(Tensor, self.readout.drifted(windows) @ self.matrix)
 
 
 @dataclass(frozen=True)
@@ -246,6 +243,10 @@ def _write_onnx(graph: Graph) -> bytes:
             dynamo=True,
             verbose=False,
         )
+    except torch.onnx.OnnxExporterError as error:
+        raise CpunetError(
+            "ONNX has no operators for this run's U-Net; give --format torchscript"
+        ) from error
     finally:
         logger.setLevel(level)
     content: bytes = cast(Any, program).model_proto.SerializeToString()

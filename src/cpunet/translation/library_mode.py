@@ -20,6 +20,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
+from cpunet.recipes.network_settings import LearnedConfig
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import BATCH, REN
 
@@ -79,16 +80,22 @@ class TemplateTranslator:
         self.dt_ns = dt_ns
         self.chain: ResponseGenerator | None = None
         backend = ren.backend
+        learned = isinstance(ren.recipe.generator, LearnedConfig)
         if isinstance(backend, ResponseBackend):
             self.chain = copy.deepcopy(backend.chain)
+            if learned and self.chain.response.drift is not None:
+                raise CpunetError(
+                    "the run's U-Net changes whole pulses, not the templates that they are "
+                    "summed from; give a run of the recipe fast"
+                )
             self.chain.response.dt_ns.fill_(dt_ns)
             if self.chain.response.drift is not None:
                 self.chain.response.drift.keeps_begin = True  # templates are summed by time
-        elif not np.isclose(dt_ns, ren.dt_ns):
+        if (learned or self.chain is None) and not np.isclose(dt_ns, ren.dt_ns):
             raise CpunetError(
-                f"templates sampled every {dt_ns:g} ns, but the run's network knows "
-                f"{ren.dt_ns:g} ns alone; give a run without a network (recipe fast), or "
-                "resample the library"
+                f"templates sampled every {dt_ns:g} ns, but what the run has learned is for "
+                f"{ren.dt_ns:g} ns alone; give a run of the recipe fast, or resample the "
+                "library"
             )
 
     def __call__(self, templates: FloatArray) -> tuple[FloatArray, Codes]:
