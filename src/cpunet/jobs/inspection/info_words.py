@@ -136,6 +136,9 @@ def _frame(crystal: Mapping[str, Any]) -> str:
 
 def _run(told: Mapping[str, Any]) -> Lines:
     fit = _mapping(told, "fit")
+    parameters = _mapping(fit, "parameters")
+    chain = any(name.startswith("pole_") for name in parameters)
+    response = f"cpunet response {told['path']}; " if chain else ""
     when = str(told.get("started", ""))[:16].replace("T", " ")
     lines = [
         ("run", str(told["path"])),
@@ -150,7 +153,8 @@ def _run(told: Mapping[str, Any]) -> Lines:
         ("fit", str(fit.get("verdict") or "")),
         ("off", _deviations(_mapping(fit, "pulls"))),
         *(("cause", str(cause)) for cause in _texts(fit.get("causes"))),
-        ("response", _parameters(_mapping(fit, "parameters"))),
+        ("response", _parameters(parameters)),
+        ("drift", str(_mapping(fit, "drift").get("verdict") or "")),
     ]
     if "baselines" in (noise := _mapping(fit, "noise")):
         lines.append(("noise", f"{_noise(told)}of {noise['baselines']} baselines"))
@@ -160,7 +164,7 @@ def _run(told: Mapping[str, Any]) -> Lines:
     versions = _mapping(told, "versions")
     lines += [
         ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
-        ("next", f"cpunet response {told['path']}; cpunet validate {told['path']} …"),
+        ("next", f"{response}cpunet validate {told['path']} …"),
     ]
     return [(n, t) for n, t in lines if t]
 

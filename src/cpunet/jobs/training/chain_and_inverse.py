@@ -111,7 +111,7 @@ def match(
     told = _described(fit, response, noise, sides)
     _note(fit, told, monitor)
     if gained is not None:
-        told["drift"] = asdict(gained)
+        told["drift"] = {"verdict": str(gained), **asdict(gained)}
         monitor.note(str(gained))
     if told_of_remains is not None:
         told["remains"] = told_of_remains
