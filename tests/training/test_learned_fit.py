@@ -90,9 +90,7 @@ def test_derivatives_are_those_of_wide_differences(band, number):
 
 def test_a_delay_changes_nothing(band):
     response = near()
-    basis, lags = response.basis.numpy(), response.lags
-    earlier, later = (response._base(lags + shift).numpy() for shift in (0.01, -0.01))
-    wanted = (later - earlier) / 0.02  # per sample of delay
+    basis, wanted = response.basis.numpy(), -np.gradient(response.base.numpy())  # a sample
     delay = np.linalg.lstsq(basis, wanted, rcond=1e-4)[0]
     assert np.abs(basis @ delay - wanted).max() < 0.15 * np.abs(wanted).max()
     compared = ResponseProblem(response, [band])

@@ -15,13 +15,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy.interpolate
 import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.extension import PADDING_BEFORE
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_layer import MIN_FACTOR, Readout, fast_length
-from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
+from cpunet.networks.response_layer import (
+    MIN_FACTOR,
+    ElectronicsResponse,
+    Readout,
+    fast_length,
+    padded_length,
+)
+from cpunet.recipes.network_settings import LearnedConfig, PunetConfig, ResponseConfig
 
 # Knots of the step response in ns: at every sample from FIRST to DENSE, then SPARSE logarithmic
 # ones up to LAST, and an exponential beyond.
@@ -32,6 +39,7 @@ WIDTH, EDGE, EDGE_NS, LINEAR_NS, LENGTH = 0.03, 5.0, 192.0, 96.0, 0.5
 # A ringing: width, time in ns after which it has decayed, and correlation length in ns.
 RINGING, RINGING_NS, RINGING_LENGTH_NS, RINGING_FROM_NS = 0.05, 400.0, 56.0, -128.0
 RINGING_COORDINATES = 24
+LONGEST_US = 1e5  # decay of a base whose data do not decay
 # The U-Net sees this much of a pulse, this part of it before the half maximum; the largest
 # logarithm of the rate, and the time over which it is smoothed; the largest variance of blur.
 SEEN_NS, SEEN_BEFORE = 4096.0, 0.625
@@ -49,8 +57,7 @@ class StepResponse(Readout):
         Sampling period of the pulses in ns.
     """
 
-    pole_ns: Tensor
-    slope: Tensor
+    base: Tensor
     basis: Tensor
     lags: Tensor
     drift = None
@@ -61,35 +68,54 @@ class StepResponse(Readout):
         sparse = np.round(np.geomspace(DENSE, LAST, SPARSE) / dt_ns).astype(int)
         lags = np.unique(np.concatenate([dense, sparse]))
         double = torch.float64
-        self.register_buffer("pole_ns", torch.tensor(45.0, dtype=double))
-        self.register_buffer("slope", torch.tensor(0.0, dtype=double))  # per sample
-        self.register_buffer("lags", torch.from_numpy(lags.astype(float)), persistent=False)
+        time = np.arange(lags[0], lags[-1] + 1)
+        self.register_buffer("lags", torch.from_numpy(time.astype(float)), persistent=False)
+        self.register_buffer("base", torch.zeros(len(time), dtype=double))
+        self.last = len(time) - int(lags[-1] - lags[-4]) - 1  # from which the decay is taken
         covariance, n = _prior(lags * dt_ns), config.coordinates
         if config.ringing:
             covariance, n = covariance + _ringing(lags * dt_ns), n + RINGING_COORDINATES
         variances, axes = np.linalg.eigh(covariance)
         scaled = axes[:, ::-1][:, :n] * np.sqrt(np.maximum(variances[::-1][:n], 0.0))
-        self.register_buffer("basis", torch.from_numpy(scaled), persistent=False)
+        place = np.arcsinh(lags * dt_ns / LINEAR_NS)
+        between = scipy.interpolate.CubicSpline(place, scaled)
+        smooth = between(np.arcsinh(time * dt_ns / LINEAR_NS))
+        self.register_buffer("basis", torch.from_numpy(smooth), persistent=False)
         self.coordinates = nn.Parameter(torch.zeros(n, dtype=double))
 
     def set_base(self, pole_ns: float, slope: float) -> None:
-        """Set the base: both its poles in ns, and the slope per sample of its decay."""
-        self.pole_ns.fill_(pole_ns)
-        self.slope.fill_(slope)
+        """Set the base: both its poles in ns, and the slope per sample of its decay.
+
+        It is a chain like any other, since charge is interpolated between its samples there.
+        """
+        dt_us = 1e-3 * float(self.dt_ns)
+        config = ResponseConfig(
+            name="response",
+            poles_ns=(pole_ns, pole_ns),
+            slow_ns=(),
+            decay_us=min(LONGEST_US, dt_us / max(-slope, 1e-9)),
+            fast_decays_us=(),
+            free_decays=False,
+            ringing_mhz=None,
+            ringing_ns=1.0,
+            drift_terms=0,
+        )
+        padded, first = padded_length(2 * len(self.lags) + 1000), int(self.lags[0])
+        with torch.no_grad():
+            chain = ElectronicsResponse(config, float(self.dt_ns)).transfer(padded)
+            kernel = torch.fft.irfft(chain, padded)
+        self.base.copy_(torch.cat([kernel[first:], kernel[: len(self.base) + first]]))
 
     def step(self, samples: int, coordinates: Tensor | None = None) -> Tensor:
         """Response to a step at sample 0, from `FIRST` on, shape (samples - first,)."""
         own = self.coordinates if coordinates is None else coordinates
-        lags = self.lags
-        time = torch.arange(int(lags[0]), samples, dtype=lags.dtype, device=lags.device)
-        apart = self.basis @ own
-        knots = self._base(lags) + apart
-        rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / (lags[-1] - lags[-4])
-        late = knots[-1] * torch.exp(rate * (time - lags[-1]).clamp_min(0))
-        upper = torch.searchsorted(lags, time).clamp(1, len(lags) - 1)
-        part = (time - lags[upper - 1]) / (lags[upper] - lags[upper - 1])
-        early = self._base(time) + torch.lerp(apart[upper - 1], apart[upper], part.clamp(0, 1))
-        return torch.where(time > lags[-1], late, early)
+        early = self.base + self.basis @ own
+        lever = len(early) - 1 - self.last
+        rate = torch.log((early[-1] / early[self.last]).clamp(0.5, 1.2)) / lever
+        first = int(self.lags[0])
+        after = torch.arange(1, samples - first - len(early) + 1).to(early)
+        late = early[-1] * torch.exp(rate * after)
+        return torch.cat([early, late])[: samples - first]
 
     def kernel(self, padded: int, coordinates: Tensor | None = None) -> Tensor:
         """The same for a transform of `padded` samples: times before 0 stand at its end."""
@@ -109,11 +135,6 @@ class StepResponse(Readout):
         columns = torch.func.jacfwd(lambda c: self.kernel(padded, c))(here)
         spectra: Tensor = torch.fft.rfft(columns.T.contiguous())
         return spectra
-
-    def _base(self, lags: Tensor) -> Tensor:
-        after = lags.clamp_min(0)
-        poles = after * self.dt_ns / self.pole_ns
-        return (1 - (1 + poles) * torch.exp(-poles)) * torch.exp(self.slope * after)
 
     @torch.no_grad()
     def describe(self) -> dict[str, float]:

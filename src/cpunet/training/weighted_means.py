@@ -104,7 +104,6 @@ class WeightedMeans:
         correlation = (1 - RIDGE) * covariance / sigma / sigma.T + RIDGE * np.eye(len(sigma))
         self.weights: Values = np.linalg.solve(correlation, slopes / sigma) / sigma
         spread = self.weights.T @ measured.covariance @ self.weights / pairs
-        spread += np.diag(TINY * spread.diagonal())
         self.whiten = np.asarray(scipy.linalg.cholesky(np.linalg.inv(spread)))
         weighing = self.whiten @ self.weights.T
         self.slopes = weighing @ slopes
