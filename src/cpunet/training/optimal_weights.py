@@ -39,6 +39,7 @@ from cpunet.training.weighted_means import Parts, Sums, jackknife_bias
 # Bins of the current amplitude are no narrower than twice its noise.
 MIN_BIN = 0.006
 FOR_WEIGHTS = 4096  # maximum number of pulses for the weights, which need not be exact
+RIDGE = 1e-6  # of many coordinates, see `WeightedMeans`
 PARTS = 10  # parts of the pulses, each left out once to estimate the bias
 # Maximum number of passes over all pulses, decrease of the sum of squares below which they end,
 # first damping, and factor by which it changes.
@@ -197,7 +198,8 @@ class _Weighted:
             simulated = _simulated(sim, self.functions, smooth, response)
         counts = (sum(part.n for part in side) for side in (simulated, measured))
         self.pairs = 1 / sum(1 / n for n in counts)
-        self.parts = Parts(simulated, measured, band.pairs)
+        ridge = RIDGE if isinstance(response, StepResponse) else 0.0
+        self.parts = Parts(simulated, measured, band.pairs, ridge)
         self.weights, self.whiten = self.parts.whole.weights, self.parts.whole.whiten
         self.slopes = self.parts.whole.slopes
         total = sum(self.functions.sum(data[rows]) for rows in _blocks(len(data)))

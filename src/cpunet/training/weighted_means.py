@@ -23,7 +23,6 @@ import scipy.linalg
 from cpunet.training.moments import Values
 
 RIDGE = 0.05  # share of a diagonal matrix in the correlations of the functions
-TINY = 1e-6  # the same in those of the weighted means, some of which may be alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +85,9 @@ class WeightedMeans:
         Sums over the two sides.
     pairs
         Number of pulses that errors refer to.
+    ridge
+        Share of a diagonal matrix in the correlations of the weighted means, for coordinates
+        whose means may be alike.
 
     Attributes
     ----------
@@ -97,13 +99,17 @@ class WeightedMeans:
         Whitened differences of the two sides, and their derivatives in the coordinates.
     """
 
-    def __init__(self, simulated: Sums, measured: Sums, pairs: float) -> None:
+    def __init__(
+        self, simulated: Sums, measured: Sums, pairs: float, ridge: float = 0.0
+    ) -> None:
         slopes = np.asarray(simulated.moved / simulated.n)
         covariance = 0.5 * (simulated.covariance + measured.covariance)
         sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)[:, np.newaxis]
         correlation = (1 - RIDGE) * covariance / sigma / sigma.T + RIDGE * np.eye(len(sigma))
         self.weights: Values = np.linalg.solve(correlation, slopes / sigma) / sigma
         spread = self.weights.T @ measured.covariance @ self.weights / pairs
+        if ridge:
+            spread += ridge * np.diag(spread.diagonal())
         self.whiten = np.asarray(scipy.linalg.cholesky(np.linalg.inv(spread)))
         weighing = self.whiten @ self.weights.T
         self.slopes = weighing @ slopes
@@ -117,19 +123,23 @@ class Parts:
     ----------
     simulated, measured
         Sums over each part of the two sides, with the same number of parts.
-    pairs
-        Number of pulses that errors refer to.
+    pairs, ridge
+        As of `WeightedMeans`.
     """
 
     def __init__(
-        self, simulated: Sequence[Sums], measured: Sequence[Sums], pairs: float
+        self,
+        simulated: Sequence[Sums],
+        measured: Sequence[Sums],
+        pairs: float,
+        ridge: float = 0.0,
     ) -> None:
         def of(left_out: int | None, share: float) -> WeightedMeans:
             sides = [
                 sum((sums for k, sums in enumerate(side) if k != left_out), Sums())
                 for side in (simulated, measured)
             ]
-            return WeightedMeans(sides[0], sides[1], share * pairs)
+            return WeightedMeans(sides[0], sides[1], share * pairs, ridge)
 
         parts = len(measured)
         self.whole = of(None, 1.0)
