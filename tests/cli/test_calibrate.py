@@ -162,7 +162,7 @@ def test_a_plan_is_told_before_any_fit(stand, command, free, tmp_path):
         (("--out", "run", "--prior", "temperature=90"), "expected NAME=VALUE±ERROR"),
         (("--out", "run", "--prior", "temperature=90±0"), "expected NAME=VALUE±ERROR"),
         (("--out", "run", "--free", "bias", "--fix", "bias"), "all of it is fixed"),
-        (("--out", "run", "--recipe", "paper"), "has no readout chain"),
+        (("--out", "run", "--recipe", "paper"), "fits no readout chain"),
         (("--out", "run", "--hits", "x.lh5"), "give either --sim FILE, with its hits, or"),
     ],
 )

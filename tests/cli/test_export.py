@@ -42,7 +42,7 @@ def test_a_library_is_translated(command, trained, tmp_path):
     other = library_file(tmp_path / "fine.lh5", dt_ns=1.0)
     refused = command("library", "translate", trained, other, "--out", tmp_path / "x.lh5")
     assert refused.code == 2
-    assert "knows 16 ns alone" in " ".join(refused.err.split())
+    assert "for 16 ns alone" in " ".join(refused.err.split())
     (tmp_path / "text").write_text("no HDF5")
     refused = command("library", "translate", trained, tmp_path / "text", "--out", "x.lh5")
     assert refused.code == 2
@@ -120,7 +120,7 @@ def test_import_weights(command, tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["library", "translate", "RUN", "FINE", "--format", "simflow"], "knows 16 ns alone"),
+        (["library", "translate", "RUN", "FINE", "--format", "simflow"], "for 16 ns alone"),
         (["library", "translate", "RUN", "COARSE", "--format", "simflow"], "every 16 ns, prod"),
         (["library", "translate", "RUN", "FINE", "--low-rank", "4"], "of --format simflow"),
         (
