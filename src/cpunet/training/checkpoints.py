@@ -252,7 +252,9 @@ class UnfinishedRun:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with zipfile.ZipFile(path) as parts:  # torch writes checksums, but does not read them
+        # torch writes checksums, but does not read them; from memory, since a damaged offset
+        # is an error of the system in a file
+        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as parts:
             if part := parts.testzip():
                 raise zipfile.BadZipFile(part)
         content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
