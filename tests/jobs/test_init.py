@@ -147,7 +147,7 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
 
 @pytest.mark.thorough
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
-    with pytest.raises(CpunetError, match="from which no readout chain can start"):
+    with pytest.raises(CpunetError, match="from which fast cannot start"):
         train_run(files["sim"], files["one"], tmp_path / "a", FAST, TrainOptions(init=network))
     with pytest.raises(CpunetError, match="from which no network can start"):
         train_run(files["sim"], files["one"], tmp_path / "a", TINY, TrainOptions(init=chain))

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
+from cpunet.networks.drift_clock import DriftClock
 from cpunet.networks.linear_inverse import LinearInverse
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -69,15 +70,20 @@ class ChainGraph(nn.Module):
 
     def __init__(self, chain: ResponseGenerator, length: int) -> None:
         super().__init__()
-        self.readout, linear = chain.response, copy.deepcopy(chain.response)
-        linear.drift = None
+        linear = copy.deepcopy(chain.response)
+        self.drift, linear.drift = linear.drift, None
+        self.dt_ns = float(linear.dt_ns)
         with torch.inference_mode():
             matrix = linear(torch.eye(length, device=linear.dt_ns.device))
         self.register_buffer("matrix", matrix.clone().cpu())
 
     def forward(self, windows: Tensor) -> Tensor:
         """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
-        return cast(Tensor, self.readout.drifted(windows) @ self.matrix)
+        if isinstance(self.drift, DriftClock):
+            windows = self.drift(windows, dt_ns=self.dt_ns)
+        elif self.drift is not None:
+            windows = self.drift(windows)
+        return windows @ self.matrix
 
 
 @dataclass(frozen=True)
