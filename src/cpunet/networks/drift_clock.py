@@ -73,9 +73,7 @@ class DriftClock(nn.Module):
             later = self._duration(took, 1e-3 * dt_ns) - took
         before = end + later - torch.arange(windows.shape[1], device=windows.device)
         source = end - before / self._factor(before, 1e-3 * dt_ns)
-        first = source.detach().floor().clamp(0.0, windows.shape[1] - 1.0)
-        part = (source - first).clamp(0.0, 1.0).to(windows.dtype)
-        return _between(windows, first.long(), part)
+        return at_times(windows, source)
 
     def _factor(self, before: Tensor, dt_us: float) -> Tensor:
         """Factor of the time of each sample before the end."""
@@ -102,9 +100,11 @@ def _first(where: Tensor) -> Tensor:
     return where.to(torch.uint8).argmax(dim=1, keepdim=True)
 
 
-def _between(windows: Tensor, first: Tensor, part: Tensor) -> Tensor:
-    """Values at `part` of the way from sample `first` to the next, by cubics (Catmull-Rom)."""
+def at_times(windows: Tensor, times: Tensor) -> Tensor:
+    """Values at times in samples, by cubics (Catmull-Rom); ends are held."""
     last = windows.shape[1] - 1
+    first = times.detach().floor().clamp(0.0, float(last))
+    part, first = (times - first).clamp(0.0, 1.0).to(windows.dtype), first.long()
     a, b, c, d = (windows.gather(1, (first + i).clamp(0, last)) for i in (-1, 0, 1, 2))
     rise, bend = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d
     skew = 0.5 * (d - a) + 1.5 * (b - c)

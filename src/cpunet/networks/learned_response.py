@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.extension import PADDING_BEFORE
+from cpunet.networks.drift_clock import at_times
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_layer import (
     MIN_FACTOR,
@@ -142,7 +143,7 @@ class StepResponse(Readout):
         step = self.step(int(self.lags[-1]) + 1)
         dt_ns, top = float(self.dt_ns), int(step.argmax())
         rise = [int((step >= part * step[top]).int().argmax()) for part in (0.1, 0.9)]
-        end = torch.log(step[-1] / step[-1 - top // 2 - 100]) / (top // 2 + 100)
+        end = torch.log(step[-1] / step[self.last]) / (len(step) - 1 - self.last)
         return {
             "rise_ns": dt_ns * (rise[1] - rise[0]),
             "overshoot": float(step[top]) - 1.0,
@@ -206,7 +207,7 @@ class DriftUNet(nn.Module):
         clock = torch.cumsum(torch.exp(-log_rate), dim=1)
         late = clock - clock[:, self.before : self.before + 1] - seen
         at = (sample - half + self.before).clamp(0, self.length - 1)
-        moved = _between(windows, sample + late.gather(1, at))
+        moved = at_times(windows, sample + late.gather(1, at))
         return _blurred(moved, blur), log_rate, blur
 
 
@@ -258,16 +259,6 @@ def _ringing(time_ns: np.ndarray) -> np.ndarray:
     size = RINGING * np.exp(-np.abs(time_ns) / RINGING_NS) * (time_ns > RINGING_FROM_NS)
     near = np.exp(-0.5 * ((time_ns[:, np.newaxis] - time_ns) / RINGING_LENGTH_NS) ** 2)
     return np.asarray(size[:, np.newaxis] * size * near)
-
-
-def _between(windows: Tensor, place: Tensor) -> Tensor:
-    """Values at places in units of samples, by cubics (Catmull-Rom)."""
-    first = place.detach().floor().clamp(1, windows.shape[1] - 3).long()
-    part = (place - first).clamp(-1, 2)
-    a, b, c, d = (windows.gather(1, first + i) for i in (-1, 0, 1, 2))
-    rise, bend = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d
-    skew = 0.5 * (d - a) + 1.5 * (b - c)
-    return b + part * (rise + part * (bend + part * skew))
 
 
 def _blurred(windows: Tensor, variance: Tensor) -> Tensor:

@@ -61,9 +61,8 @@ class Readout(nn.Module):
         length = record_length(windows.shape[1])
         padded = padded_length(length)
         windows = self.drifted(windows)
-        current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
-        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
-        spectrum = torch.fft.rfft(current, padded) * self.transfer(padded).to(torch.complex64)
+        transfer = self.transfer(padded).to(torch.complex64)
+        spectrum = current_spectrum(windows, padded) * transfer
         signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
         return signal
 
@@ -224,6 +223,14 @@ def _spline(frequency: Tensor) -> Tensor:
     """
     spline: Tensor = torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
     return spline
+
+
+def current_spectrum(windows: Tensor, padded: int) -> Tensor:
+    """Spectra of the current of windows (batch, samples) within records."""
+    current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
+    current = nn.functional.pad(current, (PADDING_BEFORE, 0))
+    spectrum: Tensor = torch.fft.rfft(current, padded)
+    return spectrum
 
 
 def padded_length(length: int) -> int:

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from cpunet.networks.learned_response import StepResponse
-from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE, padded_length
+from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.response_layer import PADDING_AFTER, padded_length
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.training.moments import Moments
 from cpunet.training.translated import PLATEAU, Translated
@@ -80,11 +81,11 @@ class DifferentiableReadings:
         normal, moved = self._normalised(records, at.level)
         aligned = self._aligned(normal, at.half)
         linear = aligned @ self.matrix - self.offset
-        logs = _stretch(normal, at.tail, 0, w.fit_samples + 1).clamp_min(1e-3).log()
+        logs = stretch(normal, at.tail, 0, w.fit_samples + 1).clamp_min(1e-3).log()
         slope = logs[:, :-1] @ self.lever
         slope = slope + moved * (logs[:, 1:] @ self.lever - slope)
         half = self.weights.shape[1] // 2
-        current = _stretch(torch.diff(aligned), at.steepest, -half, half + 1)
+        current = stretch(torch.diff(aligned), at.steepest, -half, half + 1)
         amplitude = (current * self.weights[at.phase]).sum(dim=1).clamp_min(1e-4).log()
         whole = torch.cat([linear, slope[:, None]], dim=1)
         return (whole - self.centres) / self.spreads, amplitude
@@ -126,7 +127,7 @@ class DifferentiableReadings:
         from_sample = max(w.before - w.edge, 0)
         steepest = from_sample + current[:, from_sample : w.before + w.edge].argmax(dim=1)
         near, width = w.edge // 3, self.weights.shape[1]
-        around = _stretch(current, steepest, -near - width // 2, near + width // 2 + 1)
+        around = stretch(current, steepest, -near - width // 2, near + width // 2 + 1)
         best = (around.unfold(1, width, 1) @ self.weights.T).flatten(1).argmax(dim=1)
         phases = len(self.weights)
         centre = steepest - near + torch.div(best, phases, rounding_mode="floor")
@@ -144,8 +145,8 @@ class DifferentiableReadings:
         The latter is 0, but has the derivative of the time of the half maximum.
         """
         w = self.window
-        base = _stretch(records, sample, -w.base_first, -w.base_stop + 1)
-        tail = _stretch(records, sample, w.after - w.level_samples, w.after + 1)
+        base = stretch(records, sample, -w.base_first, -w.base_stop + 1)
+        tail = stretch(records, sample, w.after - w.level_samples, w.after + 1)
         zero, top = base[:, :-1].mean(dim=1), tail[:, :-1].mean(dim=1)
         time = self._part(
             (records - zero[:, None]) * (w.tail_level / (top - zero))[:, None], sample
@@ -157,12 +158,12 @@ class DifferentiableReadings:
 
     def _part(self, records: Tensor, sample: Tensor) -> Tensor:
         """Time of the half maximum after a sample."""
-        low, high = _stretch(records, sample, 0, 2).unbind(dim=1)
+        low, high = stretch(records, sample, 0, 2).unbind(dim=1)
         return (self.window.level - low) / (high - low).clamp_min(1e-6)
 
     def _aligned(self, records: Tensor, sample: Tensor) -> Tensor:
         w = self.window
-        around = _stretch(records, sample, -w.before, w.after + 1)
+        around = stretch(records, sample, -w.before, w.after + 1)
         return torch.lerp(around[:, :-1], around[:, 1:], self._part(records, sample)[:, None])
 
 
@@ -189,13 +190,6 @@ class DifferentiableSet:
         """Records of the height to which noise is added."""
         plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(dim=1, keepdim=True)
         return records * (self.sim.moments.preparation.tail_level / plateau)
-
-    def spectra(self, pulses: Tensor) -> Tensor:
-        """Spectra of the current of charge pulses, in the graph."""
-        current = torch.diff(pulses, dim=1, prepend=torch.zeros_like(pulses[:, :1]))
-        current = nn.functional.pad(current, (PADDING_BEFORE, 0))
-        spectra: Tensor = torch.fft.rfft(current, self.padded)
-        return spectra
 
     @torch.no_grad()
     def values(self, response: StepResponse) -> npt.NDArray[np.float64]:
@@ -261,12 +255,6 @@ class DifferentiableSet:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""
         nothing = np.zeros((n, self.sim.length), np.float32)
         return torch.from_numpy(self.sim.noise.add(nothing, draw, first))
-
-
-def _stretch(records: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
-    """Samples `first` to `stop`, counted from `sample` of each record; edges are repeated."""
-    index = sample[:, None] + torch.arange(first, stop)
-    return records.gather(1, index.clamp(0, records.shape[1] - 1))
 
 
 def _last(where: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ nothing unless the gain is beyond two errors by bootstrap.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from cpunet.networks.learned_response import DriftUNet, LearnedResponse
+from cpunet.networks.response_layer import current_spectrum
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.fitter import Fitter
 from cpunet.training.moments import BLOCK
@@ -33,6 +33,7 @@ BETAS, WEIGHT_DECAY, MEMORY, WARM_UP = (0.5, 0.99), 1e-2, 0.9, 10
 OF_MEAN, OF_PULSES, TYPICAL = 0.05, 1.0, 0.05
 SHARES = (0.0, 0.5, 1.0)
 RESAMPLED, SURE = 200, 2.0
+SHOWN, LOW = 2048, 0.02  # pulses that show what it does, and charge from which they count
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ class DriftFit:
         Chi-square per moment of the held-out pulses for shares of 0, 1/2 and 1.
     error
         Errors of the differences from the first of these.
-    log_rate, log_rate_spread
-        Mean and spread of the logarithm of the clock's rate.
+    longer
+        Relative change of the time from 2 to 98 % of the charge by all of the network, for the
+        quarters of the pulses from the shortest to the longest.
     blur_ns
         Root of the mean variance of the blur in ns, negative for pulses that are sharpened.
     """
@@ -56,19 +58,19 @@ class DriftFit:
     share: float
     mismatch: list[float]
     error: list[float]
-    log_rate: float
-    log_rate_spread: float
+    longer: list[float]
     blur_ns: float
 
     def __str__(self) -> str:
-        shares = ", ".join(f"{share:g}" for share in SHARES)
         found = ", ".join(f"{value:.2f}" for value in self.mismatch)
+        errors = ", ".join(f"{error:.2f}" for error in self.error[1:])
+        longer = ", ".join(f"{100 * value:+.1f}" for value in self.longer)
         kept = f"{100 * self.share:.0f} % of it is kept" if self.share else "it is left out"
         return (
-            f"U-Net before the readout: {kept} (chi-square per moment of held-out pulses for "
-            f"shares {shares}: {found} ± {max(self.error):.2f}); its clock runs "
-            f"{100 * math.expm1(self.log_rate):+.1f} ± {100 * self.log_rate_spread:.1f} %, "
-            f"blur {self.blur_ns:+.0f} ns"
+            f"U-Net before the readout: {kept}; chi-square per moment of held-out pulses is "
+            f"{found} with none, half and all of it (gains ± {errors}); all of it makes the "
+            f"charge of short to long pulses arrive over times longer by {longer} % and blurs "
+            f"by {self.blur_ns:+.0f} ns"
         )
 
 
@@ -89,11 +91,7 @@ def changed(bands: Sequence[Band], drift: DriftUNet | None) -> list[Band]:
 
 
 def fit_drift(
-    response: LearnedResponse,
-    bands: Sequence[Band],
-    wide: Sequence[Band],
-    fitter: Fitter,
-    seed: int,
+    response: LearnedResponse, bands: Sequence[Band], wide: float, fitter: Fitter, seed: int
 ) -> DriftFit:
     """Train the U-Net in front of a fitted readout, which gets as much of it as is kept.
 
@@ -101,53 +99,57 @@ def fit_drift(
     ----------
     response
         Readout fitted without it.
-    bands, wide
-        Pulses to train on, with narrow and wide bins of the current amplitude.
+    bands
+        Pulses to train on.
+    wide
+        Width of bins of the current amplitude by which the step response follows at first.
     fitter
         Fitter of the step response.
     seed
-        Seed of the batches and the held-out pulses.
+        Seed of the network, its batches and the held-out pulses.
     """
     rng = np.random.default_rng(seed)
     split = [_split(band, rng) for band in bands]
     known, held = [one for one, _ in split], [other for _, other in split]
-    first = [_split(band, np.random.default_rng(seed))[0] for band in wide]
-    drift = DriftUNet(response.config.width, float(response.dt_ns))
-    step = response.step
-    without = copy.deepcopy(step)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        drift = DriftUNet(response.config.width, float(response.dt_ns))
+    step, without = response.step, response.step.coordinates.detach().clone()
     trained = [_Trained(band, response) for band in known]
     optimiser = torch.optim.AdamW(drift.parameters(), RATE, BETAS, weight_decay=WEIGHT_DECAY)
     for number in range(ROUNDS):
         _train(drift, trained, optimiser, number * STEPS, rng)
-        for some in (first, known):  # wide bins first
+        for some in ([band.with_wider_bins(wide) for band in known], known):
             fitter.follow(ResponseProblem(step, changed(some, drift), draws=1))
-    ends = torch.stack([without.coordinates.detach(), step.coordinates.detach()])
+    whole = step.coordinates.detach().clone()
     results = []
     for share in SHARES:
         drift.share.fill_(share)
-        step.coordinates.data.copy_(torch.lerp(ends[0], ends[1], share))
+        step.coordinates.data.copy_(torch.lerp(without, whole, share))
         if 0 < share < 1:
             fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
         results.append(_HeldOut(changed(held, drift), known, response))
     chosen, mismatch, error = _chosen(results, seed)
     drift.share.fill_(1.0)
-    with torch.no_grad():
-        pulses = torch.from_numpy(np.array(bands[0].sim.sim[:BLOCK]))
-        _, log_rate, blur = drift.changed(pulses)
-    variance = float(blur.mean())
+    longer, blur_ns = _learned(drift, bands[0], float(response.dt_ns))
     drift.share.fill_(SHARES[chosen])
-    step.coordinates.data.copy_(torch.lerp(ends[0], ends[1], SHARES[chosen]))
+    step.coordinates.data.copy_(torch.lerp(without, whole, SHARES[chosen]))
     if chosen:
         response.drift = drift
         response.config = response.config.model_copy(update={"drift": True})
-    return DriftFit(
-        SHARES[chosen],
-        mismatch,
-        error,
-        float(log_rate.mean()),
-        float(log_rate.std()),
-        math.copysign(math.sqrt(abs(variance)) * float(response.dt_ns), variance),
-    )
+    return DriftFit(SHARES[chosen], mismatch, error, longer, blur_ns)
+
+
+@torch.no_grad()
+def _learned(drift: DriftUNet, band: Band, dt_ns: float) -> tuple[list[float], float]:
+    """What a U-Net does, as `DriftFit` has it."""
+    pulses = torch.from_numpy(np.array(band.sim.sim[:SHOWN]))
+    after, _, blur = drift.eval().changed(pulses)
+    times = [((p > LOW) & (p < 1 - LOW)).sum(dim=1).double() for p in (pulses, after)]
+    quarters = times[0].argsort().tensor_split(4)
+    longer = [float(times[1][rows].sum() / times[0][rows].sum()) - 1 for rows in quarters]
+    variance = float(blur.mean())
+    return longer, math.copysign(math.sqrt(abs(variance)) * dt_ns, variance)
 
 
 def _split(band: Band, rng: np.random.Generator) -> tuple[Band, Band]:
@@ -171,7 +173,7 @@ class _Trained:
     """A band that the U-Net is trained on."""
 
     def __init__(self, band: Band, response: LearnedResponse) -> None:
-        self.band, self.response, self.set = band, response, DifferentiableSet(band.sim)
+        self.band, self.response = band, response
         comparison = Comparison(band)
         self.whiten = torch.from_numpy(comparison.whiten / comparison.sigma)
         self.wanted = torch.from_numpy(comparison.wanted)
@@ -182,10 +184,10 @@ class _Trained:
         sim = self.band.sim
         rows = np.sort(rng.permutation(len(sim))[:BATCH])
         pulses, log_rate, blur = drift.changed(torch.from_numpy(np.array(sim.sim[rows])))
-        batch = DifferentiableSet(replace(sim.of(rows)))
-        spectra = batch.spectra(pulses)
+        batch = DifferentiableSet(sim.of(rows))
         with torch.no_grad():
             transfer = self.response.step.transfer(batch.padded).to(torch.complex64)
+        spectra = current_spectrum(pulses, batch.padded)
         clean = batch.scaled(batch.records(spectra, transfer))
         draw = int(rng.integers(len(sim.noise.factor)))
         noisy = clean + batch.noise(draw, 0, len(rows))
@@ -231,10 +233,12 @@ class _HeldOut:
     def __init__(
         self, bands: Sequence[Band], known: Sequence[Band], response: LearnedResponse
     ) -> None:
-        self.sides = [
-            (DifferentiableSet(band.sim).values(response.step), band.moments.values)
-            for band in bands
-        ]
+        # functions and weights of both sides
+        self.sides = []
+        for band in bands:
+            data = band.moments.values
+            simulated = DifferentiableSet(band.sim).values(response.step), band.sim.weights
+            self.sides.append((simulated, (data, np.ones(len(data)))))
         # the covariance of those that were trained on, which are more
         self.comparisons = [Comparison(band) for band in known]
         self.scales = [held.pairs / band.pairs for held, band in zip(bands, known, strict=True)]
@@ -243,13 +247,12 @@ class _HeldOut:
         """Per moment, of all pulses or of pulses drawn from them with replacement."""
         total, n = 0.0, 0
         for sides, of, scale in zip(self.sides, self.comparisons, self.scales, strict=True):
-            simulated, measured = (
-                side.mean(axis=0)
-                if rng is None
-                else side[rng.integers(len(side), size=len(side))].mean(axis=0)
-                for side in sides
-            )
-            white = of.whiten @ ((simulated - measured) / of.sigma)
+            means = []
+            for values, weights in sides:
+                size = len(values)
+                rows = np.arange(size) if rng is None else rng.integers(size, size=size)
+                means.append(np.average(values[rows], axis=0, weights=weights[rows]))
+            white = of.whiten @ ((means[0] - means[1]) / of.sigma)
             total, n = total + scale * float(white @ white), n + len(white)
         return total / n
 

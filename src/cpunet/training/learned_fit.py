@@ -9,16 +9,16 @@
 3. If the fit is poor, a ringing is tried, or, if pulses begin differently than simulated, the
    U-Net in front; see `cpunet.training.drift_training`.
 
-No discriminator is trained: where these moments agree, one that is trained on half of the
-pulses finds no difference in the other half; see the results.
+No discriminator network is trained.  What these moments do not see, the classifier of a
+validation tells.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains
@@ -26,7 +26,7 @@ from cpunet.networks.learned_response import LearnedResponse, StepResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import LearnedConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.drift_training import DriftFit, changed, fit_drift
+from cpunet.training.drift_training import changed, fit_drift
 from cpunet.training.fitter import Fitted, Fitter
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS, Listener
 from cpunet.training.moments import Values
@@ -36,9 +36,10 @@ from cpunet.training.response_fit import CHECKED, Fit, described
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
 
-# Widths of the bins of the current amplitude, and pulses of each side, one fit after another.
-STAGES = ((0.2, 512), (0.05, 2048))
-POLES_NS = 19.2 * 1.25 ** np.arange(9)  # that are tried for the base of the step response
+# Width of the bins of the current amplitude and pulses of each side in the first fit from afar,
+# and the width in the second.
+FIRST_WIDTH, FIRST_PULSES, WIDTH = 0.2, 512, 0.05
+POLE_NS = 19.2  # of the base of a step response, times one of the recipe's factors
 # Rounds of optimal weights at most, and the move, in widths of the prior, below which they end.
 ROUNDS, STILL = 8, 0.15
 
@@ -53,60 +54,62 @@ def fit_learned(
     known: LearnedResponse | None = None,
     remains: DrawnRemains | None = None,
     listener: Listener | None = None,
-) -> tuple[LearnedResponse, Fit, DriftFit | None]:
+) -> tuple[LearnedResponse, Fit]:
     """Fit a learned readout; parameters as of `cpunet.training.response_fit.fit_response`.
 
-    Returns
-    -------
-    tuple
-        The readout, how well it describes the data, and what the U-Net gains if it was tried.
+    Of a known readout only the step response is a start: the U-Net is that of other pulses.
     """
     config, training = recipe.matching
     assert isinstance(config, LearnedConfig)
-    torch.manual_seed(seed)
+    config = config.model_copy(update={"drift": False})  # a U-Net is trained first
     sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), remains)
-    fitter = Fitter(training, None if remains is None else remains.known_decay, listener)
-    stages = [sets.bands(most, width) for width, most in STAGES]
-    response, found = _fitted(config, stages, noise.dt_ns, fitter, known)
-    tried: DriftFit | None = None
-    if found.poor:
-        if onset_is_off(found.problem):
-            tried = fit_drift(response, sets.bands(CHECKED), stages[-1], fitter, seed)
-        elif not config.ringing:
-            rings = config.model_copy(update={"ringing": True})
-            other, better = _fitted(rings, stages, noise.dt_ns, fitter)
-            if better.cost < RINGS * found.cost:
-                response = other
+    fitter = Fitter(training, listener=listener)
+    far = [band.with_wider_bins(FIRST_WIDTH) for band in sets.bands(FIRST_PULSES)]
+    near = [band.with_wider_bins(WIDTH) for band in sets.bands(training.search_pulses)]
+    found = None
+    if known is not None:
+        plain = known.config.model_copy(update={"drift": False})
+        response = LearnedResponse(plain, noise.dt_ns)
+        response.step.load_state_dict(known.step.state_dict())
+        found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
+    if found is None or found.poor:
+        response, found = _from_afar(config, noise.dt_ns, far, near, fitter)
+    tried = None
+    if found.poor and onset_is_off(found.problem):
+        if training.drift_terms:
+            tried = fit_drift(response, sets.bands(CHECKED), WIDTH, fitter, seed)
+    elif found.poor and training.ringing_mhz and not response.config.ringing:
+        rings = response.config.model_copy(update={"ringing": True})
+        other, better = _from_afar(rings, noise.dt_ns, far, near, fitter)
+        if better.cost < RINGS * found.cost:
+            response = other
     everything = changed(sets.bands(), response.drift)
     if response.drift is None:
         covariance = _determined(response.step, everything, fitter)
     else:
         covariance = fitter.follow(ResponseProblem(response.step, everything, 2)).covariance
     fit = described(ResponseProblem(response.step, everything), covariance, fitter.steps)
-    return response, fit, tried
+    return response, replace(fit, drift=tried)
 
 
-def _fitted(
+def _from_afar(
     config: LearnedConfig,
-    stages: Sequence[Sequence[Band]],
     dt_ns: float,
+    far: Sequence[Band],
+    near: Sequence[Band],
     fitter: Fitter,
-    known: LearnedResponse | None = None,
 ) -> tuple[LearnedResponse, Fitted]:
-    """Fit a step response to some of the pulses, from the best base or a known response."""
-    if known is not None:
-        found = fitter.fit(ResponseProblem(known.step, stages[-1], draws=1), coarse=False)
-        return known, found
-    starts = [LearnedResponse(config, dt_ns) for _ in POLES_NS]
-    problems = [ResponseProblem(start.step, stages[0], draws=1) for start in starts]
-    for pole_ns, problem in zip(POLES_NS, problems, strict=True):
-        step = problem.response
-        assert isinstance(step, StepResponse)
-        step.set_base(float(pole_ns), problem.slope)
-    best = min(range(len(starts)), key=lambda i: _distance(problems[i]))
-    response, found = starts[best], fitter.fit(problems[best])
-    for bands in stages[1:]:
-        found = fitter.fit(ResponseProblem(response.step, bands, draws=1), coarse=False)
+    """Fit a step response from the best of some bases, first by wide bins."""
+    problems = []
+    for factor in fitter.training.start_factors:
+        problem = ResponseProblem(StepResponse(config, dt_ns), far, draws=1)
+        problem.response.set_base(factor * POLE_NS, problem.slope)
+        problems.append(problem)
+    best = min(problems, key=_distance)
+    fitter.fit(best)
+    response = LearnedResponse(config, dt_ns)
+    response.step = best.response
+    found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
     return response, found
 
 

@@ -198,6 +198,11 @@ class Moments:
         )
         return (readings, beyond) if counts.all() else (readings[counts], beyond[counts])
 
+    def with_wider_bins(self, width: float) -> Moments:
+        """The same with bins of the current amplitude no narrower than `width`."""
+        wide = replace(self, amplitude_widths=np.maximum(self.amplitude_widths, width))
+        return replace(wide, values=wide.functions(self.data))
+
     def window(self, last: int) -> Window:
         """Where records are read whose half maxima are before a sample."""
         return _window(self.config, self.preparation, self.level, last)

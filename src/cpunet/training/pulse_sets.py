@@ -11,7 +11,6 @@ from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.energy_bands import EnergyBand, energy_bands
 from cpunet.training.moments import Moments, Rows
 from cpunet.training.response_problem import Band
@@ -62,16 +61,8 @@ class PulseSets:
             for band in parted
         ]
 
-    def bands(
-        self, most: int | None = None, amplitude_width: float | None = None
-    ) -> list[Band]:
-        """All pulses, or about `most` of each side, in the same proportions.
-
-        With `amplitude_width`, bins of the current amplitude are no narrower than that.
-        """
-        training = self.recipe.matching.training
-        if amplitude_width is not None:
-            training = training.model_copy(update={"amplitude_width": amplitude_width})
+    def bands(self, most: int | None = None) -> list[Band]:
+        """All pulses, or about `most` of each side, in the same proportions."""
         n_sim, n_data = (
             sum(len(order) for order in orders)
             for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
@@ -83,10 +74,11 @@ class PulseSets:
                 share = 1.0 if most is None else min(1.0, most / n)
                 kept = max(math.ceil(share * len(order)), min(MIN_OF_BAND, len(order)))
                 chosen.append(np.sort(order[:kept]))
-            some.append(self._band(band, chosen[0], chosen[1], training))
+            some.append(self._band(band, *chosen))
         return some
 
-    def _band(self, band: EnergyBand, sim: Rows, data: Rows, training: MatchingConfig) -> Band:
+    def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
+        _, training = self.recipe.matching
         measured = _taken(self.data.waveforms, band.data[data])
         moments = Moments.of_data(measured, training, self.recipe.preparation)
         rows = band.sim[sim]

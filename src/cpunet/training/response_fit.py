@@ -19,6 +19,7 @@ from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
+from cpunet.training.drift_training import DriftFit
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.misfit import amplitude_shift
@@ -74,6 +75,8 @@ class Fit:
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
         the data's, see `cpunet.training.misfit`.
+    drift
+        What a U-Net before a learned readout gains, if one was trained.
     """
 
     chi_square: float
@@ -87,6 +90,7 @@ class Fit:
     bands: dict[str, list[int]]
     amplitude_shift: float
     amplitude_shift_error: float
+    drift: DriftFit | None = None
 
     @property
     def verdict(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -110,6 +110,11 @@ class Band:
     def moments(self) -> Moments:
         """Moments defined by the measured pulses."""
         return self.sim.moments
+
+    def with_wider_bins(self, width: float) -> Band:
+        """The same pulses with bins of the current amplitude no narrower than `width`."""
+        wide = self.moments.with_wider_bins(width)
+        return replace(self, sim=replace(self.sim, moments=wide))
 
     @property
     def pairs(self) -> float:

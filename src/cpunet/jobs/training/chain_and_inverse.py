@@ -10,20 +10,17 @@ from typing import Any
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.jobs.common.monitor import Monitor
-from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
-from cpunet.training.drift_training import DriftFit
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
@@ -107,12 +104,21 @@ def match(
     if note is not None:
         monitor.note(f"warning: {note}")
 
-    response, fit, gained = _fitted(sides, noise, recipe, seed, known, drawn, listen)
+    if isinstance(known, ElectronicsResponse):
+        allowed = recipe.matching.training.drift_terms
+        if known.config.drift_terms > allowed:
+            known = with_drift_terms(known, allowed)
+        recipe = recipe.model_copy(update={"generator": known.config})
+    given: dict[str, Any] = {
+        "seed": seed,
+        "known": known,
+        "remains": drawn,
+        "listener": listen,
+    }
+    fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
+    response, fit = fitted(sides.sim, sides.data, noise, recipe, **given)
     told = _described(fit, response, noise, sides)
     _note(fit, told, monitor)
-    if gained is not None:
-        told["drift"] = {"verdict": str(gained), **asdict(gained)}
-        monitor.note(str(gained))
     if told_of_remains is not None:
         told["remains"] = told_of_remains
     # as fitted: a ringing or a stretch may have been added
@@ -125,47 +131,6 @@ def match(
     return nn.ModuleDict({"ren": chain, "iren": iren}), {"fit": told}, recipe
 
 
-def _fitted(
-    sides: Sides,
-    noise: BaselineNoise,
-    recipe: Recipe,
-    seed: int,
-    known: Readout | None,
-    remains: DrawnRemains | None,
-    listener: Listener,
-) -> tuple[ElectronicsResponse | LearnedResponse, Fit, DriftFit | None]:
-    """Fit the response of a recipe."""
-    if isinstance(recipe.generator, LearnedConfig):
-        assert known is None or isinstance(known, LearnedResponse)
-        return fit_learned(
-            sides.sim,
-            sides.data,
-            noise,
-            recipe,
-            seed=seed,
-            known=known,
-            remains=remains,
-            listener=listener,
-        )
-    if known is not None:
-        assert isinstance(known, ElectronicsResponse)
-        allowed = recipe.matching.training.drift_terms
-        if known.config.drift_terms > allowed:
-            known = with_drift_terms(known, allowed)
-        recipe = recipe.model_copy(update={"generator": known.config})
-    response, fit = fit_response(
-        sides.sim,
-        sides.data,
-        noise,
-        recipe,
-        seed=seed,
-        known=known,
-        remains=remains,
-        listener=listener,
-    )
-    return response, fit, None
-
-
 def _described(
     fit: Fit, response: Readout, noise: BaselineNoise, sides: Sides
 ) -> dict[str, Any]:
@@ -174,6 +139,7 @@ def _described(
     return {
         "parameters": parameters,
         **asdict(fit),
+        "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
         "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
@@ -199,6 +165,8 @@ def _note(fit: Fit, told: Mapping[str, Any], monitor: Monitor) -> None:
             f"simulated and {beside['data']} measured pulses"
         )
     monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
+    if fit.drift is not None:
+        monitor.note(str(fit.drift))
     for number, cause in enumerate(told["causes"], 1):
         monitor.note(f"  {number}. {cause}")
     for found in beyond(told["parameters"]) + stretched(told["parameters"]):
