@@ -123,3 +123,13 @@ def test_half_of_a_unet_is_half_of_what_it_does():
     network = drift(0.1)
     network.share.fill_(0.5)
     torch.testing.assert_close(network(edges()), drift(0.05)(edges()), atol=1e-5, rtol=0)
+
+
+def test_the_effect_is_told_in_times_and_variances_of_each_pulse():
+    pulses = edges()
+    before_ns, longer, blur_ns2 = drift(0.05, variance=2.0).effect(pulses)
+    from_2_to_98 = 2 * 2.0537 * width_of(pulses)  # of a Gaussian
+    torch.testing.assert_close(before_ns.float(), from_2_to_98 * DT_NS, rtol=5e-3, atol=0)
+    wanted = (math.exp(0.1) + 2.0 / width_of(pulses).square()).sqrt() - 1
+    assert (longer - wanted).abs().max() < 5e-3
+    torch.testing.assert_close(blur_ns2, torch.full_like(blur_ns2, 2.0 * DT_NS**2))

@@ -110,14 +110,14 @@ def test_pulses_are_those_of_the_true_chain(problem, fitted):
     assert fit.chi_square / fit.moments < 1.6
     assert fit.drift is None
     errors = edge_errors(response)
-    assert np.median(errors) < 3e-3
-    assert np.quantile(errors, 0.95) < 5e-3
+    assert np.median(errors) < 1e-3
+    assert np.quantile(errors, 0.95) < 2e-3
 
 
 @pytest.mark.thorough
 def test_other_noise_ends_at_the_truth_too(problem):
     again, _ = fit_learned(problem.sim, problem.data, problem.noise, RECIPE, seed=1)
-    assert np.median(edge_errors(again)) < 3e-3
+    assert np.median(edge_errors(again)) < 1e-3
 
 
 @pytest.mark.thorough
@@ -135,7 +135,7 @@ def test_a_known_response_is_a_start(problem, fitted):
     )
     assert costs[0] < 2 * fit.moments
     assert fit.chi_square < 1.6 * fit.moments
-    assert np.median(edge_errors(response)) < 2e-3
+    assert np.median(edge_errors(response)) < 1e-3
 
 
 @pytest.mark.thorough

@@ -37,6 +37,7 @@ Values = npt.NDArray[np.float64]
 
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 AVERAGED = 10  # records in the moving average
+DRIFT_BINS = 12  # of drift time, with as many pulses each
 COLUMNS = 4  # panels of further parameters in a row
 # Panels of the loss figure: losses with their label and colour.
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
@@ -274,6 +275,34 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         xlim=(time_ns[0], time_ns[-1]),
     )
     linear_within(below, 1.0)
+    return figure
+
+
+@styled
+def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
+    """What the U-Net before a readout does, against the drift time of the simulated pulse.
+
+    Parameters
+    ----------
+    before_ns, longer, blur_ns2
+        As `cpunet.networks.learned_response.DriftUNet.effect` returns them, shapes (pulses,).
+    """
+    figure = Figure(figsize=(8.4, 3.4))
+    panels = figure.subplots(1, 2)
+    edges = np.unique(np.quantile(before_ns, np.linspace(0, 1, DRIFT_BINS + 1)))
+    in_bin = np.clip(np.searchsorted(edges, before_ns, "right") - 1, 0, len(edges) - 2)
+    blur_ns = np.sign(blur_ns2) * np.sqrt(np.abs(blur_ns2))
+    filled = np.unique(in_bin)
+    for axes, values in zip(panels, (100 * longer, blur_ns), strict=True):
+        axes.plot(before_ns, values, ".", color=COLOURS["raw"], markersize=1.5, alpha=0.3)
+        middle = [np.median(values[in_bin == number]) for number in filled]
+        at = [np.median(before_ns[in_bin == number]) for number in filled]
+        axes.plot(at, middle, color=COLOURS["ren"], marker="o", markersize=3, label="median")
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set(xlabel="Simulated time from 2 to 98 % of the charge [ns]")
+    panels[0].set(ylabel="Longer by [%]", title="Clock of the U-Net")
+    panels[1].set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
+    panels[0].legend()
     return figure
 
 

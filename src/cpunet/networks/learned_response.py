@@ -45,6 +45,7 @@ LONGEST_US = 1e5  # decay of a base whose data do not decay
 # logarithm of the rate, and the time over which it is smoothed; the largest variance of blur.
 SEEN_NS, SEEN_BEFORE = 4096.0, 0.625
 MAX_LOG_RATE, SMOOTH_NS, MAX_BLUR_NS2 = 0.3, 80.0, 768.0
+LOW = 0.02  # charge from which the time of a pulse counts
 
 
 class StepResponse(Readout):
@@ -172,6 +173,7 @@ class DriftUNet(nn.Module):
 
     def __init__(self, width: int, dt_ns: float) -> None:
         super().__init__()
+        self.dt_ns = dt_ns
         self.length = 16 * max(1, round(SEEN_NS / dt_ns / 16))
         self.before = round(SEEN_BEFORE * self.length)
         self.max_blur = MAX_BLUR_NS2 / dt_ns**2
@@ -209,6 +211,20 @@ class DriftUNet(nn.Module):
         at = (sample - half + self.before).clamp(0, self.length - 1)
         moved = at_times(windows, sample + late.gather(1, at))
         return _blurred(moved, blur), log_rate, blur
+
+    @torch.no_grad()
+    def effect(self, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What it does with each pulse, shapes (batch,).
+
+        Returns
+        -------
+        tuple
+            Time from 2 to 98 % of the charge in ns as simulated, its relative change, and the
+            variance of the blur in ns².
+        """
+        changed, _, blur = self.eval().changed(windows)
+        before, after = (_crossing(p, 1 - LOW) - _crossing(p, LOW) for p in (windows, changed))
+        return before * self.dt_ns, after / before - 1, blur.double() * self.dt_ns**2
 
 
 class LearnedResponse(Readout):
@@ -259,6 +275,13 @@ def _ringing(time_ns: np.ndarray) -> np.ndarray:
     size = RINGING * np.exp(-np.abs(time_ns) / RINGING_NS) * (time_ns > RINGING_FROM_NS)
     near = np.exp(-0.5 * ((time_ns[:, np.newaxis] - time_ns) / RINGING_LENGTH_NS) ** 2)
     return np.asarray(size[:, np.newaxis] * size * near)
+
+
+def _crossing(windows: Tensor, level: float) -> Tensor:
+    """Time in samples at which rising pulses (batch, samples) pass a level, shape (batch,)."""
+    after = (windows < level).sum(dim=1, keepdim=True).clamp(1, windows.shape[1] - 1)
+    low, high = (windows.double().gather(1, at) for at in (after - 1, after))
+    return (after - (high - level) / (high - low).clamp_min(1e-9))[:, 0]
 
 
 def _blurred(windows: Tensor, variance: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ BETAS, WEIGHT_DECAY, MEMORY, WARM_UP = (0.5, 0.99), 1e-2, 0.9, 10
 OF_MEAN, OF_PULSES, TYPICAL = 0.05, 1.0, 0.05
 SHARES = (0.0, 0.5, 1.0)
 RESAMPLED, SURE = 200, 2.0
-SHOWN, LOW = 2048, 0.02  # pulses that show what it does, and charge from which they count
+SHOWN = 2048  # pulses that show what it does
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class DriftFit:
     error
         Errors of the differences from the first of these.
     longer
-        Relative change of the time from 2 to 98 % of the charge by all of the network, for the
-        quarters of the pulses from the shortest to the longest.
+        Mean relative change of the time from 2 to 98 % of the charge by all of the network, for
+        the quarters of the pulses from the shortest to the longest.
     blur_ns
         Root of the mean variance of the blur in ns, negative for pulses that are sharpened.
     """
@@ -131,7 +131,7 @@ def fit_drift(
         results.append(_HeldOut(changed(held, drift), known, response))
     chosen, mismatch, error = _chosen(results, seed)
     drift.share.fill_(1.0)
-    longer, blur_ns = _learned(drift, bands[0], float(response.dt_ns))
+    longer, blur_ns = _learned(drift, bands[0])
     drift.share.fill_(SHARES[chosen])
     step.coordinates.data.copy_(torch.lerp(without, whole, SHARES[chosen]))
     if chosen:
@@ -140,16 +140,13 @@ def fit_drift(
     return DriftFit(SHARES[chosen], mismatch, error, longer, blur_ns)
 
 
-@torch.no_grad()
-def _learned(drift: DriftUNet, band: Band, dt_ns: float) -> tuple[list[float], float]:
+def _learned(drift: DriftUNet, band: Band) -> tuple[list[float], float]:
     """What a U-Net does, as `DriftFit` has it."""
-    pulses = torch.from_numpy(np.array(band.sim.sim[:SHOWN]))
-    after, _, blur = drift.eval().changed(pulses)
-    times = [((p > LOW) & (p < 1 - LOW)).sum(dim=1).double() for p in (pulses, after)]
-    quarters = times[0].argsort().tensor_split(4)
-    longer = [float(times[1][rows].sum() / times[0][rows].sum()) - 1 for rows in quarters]
-    variance = float(blur.mean())
-    return longer, math.copysign(math.sqrt(abs(variance)) * dt_ns, variance)
+    before_ns, longer, blur_ns2 = drift.effect(torch.from_numpy(np.array(band.sim.sim[:SHOWN])))
+    quarters = before_ns.argsort().tensor_split(4)
+    variance = float(blur_ns2.mean())
+    blur_ns = math.copysign(math.sqrt(abs(variance)), variance)
+    return [float(longer[rows].mean()) for rows in quarters], blur_ns
 
 
 def _split(band: Band, rng: np.random.Generator) -> tuple[Band, Band]:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
@@ -19,6 +20,7 @@ from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectr
 from cpunet.analysis.remains_figure import sizes_figure
 from cpunet.analysis.run_figures import (
     cycle_figure,
+    drift_figure,
     further_histograms,
     loss_curves,
     mean_pulses,
@@ -28,6 +30,7 @@ from cpunet.analysis.slice_figure import slice_figure
 from cpunet.jobs.validation.evaluation import Evaluation
 from cpunet.jobs.validation.peak_details import PeakDetails
 from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.translation.translator import IREN, REN
 
@@ -36,6 +39,7 @@ DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 REMAINS = "remains of earlier pulses"
+DRIFT, IN_DRIFT = "clock and blur of the U-Net", 2048  # pulses in it
 SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
 CYCLES = ("forward cycle", "backward cycle")
 
@@ -55,6 +59,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     forward, backward = CYCLES
     made[f"{fullest.name} {forward}"] = _forward(fullest, found.ren, found.iren)
     made[f"{fullest.name} {backward}"] = _backward(fullest, found.ren, found.iren)
+    made |= _drift(fullest, found.ren)
     for peak in scored:
         made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
     if DEP in {peak.name for peak in scored} and len(scored) > 1:
@@ -71,6 +76,16 @@ def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
     wanted = ("rate_khz", "rate_error_khz", "decay_us", "error_kev", "traces")
     known = {name: told[name] for name in wanted}
     return {REMAINS: partial(sizes_figure, known, told["sizes"], told["drawn"]["energies_kev"])}
+
+
+def _drift(peak: PeakSets, ren: REN) -> dict[str, Drawing]:
+    """What a U-Net before the readout does, if there is one."""
+    response = getattr(ren.backend.network, "response", None)
+    drift = getattr(response, "drift", None)
+    if not isinstance(drift, DriftUNet):
+        return {}
+    effect = drift.effect(torch.from_numpy(peak.raw.waveforms[:IN_DRIFT]))
+    return {DRIFT: partial(drift_figure, *(values.numpy() for values in effect))}
 
 
 def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
