@@ -29,7 +29,6 @@ from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
@@ -103,11 +102,11 @@ def experiments(
     stand: Path, nuisances: tuple[Nuisance, ...], sets: int
 ) -> Iterator[Experiment]:
     """Calibrate disjoint parts of a stand."""
-    recipe, quiet = load_recipe("fast"), Monitor()
+    recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     files = [InputFile(stand / f"{name}.lh5") for name in ("sim", "data")]
-    sim = load_simulated(files[0], recipe, selection, quiet).prepared
-    data = load_measured(files[1], recipe, selection, quiet).prepared
+    sim = load_simulated(files[0], recipe, selection).prepared
+    data = load_measured(files[1], recipe, selection).prepared
     noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)
     stored = StoredSimulation.read(files[0].path)
     physics = Physics(stored.detector, stored.settings, nuisances)

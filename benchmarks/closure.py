@@ -18,7 +18,6 @@ from rich.table import Table
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
@@ -46,7 +45,6 @@ def scores_of(
                 seed=seed,
                 device="auto",
             ),
-            Monitor(),
         ).metrics
 
 

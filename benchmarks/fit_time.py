@@ -19,7 +19,6 @@ import numpy as np
 
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
@@ -37,8 +36,8 @@ def one(stand: Path, n: int) -> dict[str, float]:
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     files = [InputFile(stand / f"{side}.lh5") for side in ("sim", "data")]
-    sim = load_simulated(files[0], recipe, selection, Monitor()).prepared.pulses
-    data = load_measured(files[1], recipe, selection, Monitor()).prepared.pulses
+    sim = load_simulated(files[0], recipe, selection).prepared.pulses
+    data = load_measured(files[1], recipe, selection).prepared.pulses
     noise, _ = measured_noise(files[1], data, recipe.preparation)
     sides = first(sim, n), first(data, n)
     loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

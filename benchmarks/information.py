@@ -23,7 +23,6 @@ import torch
 from cpunet.electronics.finishing import finish
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import known_response
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
@@ -188,8 +187,8 @@ def main() -> None:
         return
     files = [InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
-    sim = load_simulated(files[0], RECIPE, selection, Monitor()).prepared.pulses
-    data = load_measured(files[1], RECIPE, selection, Monitor()).prepared.pulses
+    sim = load_simulated(files[0], RECIPE, selection).prepared.pulses
+    data = load_measured(files[1], RECIPE, selection).prepared.pulses
     noise, _ = measured_noise(files[1], data, RECIPE.preparation)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
@@ -49,7 +48,6 @@ def one_seed(
                 seed=seed,
                 device="auto",
             ),
-            Monitor(),
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
     for peak in PEAKS:

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from cpunet.cli.messages import monitor
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import translate_file
@@ -122,7 +121,6 @@ def main() -> None:
                 InputFile(folder / "sim.lh5"),
                 folder / "out.lh5",
                 TranslateOptions(adc=adc),
-                monitor=monitor(),
             )
         seconds = time.perf_counter() - begin
         size = (folder / "out.lh5").stat().st_size

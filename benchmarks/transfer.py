@@ -17,7 +17,6 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
@@ -75,7 +74,6 @@ def main() -> None:
                 ValidateOptions(
                     truth=arguments.stand / "truth.npz", baselines=False, seed=0, device="cpu"
                 ),
-                Monitor(),
             )
             rows[title] = (info["seconds"], scored.metrics)
     show(rows)

@@ -14,6 +14,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from cpunet import progress
+
 # compilation and a shared machine make single examples slow now and then
 settings.register_profile("cpunet", deadline=None, max_examples=25)
 settings.register_profile("full", deadline=None, max_examples=200)  # see `make test-slow`
@@ -63,10 +65,22 @@ def held() -> ModuleType:
     return beside("held")
 
 
+@pytest.fixture
+def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
+    """Total and steps of each stage of the work, by title."""
+    seen: dict[str, list[float | None]] = {}
+
+    def update(bar: progress.Stage, n: float = 1) -> None:
+        seen.setdefault(bar.desc, [bar.total]).append(n)
+
+    monkeypatch.setattr(progress.Stage, "update", update)
+    return seen
+
+
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
-    patch.setattr("cpunet.jobs.validation.validate._drawn", lambda _drawing, _advance: Figure())
+    patch.setattr("cpunet.jobs.validation.validate._drawn", lambda _drawing, _bar: Figure())
     patch.setattr("cpunet.analysis.report.figure_png", lambda _figure: b"")
 
 

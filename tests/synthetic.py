@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from cpunet.analysis.paired import PairedScores, pair_squares, scores_of_squares
 from cpunet.electronics.finishing import finish
 from cpunet.jobs.common.inputs import InputFile, InputSet
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.common.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses
@@ -181,31 +180,6 @@ def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
         whole = Pulses.of(pulses, dt_ns=DT_NS, energy_kev=energies)
         write_pulses(folder / f"{name}.lh5", whole)
     return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
-
-
-class Listening(Monitor):
-    """Keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, list[int | None]] = {}
-        self.notes: list[str] = []
-        self.states: list[str] = []
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        done: list[int | None] = [total]
-        self.stages[title] = done
-        yield done.append
-
-    def state(self, text: str) -> None:
-        self.states.append(text)
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
-
-    @property
-    def warnings(self) -> list[str]:
-        return [note for note in self.notes if note.startswith("warning")]
 
 
 @contextmanager

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
@@ -29,10 +28,10 @@ def made(command, tmp_path: Path) -> Path:
 
 
 def test_the_folder_is_read_and_prepared(made: Path):
-    recipe, quiet = load_recipe("fast"), Monitor()
+    recipe = load_recipe("fast")
     chosen = parse_selection("FEP,DEP", recipe.peaks)
-    sim = load_simulated(InputFile(made / "sim.lh5"), recipe, chosen, quiet)
-    data = load_measured(InputFile(made / "data.lh5"), recipe, chosen, quiet)
+    sim = load_simulated(InputFile(made / "sim.lh5"), recipe, chosen)
+    data = load_measured(InputFile(made / "data.lh5"), recipe, chosen)
     assert len(sim.prepared) > 20
     assert len(data.prepared) > 10
     truth = prepared_truth(made / "truth.npz", sim, recipe.preparation)

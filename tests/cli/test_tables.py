@@ -96,18 +96,3 @@ def test_markup_and_empty_tables(screen, capsys):
     table.add_row("[bold]a[/]", "[bold]123456789.123456789[/]")
     messages.tell(table)
     assert "123456789.123456789" in capsys.readouterr().out
-
-
-def test_a_stage_that_takes_longer_has_no_time_left(monkeypatch, capsys):
-    """Fits say how many steps most of them need, and some need more."""
-    monkeypatch.setattr(messages, "LOG_EVERY_S", 0.0)
-    shown = messages.LogMonitor()
-    with shown.stage("Matching", 2) as advance:
-        shown.state("chi-square 7")
-        for _ in range(3):
-            advance(1)
-    first, second, third, done = capsys.readouterr().err.splitlines()
-    assert " s left" in first
-    assert "left" not in second + third + done
-    assert third.startswith("Matching: 3/2, ")
-    assert third.endswith(", chi-square 7")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +29,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.translation.translator import IREN, REN
-from synthetic import Files, Listening, after_pole_and_decay, in_traces, sampled, two_sites
+from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
 
 DT_NS, FINE = 16.0, 16
 POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511
@@ -81,16 +84,19 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 class Run(NamedTuple):
     folder: Path
     info: dict[str, Any]
-    monitor: Listening
+    told: list[logging.LogRecord]
 
 
 @pytest.fixture(scope="module")
 def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder, monitor = tmp_path_factory.mktemp("runs") / "run", Listening()
-    info = train_run(
-        *files, folder, RECIPE, TrainOptions(seed=3, device="cpu"), monitor=monitor
-    )
-    return Run(folder, info, monitor)
+    folder, told = tmp_path_factory.mktemp("runs") / "run", SimpleQueue[logging.LogRecord]()
+    handler, logger = QueueHandler(told), logging.getLogger("cpunet")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    info = train_run(*files, folder, RECIPE, TrainOptions(seed=3, device="cpu"))
+    logger.removeHandler(handler)
+    logger.setLevel(logging.NOTSET)
+    return Run(folder, info, [told.get() for _ in range(told.qsize())])
 
 
 def test_the_run_tells_of_the_fit(run: Run) -> None:
@@ -114,15 +120,15 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
 
 def test_what_is_told_on_the_way(run: Run) -> None:
     # few pulses are told of, and nothing else
-    assert [w for w in run.monitor.warnings if "1000 or more are better" not in w] == []
-    total, *steps = run.monitor.stages["Matching"]
-    assert total == RECIPE.matching.training.steps  # of one start; most fits need fewer
-    assert steps == [1] * run.info["fit"]["steps"]
+    warnings = [r.getMessage() for r in run.told if r.levelno >= logging.WARNING]
+    assert [w for w in warnings if "1000 or more are better" not in w] == []
+    assert any(r.getMessage().startswith("fit: ") for r in run.told)
     records = [json.loads(x) for x in (run.folder / "losses.jsonl").read_text().splitlines()]
-    assert [record["iteration"] for record in records] == list(range(1, len(steps) + 1))
+    assert [record["iteration"] for record in records] == list(
+        range(1, run.info["fit"]["steps"] + 1)
+    )
     last = records[-1]["losses"]["chi_square"]
     assert last == pytest.approx(run.info["fit"]["chi_square"])
-    assert run.monitor.states[-1] == f"chi-square {last:.4g}"
 
 
 def test_both_directions_are_in_the_weights(run: Run) -> None:
@@ -166,21 +172,20 @@ def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_remains_of_earlier_pulses_are_learned_without_being_asked(
-    files: Files, tmp_path: Path
+    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO", "cpunet")
     traces, rng = digitised(N, seed=2), np.random.default_rng(7)
     law = RemainsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
     left = law.draw(N, rng)[:, np.newaxis]
     decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
     data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
-    monitor = Listening()
     info = train_run(
         files.sim,
         data,
         tmp_path / "run",
         RECIPE,
         TrainOptions(seed=3, device="cpu"),
-        monitor=monitor,
     )
     fit = info["fit"]
     assert fit["chi_square"] < 1.6 * fit["moments"]
@@ -189,7 +194,7 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     told = fit["remains"]
     assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
     assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
-    assert any(note.startswith("remains of earlier pulses: ") for note in monitor.notes)
+    assert any(note.startswith("remains of earlier pulses: ") for note in caplog.messages)
     ren = REN.load(tmp_path / "run")
     assert ren.remains is not None
     assert ren.remains.law.rate_khz == told["rate_khz"]
@@ -199,10 +204,10 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     # networks with noise outside are prepared alike
     paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
     chosen = parse_selection("FEP", paper.peaks)
-    sim = load_simulated(files.sim, paper, chosen, monitor).prepared.pulses
-    measured = load_measured(data, paper, chosen, monitor)
+    sim = load_simulated(files.sim, paper, chosen).prepared.pulses
+    measured = load_measured(data, paper, chosen)
     sides = Sides(sim, measured.prepared.pulses, data, measured)
-    outside, entry = outside_noise(sides, paper, monitor)
+    outside, entry = outside_noise(sides, paper)
     assert outside is not None
     assert outside.noise.remains is not None
     assert outside.noise.remains.law.rate_khz == told["rate_khz"]
@@ -211,42 +216,39 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
 
 def test_data_without_remains_are_given_none(run: Run) -> None:
     assert run.info["fit"]["remains"]["rate_khz"] == 0
-    assert not any("remains" in note for note in run.monitor.notes)
+    assert not any("remains" in record.getMessage() for record in run.told)
     remains = REN.load(run.folder).remains
     assert remains is not None
     assert remains.law.rate_khz == 0
 
 
 @pytest.mark.thorough
-def test_a_simulation_of_other_physics_is_told(files: Files, tmp_path: Path) -> None:
+def test_a_simulation_of_other_physics_is_told(
+    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
-    monitor, recipe = Listening(), load_recipe("fast", [*ONE_START, *SHORT])
-    info = train_run(
-        other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"), monitor=monitor
-    )
+    recipe = load_recipe("fast", [*ONE_START, *SHORT])
+    info = train_run(other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
     fit = info["fit"]
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
-    said = [note for note in monitor.warnings if "poor fit" in note]
+    said = [note for note in caplog.messages if "poor fit" in note]
     assert len(said) == 1
     assert f"chi-square is {fit['chi_square'] / fit['moments']:.1f} per moment" in said[0]
 
 
 @pytest.mark.thorough
 def test_a_stretched_drift_is_told_and_translated(
-    run: Run, files: Files, tmp_path: Path
+    run: Run, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.25), FINE))
-    monitor = Listening()
     recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
-    info = train_run(
-        sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"), monitor=monitor
-    )
+    info = train_run(sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
     fit = info["fit"]
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
     assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
-    assert any(note.startswith("warning: charges drift for") for note in monitor.notes)
+    assert any(note.startswith("charges drift for") for note in caplog.messages)
     assert "longer than simulated" in fit["verdict"]
     # what is translated rises as the data do
     clean = REN.load(tmp_path / "run").translate(
@@ -280,14 +282,12 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
             TrainOptions(peak="FEP,300-400", device="cpu"),
         )
     # a range that both sides have, but not all of it: what cannot be compared is counted
-    monitor = Listening()
     info = train_run(
         sim,
         files.data,
         tmp_path / "r",
         load_recipe("fast", [*ONE_START, *SHORT]),
         TrainOptions(peak="1000-", device="cpu"),
-        monitor=monitor,
     )
     assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
 

@@ -59,19 +59,19 @@ def test_a_simulation_serves_all_channels_or_its_own(tmp_path):
     assert str(found["ch2"]).endswith("both.h5: no table of ch2; there are those of ch1, ch3")
 
 
-def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path):
+def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog):
+    caplog.set_level("INFO", "cpunet")
     data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")
-    notes: list[str] = []
 
     def work(name: str, _pair: object, out: Path) -> str:
         if name == "ch2":
             raise CpunetError("too few pulses")
         return out.name
 
-    outcome = one_by_one(paired(data, data), tmp_path / "out", work, notes.append)
+    outcome = one_by_one(paired(data, data), tmp_path / "out", work)
     assert outcome.done == {"ch1": "ch1", "ch3": "ch3"}
     assert outcome.failed == {"ch2": "too few pulses"}
-    assert "ch2: failed: too few pulses" in notes
+    assert "ch2: failed: too few pulses" in caplog.messages
     with pytest.raises(CpunetError, match="1 of 3 channels failed, the first: ch2: too few"):
         outcome.require_all(tmp_path / "out")
 
@@ -85,11 +85,11 @@ def test_what_ends_one_may_end_all_and_an_output_of_one_is_refused(tmp_path):
 
     data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
     with pytest.raises(StopError):
-        one_by_one(paired(data, data), tmp_path / "out", stop, lambda _n: None, StopError)
+        one_by_one(paired(data, data), tmp_path / "out", stop, StopError)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".cpunet.json").write_text("{}")
     with pytest.raises(CpunetError, match="is the output of one channel"):
-        one_by_one(paired(data, data), tmp_path / "run", stop, lambda _n: None)
+        one_by_one(paired(data, data), tmp_path / "run", stop)
 
 
 def test_runs_of_channels_are_found(tmp_path):

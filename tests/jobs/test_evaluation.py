@@ -12,7 +12,6 @@ from cpunet.analysis.drift_slices import slice_edges
 from cpunet.analysis.paired import pair_squares, scores_of_squares
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
@@ -81,7 +80,6 @@ def evaluated(run: Path, sim: InputFile, data: InputFile) -> Evaluation:
         sim,
         data,
         ValidateOptions(truth=None, baselines=False, seed=0, device="cpu"),
-        Monitor(),
     )
 
 
@@ -103,7 +101,6 @@ def test_a_sample_of_both_sides_is_compared(run, files) -> None:
         files["sim"],
         files["data"],
         ValidateOptions(truth=None, baselines=False, seed=0, device="cpu", most=250),
-        Monitor(),
     )
     assert len(few.sim.prepared) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
@@ -196,7 +193,6 @@ def found(run, files, tmp_path_factory):
         files["sim"],
         files["data"],
         ValidateOptions(truth=path, baselines=True, seed=0, device="cpu"),
-        Monitor(),
     )
 
 

@@ -19,7 +19,6 @@ from cpunet.jobs.common.inputs import (
     load_simulated,
     require_same_sampling,
 )
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
@@ -32,7 +31,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run_folder import write_run
-from synthetic import KEV, SMALL_NETWORK, Files, Listening, prepared_truth, write_files
+from synthetic import KEV, SMALL_NETWORK, Files, prepared_truth, write_files
 
 RECIPE = load_recipe(
     "paper",
@@ -66,7 +65,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def sim_set(files) -> InputSet:
     selection = parse_selection("SEP,DEP", RECIPE.peaks)
-    return load_simulated(files[0], RECIPE, selection, Monitor())
+    return load_simulated(files[0], RECIPE, selection)
 
 
 def test_provenance_counts_and_fingerprints(files, sim_set):
@@ -82,19 +81,19 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
 
 def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
     selection = parse_selection("FEP", RECIPE.peaks)
-    told = load_measured(files[1], RECIPE, selection, Monitor()).provenance()
+    told = load_measured(files[1], RECIPE, selection).provenance()
     assert {window["name"] for window in told["cuts"]["windows"]} >= {"tail_slope", "baseline"}
     json.dumps(told)
 
 
-def test_measured_pulses_given_as_simulated_ones_are_doubted(files):
-    selection, monitor = parse_selection("FEP", RECIPE.peaks), Listening()
-    load_simulated(files[1], RECIPE, selection, monitor)
-    assert monitor.notes[0].startswith("warning: data.lh5: these pulses decay")
-    monitor.notes.clear()
-    load_simulated(files[0], RECIPE, selection, monitor)
-    load_measured(files[1], RECIPE, selection, monitor)
-    assert not any(note.startswith("warning") for note in monitor.notes)
+def test_measured_pulses_given_as_simulated_ones_are_doubted(files, caplog):
+    selection = parse_selection("FEP", RECIPE.peaks)
+    load_simulated(files[1], RECIPE, selection)
+    assert caplog.messages[0].startswith("data.lh5: these pulses decay")
+    caplog.clear()
+    load_simulated(files[0], RECIPE, selection)
+    load_measured(files[1], RECIPE, selection)
+    assert not caplog.messages
 
 
 def test_sets_of_different_sampling(sim_set, files):
@@ -149,43 +148,39 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
             prepared_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
 
 
-def test_a_training_tells_what_it_does(files, tmp_path):
-    monitor = Listening()
-    info = train_run(
-        *files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"), monitor=monitor
-    )
-    assert monitor.stages == {
+def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
+    caplog.set_level("INFO", "cpunet")
+    info = train_run(*files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"))
+    assert stages == {
         "Preparing sim.lh5": [N, N],
         "Preparing data.lh5": [N, N],
         "Training": [2, 2],
     }
-    assert monitor.notes[0].startswith("sim.lh5: 10 of 30 pulses used (left out: 20 energy_")
+    told = "sim.lh5: 10 of 30 pulses used (left out: 20 energy_"
+    assert any(note.startswith(told) for note in caplog.messages)
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == info
     assert (info["seed"], info["device"]) == (7, "cpu")
 
 
-def test_a_range_of_energies(files, tmp_path):
-    monitor = Listening()
+def test_a_range_of_energies(files, tmp_path, caplog):
     how = TrainOptions(peak="1500-2200", device="cpu")
-    info = train_run(*files, tmp_path / "run", RECIPE, how, monitor=monitor)
-    told = "warning: SEP, DEP are in the range trained on, and no test of it any more"
-    assert [note for note in monitor.notes if "trained on" in note] == [told]
+    info = train_run(*files, tmp_path / "run", RECIPE, how)
+    told = "SEP, DEP are in the range trained on, and no test of it any more"
+    assert [note for note in caplog.messages if "trained on" in note] == [told]
     assert info["peak"] == "1500-2200"
     assert info["sim"]["used"] == 20
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, inverse):
+def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, stages, inverse):
     source = files[1] if inverse else files[0]
     options = TranslateOptions(inverse=inverse, noise=False)
     whole = translate_file(run, source, tmp_path / "whole.lh5", options, device="cpu")
     monkeypatch.setattr(translate_job, "BLOCK_SIZE", 7)
-    monitor = Listening()
-    parts = translate_file(
-        run, source, tmp_path / "parts.lh5", options, device="cpu", monitor=monitor
-    )
+    stages.clear()
+    parts = translate_file(run, source, tmp_path / "parts.lh5", options, device="cpu")
     assert whole == parts == {"read": N, "translated": N, "rejections": {}}
-    assert monitor.stages == {"Translating": [N, 7, 7, 7, 7, 2]}
+    assert stages == {"Translating": [N, 7, 7, 7, 7, 2]}
     found = [open_pulses(tmp_path / name).read() for name in ("whole.lh5", "parts.lh5")]
     np.testing.assert_allclose(found[0].waveforms, found[1].waveforms, atol=1e-5)
     assert found[0].event_number.tolist() == found[1].event_number.tolist() == list(range(N))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, load_simulated
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import (
     GammaSource,
     HitFile,
@@ -35,7 +33,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import Transform, read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from synthetic import Listening
 
 SETTINGS = SimulationSettings(length_ns=1600)
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
@@ -80,7 +77,7 @@ def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     assert summary.hits < summary.hits_before_merging
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
-    used = load_simulated(InputFile(out), recipe, selection, Monitor()).prepared
+    used = load_simulated(InputFile(out), recipe, selection).prepared
     assert len(used) >= summary.lines["FEP"] > 10
     pulses = next(open_pulses(out).blocks())
     assert pulses.waveforms.shape == (summary.n_written, 100)
@@ -196,12 +193,11 @@ def test_hits_all_outside_say_where_they_are(ppc, source):
         away.open(ppc)
 
 
-def test_hits_outside_are_told(ppc, source, tmp_path: Path):
-    told = Listening()
-    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS, monitor=told)
+def test_hits_outside_are_told(ppc, source, tmp_path: Path, caplog):
+    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS)
     # one of five, at z = 300 mm
-    assert told.notes == [
-        f"warning: {source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
+    assert caplog.messages == [
+        f"{source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
         "mm); they span x 0 to 12, y 0 to 3, z 20 to 300 mm; their energy is lost; check "
         "--origin, --flip-z and --hits-detector"
     ]
@@ -223,10 +219,11 @@ def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
         HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc)
 
 
-def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path):
-    out, told = tmp_path / "sim.lh5", Listening()
+def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path, caplog):
+    caplog.set_level("INFO", "cpunet")
+    out = tmp_path / "sim.lh5"
     known = ppc.model_copy(update={"measured_depletion_V": 2100.0})
-    simulate_file(known, source, out, SETTINGS, impurity_from="depletion", monitor=told)
+    simulate_file(known, source, out, SETTINGS, impurity_from="depletion")
     made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])
     scale = made["detector"]["impurity_scale"]
     assert (made["impurity_from"], made["depletion_V"]) == (
@@ -234,7 +231,7 @@ def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: 
         pytest.approx(2100, abs=1),
     )
     assert scale > 1.05
-    assert any(f"impurities times {scale:.4g}" in note for note in told.notes)
+    assert any(f"impurities times {scale:.4g}" in note for note in caplog.messages)
     # what is kept is the detector that was simulated
     again = tmp_path / "again.lh5"
     simulate_file(Detector.model_validate(made["detector"]), source, again, SETTINGS)
@@ -268,15 +265,9 @@ def test_an_interrupted_run_leaves_nothing(ppc, tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_reaches_the_number_of_events(ppc, source, tmp_path: Path):
-    seen: list[int] = []
-
-    class Listening(Monitor):
-        def stage(self, title, total=None):
-            return nullcontext(seen.append if total else lambda _steps: None)
-
-    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS, monitor=Listening())
-    assert sum(seen) == 4
+def test_progress_reaches_the_number_of_events(ppc, source, tmp_path: Path, stages):
+    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS)
+    assert stages["Simulating ppc"] == [4, 4]
 
 
 def test_settings_of_a_file_and_on_top(tmp_path: Path):

@@ -6,7 +6,6 @@ import json
 import multiprocessing
 import os
 import signal
-from contextlib import contextmanager
 from pathlib import Path
 
 import awkward as ak
@@ -25,7 +24,6 @@ from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
@@ -35,6 +33,7 @@ from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.jobs.translation.translation_blocks import noise_seed, regrouped
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.reading.opening import open_pulses
@@ -43,7 +42,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training.run_folder import write_run
 from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
-from synthetic import Listening, decay, edges, in_traces, nearly_full_disk
+from synthetic import decay, edges, in_traces, nearly_full_disk
 
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0
@@ -177,19 +176,19 @@ def test_all_other_columns_are_kept(run, tmp_path):
         assert after[name].attrs.get("units") == before[name].attrs.get("units")
 
 
-def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path):
+def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path, caplog):
     with h5py.File(tmp_path / "sim.hdf5", "w") as file:
         file["waveform"], file["dt_ns"] = charge(), DT_NS
         file["energy_kev"], file["depth"] = np.full(N, 1000.0), np.arange(N)
         file["text"] = np.array(["a", "bc"] * (N // 2), dtype=object)
         file["short"] = np.arange(3)
         file["pair"] = np.ones(N, complex)
-    listening, out = Listening(), tmp_path / "out.lh5"
-    translate_file(run, InputFile(tmp_path / "sim.hdf5"), out, device="cpu", monitor=listening)
+    out = tmp_path / "out.lh5"
+    translate_file(run, InputFile(tmp_path / "sim.hdf5"), out, device="cpu")
     table = lh5.read("geds/ren", out)
     assert plain(table.depth) == list(range(N))
     assert plain(table.text) == [b"a", b"bc"] * (N // 2)
-    told = " ".join(listening.notes)
+    told = " ".join(caplog.messages)
     assert "column short is left out: 3 rows beside 40 pulses" in told
     assert "column pair is left out: of type complex128" in told
     assert {"short", "pair"}.isdisjoint(table)
@@ -395,17 +394,17 @@ def require_same_bytes(path, expected):
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
-    run, many, sequential, tmp_path, jobs
+    run, many, sequential, tmp_path, caplog, jobs
 ):
-    bad, listening, out = tmp_path / "bad.lh5", Listening(), tmp_path / "out"
+    bad, out = tmp_path / "bad.lh5", tmp_path / "out"
     bad.write_bytes(many[0].path.read_bytes()[:3000])
     sources = [InputFile(bad), *many]
     with pytest.raises(
         CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"
     ) as error:
-        translate_files(run, sources, out, jobs=jobs, device="cpu", monitor=listening)
+        translate_files(run, sources, out, jobs=jobs, device="cpu")
     assert "\n" not in str(error.value)
-    assert sum("bad.lh5" in note for note in listening.notes) == 1
+    assert sum("bad.lh5" in note for note in caplog.messages) == 1
     assert names(out) == names(sequential[0])
     for path in sequential[0].iterdir():
         require_same_bytes(out / path.name, path)
@@ -523,7 +522,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
 
 
 def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
-    run, network, tmp_path
+    run, network, tmp_path, caplog
 ):
     source = InputFile(sim_file(tmp_path / "sim.lh5"))
     translate_file(run, source, tmp_path / "chain.lh5", TranslateOptions(adc=ADC), device="cpu")
@@ -531,7 +530,6 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
     for part in (slice(0, 250), slice(1150, 1400)):
         steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
         assert steps.mean() == pytest.approx(10 * NOISE_KEV, rel=0.05)
-    listening = Listening()
     given = Adc(adc_per_kev=8.0, baseline=14_000, length=1000, n_pre=500)
     told = translate_file(
         network,
@@ -539,10 +537,9 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
         tmp_path / "unet.lh5",
         TranslateOptions(adc=given, noise=False),
         device="cpu",
-        monitor=listening,
     )
     assert told["read"] == N
-    assert any("beyond them stand baseline and decay" in note for note in listening.notes)
+    assert any("beyond them stand baseline and decay" in note for note in caplog.messages)
     assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
 
 
@@ -761,15 +758,9 @@ def test_options_that_contradict_each_other(options, said):
 def test_a_file_that_changes_meanwhile_gives_no_output(run, tmp_path, monkeypatch):
     source = sim_file(tmp_path / "sim.lh5")
 
-    class Touching(Monitor):
-        @contextmanager
-        def stage(self, title, total=None):
-            yield lambda _: os.utime(source, ns=(0, 0))
-
+    monkeypatch.setattr(Stage, "update", lambda *_: os.utime(source, ns=(0, 0)))
     with pytest.raises(CpunetError, match=r"sim.lh5: changed while it was read"):
-        translate_file(
-            run, InputFile(source), tmp_path / "out.lh5", device="cpu", monitor=Touching()
-        )
+        translate_file(run, InputFile(source), tmp_path / "out.lh5", device="cpu")
     assert names(tmp_path) == ["sim.lh5"]
 
 
@@ -806,14 +797,14 @@ def test_targets_that_cannot_be_written(run, tmp_path):
 class _Killed:
     """Work that the system ends, as for lack of memory."""
 
-    def work(self, _monitor):
+    def work(self):
         return lambda _task: os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.thorough
 def test_a_process_that_is_killed_is_told():
     with pytest.raises(CpunetError, match="a process was ended, perhaps for lack of memory"):
-        list(_in_processes(_Killed(), ["a", "b"], 1, print, Monitor()))
+        list(_in_processes(_Killed(), ["a", "b"], 1))
     assert multiprocessing.active_children() == []
 
 

@@ -13,7 +13,6 @@ import torch
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import load_measured, load_simulated
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.tune import (
     JOURNAL,
     UNCHANGED,
@@ -55,8 +54,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
     selection = parse_selection("FEP", recipe.peaks)
-    sim = load_simulated(files.sim, recipe, selection, Monitor())
-    data = load_measured(files.data, recipe, selection, Monitor())
+    sim = load_simulated(files.sim, recipe, selection)
+    data = load_measured(files.data, recipe, selection)
     return HeldOut.of(sim, data, files.data, recipe, seed)
 
 

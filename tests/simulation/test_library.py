@@ -47,10 +47,7 @@ def largest_rise(events: EventPulses, kept: npt.NDArray[np.bool_]) -> Array:
 def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
     place = [[1.0, 2.0, 5.0], [6.0, 0.0, 9.0], [0.0, 0.0, 0.5]]
     hits = Hits.of(place, [300.0, 100.0, 50.0], [0, 3, 3])
-    seen: list[tuple[int, int]] = []
-    events = simulate_events(
-        planar, hits, SETTINGS, progress=lambda done, n: seen.append((done, n))
-    )
+    events = simulate_events(planar, hits, SETTINGS)
     single = hit_signals(planar, *np.transpose(place), 1.0, SETTINGS).waveforms
     np.testing.assert_allclose(
         events.waveforms[0], 0.75 * single[0] + 0.25 * single[1], atol=1e-6
@@ -61,7 +58,6 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
     assert events.counts["events without signal"] == 1
     assert len(events.pulses()) == 1
     assert events.pulses().energy_kev.tolist() == [400.0]
-    assert seen[-1] == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -165,13 +161,3 @@ def test_exact_mode_does_without_a_library(
     ignored = simulate_events(planar, hits, SETTINGS, library=library)
     np.testing.assert_array_equal(without.waveforms, ignored.waveforms)
     assert simulate_events(planar, hits, SETTINGS, "library", library=library).counts
-
-
-def test_building_tells_how_far_it_is(planar: Maps) -> None:
-    seen: list[tuple[int, int]] = []
-    build_library(planar, SETTINGS, lambda done, n: seen.append((done, n)))
-    done, total = np.transpose(seen)
-    assert np.all(np.diff(done) > 0)
-    assert np.all(np.diff(total) >= 0)
-    assert np.all(done <= total)
-    assert done[-1] == total[-1]

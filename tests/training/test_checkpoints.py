@@ -58,10 +58,8 @@ def straight(sets, recipe):
     return weights(train(*sets, recipe, seed=3, listener=records.extend)), records
 
 
-def unfinished(folder: Path, notes: list | None = None, **facts: object) -> UnfinishedRun:
-    return UnfinishedRun(
-        folder, facts, {"device": "cpu"}, ([] if notes is None else notes).append
-    )
+def unfinished(folder: Path, **facts: object) -> UnfinishedRun:
+    return UnfinishedRun(folder, facts, {"device": "cpu"})
 
 
 def until(iteration: int, sets, recipe, folder: Path) -> list:
@@ -207,10 +205,10 @@ class Interrupted(BaseException):
     """As if the process had died there."""
 
 
-def work(sets, recipe, out: Path, notes: list, *, resume=False, die=None, disk=None, seed=3):
+def work(sets, recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
     """Train in a folder, as the job does; `die` after so many records."""
     with unfinished_folder(out, resume=resume) as folder:
-        run = unfinished(folder, notes, recipe=recipe.model_dump(mode="json"), seed=seed)
+        run = unfinished(folder, recipe=recipe.model_dump(mode="json"), seed=seed)
         start = run.begin(resume=resume)
 
         def listen(records):
@@ -247,8 +245,7 @@ def made(tmp_path_factory) -> Path:
 def whole(sets, recipe, made) -> dict[str, bytes]:
     """What a training in one go leaves."""
     if not (made / "whole").exists():
-        work(sets, recipe, made / "whole", notes := [])
-        assert notes == []
+        work(sets, recipe, made / "whole")
         assert not (made / "whole.unfinished").exists()
     return content(made / "whole")
 
@@ -258,7 +255,7 @@ def out(sets, recipe, made, tmp_path) -> Path:
     """Of a training that died in its last iteration, after checkpoints at 2 and 4."""
     if not beside(made / "died").exists():
         with pytest.raises(Interrupted):
-            work(sets, recipe, made / "died", [], die=4)
+            work(sets, recipe, made / "died", die=4)
     shutil.copytree(beside(made / "died"), beside(tmp_path / "run"))
     return tmp_path / "run"
 
@@ -267,14 +264,15 @@ def beside(out: Path) -> Path:
     return out.with_name(f"{out.name}.unfinished")
 
 
-def test_a_training_that_died_is_finished(sets, recipe, out, whole):
+def test_a_training_that_died_is_finished(sets, recipe, out, whole, caplog):
+    caplog.set_level("INFO", "cpunet")
     files = {CHECKPOINT, LOSSES, MARKER, outputs.MARKER}
     assert files == content(beside(out)).keys()
     assert not out.exists()
     # the log is ahead of the checkpoint, and is cut
     assert len((beside(out) / LOSSES).read_text().splitlines()) == 5
-    work(sets, recipe, out, notes := [], resume=True)
-    assert notes == ["going on after 4 iterations"]
+    work(sets, recipe, out, resume=True)
+    assert caplog.messages == ["going on after 4 iterations"]
     assert content(out) == whole
     assert not beside(out).exists()
 
@@ -282,13 +280,14 @@ def test_a_training_that_died_is_finished(sets, recipe, out, whole):
 def test_without_resume_nothing_is_lost(sets, recipe, out):
     before = content(beside(out))
     with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; continue"):
-        work(sets, recipe, out, [])
+        work(sets, recipe, out)
     assert content(beside(out)) == before
 
 
-def test_resume_without_a_training_begins_one(sets, recipe, tmp_path, whole):
-    work(sets, recipe, tmp_path / "run", notes := [], resume=True)
-    assert notes == ["no checkpoint to go on from; beginning at the beginning"]
+def test_resume_without_a_training_begins_one(sets, recipe, tmp_path, whole, caplog):
+    caplog.set_level("INFO", "cpunet")
+    work(sets, recipe, tmp_path / "run", resume=True)
+    assert caplog.messages == ["no checkpoint to go on from; beginning at the beginning"]
     assert content(tmp_path / "run") == whole
 
 
@@ -298,30 +297,33 @@ def test_another_recipe_or_seed(sets, recipe, tiny, out, whole):
     with pytest.raises(
         CpunetError, match=r"^resumed with another recipe: training\.batch_size 4 → 5; give"
     ):
-        work(sets, other, out, [], resume=True)
+        work(sets, other, out, resume=True)
     with pytest.raises(CpunetError, match=r"^resumed with another seed: 3 → 4; give"):
-        work(sets, recipe, out, [], resume=True, seed=4)
+        work(sets, recipe, out, resume=True, seed=4)
     assert content(beside(out)).keys() == before
-    work(sets, recipe, out, [], resume=True)
+    work(sets, recipe, out, resume=True)
     assert content(out) == whole
 
 
-def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole):
+def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole, caplog):
     out = tmp_path / "run"
-    work(sets, recipe, out, notes := [], disk=3000)
-    (note,) = notes
-    assert note.startswith(f"warning: {beside(out)}: no checkpoint after 4 iterations (")
+    work(sets, recipe, out, disk=3000)
+    (note,) = caplog.messages
+    assert note.startswith(f"{beside(out)}: no checkpoint after 4 iterations (")
     assert note.endswith("; the one before is kept")
     assert content(out) == whole
 
 
 @pytest.mark.thorough
-def test_after_a_full_disk_the_checkpoint_before_it_is_used(sets, recipe, tmp_path, whole):
+def test_after_a_full_disk_the_checkpoint_before_it_is_used(
+    sets, recipe, tmp_path, whole, caplog
+):
+    caplog.set_level("INFO", "cpunet")
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
-        work(sets, recipe, out, [], disk=3000, die=4)
-    work(sets, recipe, out, notes := [], resume=True)
-    assert notes == ["going on after 2 iterations"]
+        work(sets, recipe, out, disk=3000, die=4)
+    work(sets, recipe, out, resume=True)
+    assert caplog.messages[-1:] == ["going on after 2 iterations"]
     assert content(out) == whole
 
 
@@ -342,7 +344,7 @@ def test_a_training_that_cannot_be_put_in_place_is_kept(tmp_path):
 
 def test_what_never_had_a_checkpoint_leaves_nothing(sets, recipe, tmp_path):
     with pytest.raises(Interrupted):
-        work(sets, recipe, tmp_path / "run", [], die=0)
+        work(sets, recipe, tmp_path / "run", die=0)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,6 +8,7 @@ search ends when the physics no longer changes.
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -28,7 +29,8 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import ResponseProblem
 from cpunet.training.response_starts import start_response
 
-Note = Callable[[str], None]
+log = logging.getLogger(__name__)
+
 OtherChain = Callable[[JointProblem, PulseSets, MatchingConfig], ElectronicsResponse | None]
 
 ROUNDS, STEPS, FIRST_STEPS = 8, 12, 20
@@ -120,8 +122,6 @@ class Search:
         Deviations from further knowledge of the coordinates.
     free
         Positions of the free parameters. None for those that the data determine.
-    note
-        Called with a message in each round.
     """
 
     simulator: Simulator
@@ -131,7 +131,6 @@ class Search:
     given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     known: Callable[[Values], Values] = lambda _: np.empty(0)
     free: list[int] | None = None
-    note: Note = lambda _: None
 
     def __post_init__(self) -> None:
         self._bands = self.sets.bands()
@@ -237,7 +236,7 @@ class Search:
                 there = nearby.moved(nearby.centre + move)
                 break
             except CpunetError as error:  # for example, if the detector is not depleted
-                self.note(f"{error}; going half as far")
+                log.info(f"{error}; going half as far")
                 move = 0.5 * move
         else:
             raise CpunetError(
@@ -338,7 +337,7 @@ class Search:
                 value = values[nuisance.name]
                 slope = nuisance.slope(physics.nominal(nuisance), value)
                 told.append(f"{nuisance.name} {value:.4g} ± {slope * error:.2g}")
-        self.note(", ".join(told))
+        log.info(", ".join(told))
 
 
 def _scale(problem: JointProblem, chi_square: float) -> float:

@@ -14,12 +14,10 @@ from cpunet.analysis.calibration_figures import calibration_figures
 from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
-from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json, read_settings
@@ -58,7 +56,7 @@ class CalibratedRun(Run):
                 "cpunet.Run.load, or calibrate"
             )
         content = read_json(folder / CALIBRATION, "calibrate again")
-        return cls(folder, info, tuple(content.get("notes", ())), content)
+        return cls(folder, info, content)
 
     @property
     def physics(self) -> dict[str, dict[str, Any]]:
@@ -116,7 +114,6 @@ def calibrate(
     events: int = 3000,
     seed: int = 0,
     force: bool = False,
-    progress: bool | Monitor = True,
 ) -> CalibratedRun:
     """Fit detector and readout together, and train on the resulting simulation.
 
@@ -148,8 +145,6 @@ def calibrate(
         Seed of all random numbers.
     force
         Whether to replace an output that this program wrote earlier.
-    progress
-        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -161,7 +156,6 @@ def calibrate(
     CpunetError
         If an argument cannot be used, or the data are of another detector.
     """
-    monitor = shown(progress)
     known = detector if isinstance(detector, Detector | None) else read_detector(str(detector))
     start = Start(
         sim=None if isinstance(sim, HitFile) else as_input(sim, "sim"),
@@ -179,5 +173,5 @@ def calibrate(
         events=events,
         seed=seed,
     )
-    content = job.run(Path(out), force=force, monitor=monitor)
-    return CalibratedRun(Path(out), read_info(Path(out)), tuple(monitor.notes), content)
+    content = job.run(Path(out), force=force)
+    return CalibratedRun(Path(out), read_info(Path(out)), content)

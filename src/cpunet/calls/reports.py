@@ -16,11 +16,9 @@ from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS, VALUES
 from cpunet.calls.given import File, as_input
-from cpunet.calls.progress import shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.compare import read_metrics
 from cpunet.jobs.validation.drawings import Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
@@ -43,8 +41,6 @@ class Report:
         Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
     folder
         Folder of the report; None if none was written.
-    notes
-        Notes of the job.
     drawn
         Functions that draw the figures, by name; none for a report that was opened.
     """
@@ -52,7 +48,6 @@ class Report:
     metrics: Mapping[str, Any]
     values: Mapping[str, ByMethod]
     folder: Path | None
-    notes: tuple[str, ...]
     drawn: Mapping[str, Drawing]
 
     @classmethod
@@ -76,7 +71,7 @@ class Report:
             raise CpunetError(
                 f"{Path(folder) / VALUES}: cannot be read ({error}); validate again"
             ) from error
-        return cls(metrics, values, Path(folder), (), {})
+        return cls(metrics, values, Path(folder), {})
 
     @property
     def scores(self) -> list[dict[str, Any]]:
@@ -181,7 +176,6 @@ def validate(
     ae_range_kev: tuple[float, float] | None = None,
     device: str = "auto",
     force: bool = False,
-    progress: bool | Monitor = True,
 ) -> Report:
     """Score a run on simulated and measured pulses, peak by peak.
 
@@ -205,8 +199,6 @@ def validate(
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
     force
         Whether to replace an output that this program wrote earlier.
-    progress
-        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -218,7 +210,6 @@ def validate(
     CpunetError
         If an argument cannot be used, or no peak can be scored.
     """
-    monitor = shown(progress)
     found, drawn = validated(
         folder_of(run),
         as_input(sim, "sim"),
@@ -228,11 +219,10 @@ def validate(
             None if truth is None else Path(truth), rivals, seed, ae_range_kev, device=device
         ),
         force=force,
-        monitor=monitor,
     )
     values = {peak: of_peak for peak, of_peak in found.values.items() if of_peak}
     where = None if out is None else Path(out)
-    return Report(found.metrics, values, where, tuple(monitor.notes), drawn)
+    return Report(found.metrics, values, where, drawn)
 
 
 def _number(value: float | None) -> str:

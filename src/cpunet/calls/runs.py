@@ -16,9 +16,7 @@ from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.response_figure import response_figure
 from cpunet.analysis.run_figures import loss_curves
 from cpunet.calls.given import File, as_input, as_recipe
-from cpunet.calls.progress import shown
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
@@ -42,13 +40,10 @@ class Run:
         Folder of the run.
     info
         The content of its ``run.json``.
-    notes
-        Notes of the training.
     """
 
     folder: Path
     info: Mapping[str, Any]
-    notes: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, folder: str | Path) -> Run:
@@ -197,7 +192,6 @@ def train(
     init: Run | str | Path | None = None,
     resume: bool = False,
     force: bool = False,
-    progress: bool | Monitor = True,
 ) -> Run:
     """Learn the translation from simulated and measured pulses, unpaired.
 
@@ -224,8 +218,6 @@ def train(
         Whether to resume an unfinished training of a network.
     force
         Whether to replace an output that this program wrote earlier.
-    progress
-        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -237,7 +229,6 @@ def train(
     CpunetError
         If an argument cannot be used; the message is one line that says what to do.
     """
-    monitor = shown(progress)
     start = init.folder if isinstance(init, Run) else init
     info = train_run(
         as_input(sim, "sim"),
@@ -245,9 +236,8 @@ def train(
         Path(out),
         as_recipe(recipe, settings),
         TrainOptions(peak, seed, device, None if start is None else Path(start), resume, force),
-        monitor=monitor,
     )
-    return Run(Path(out), info, tuple(monitor.notes))
+    return Run(Path(out), info)
 
 
 def folder_of(run: Run | str | Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,13 +19,12 @@ from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.style import COLOURS, styled
 from cpunet.calls.given import File, as_input
-from cpunet.calls.progress import NotesKept, shown
 from cpunet.calls.runs import Run, folder_of
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
@@ -32,6 +32,8 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.learned_remains import NONE
 from cpunet.translation.output_form import Formed
+
+log = logging.getLogger(__name__)
 
 MAX_BINS = 49
 DRAWN = 50  # pulses in a figure
@@ -53,8 +55,6 @@ class Translation:
         Whether the pulses are raw traces in ADC counts instead of normalised windows.
     path
         The file they were written to; None if they are in memory only.
-    notes
-        Notes of the job.
     kept
         The pulses and the codes of their rejections if they are in memory.
     """
@@ -64,7 +64,6 @@ class Translation:
     recipe: Recipe
     adc: bool = False
     path: Path | None = None
-    notes: tuple[str, ...] = ()
     kept: tuple[Pulses, Codes] | None = None
 
     @cached_property
@@ -177,7 +176,6 @@ def translate(
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
-    progress: bool | Monitor = True,
 ) -> Translation:
     """Make simulated pulses look measured, or with `inverse` the other way round.
 
@@ -208,8 +206,6 @@ def translate(
         Whether to keep an existing file that was made from this input, run and options.
     force
         Whether to replace an existing file.
-    progress
-        Whether to show bars in a notebook or on a terminal; or a monitor of your own.
 
     Returns
     -------
@@ -231,10 +227,9 @@ def translate(
         remains=remains,
         pile_up_khz=pile_up_khz,
     )
-    monitor = shown(progress)
     job = FileTranslation(folder_of(run), options, device)
-    for note in job.notes:
-        monitor.note(note)
+    for doubt in job.doubts:
+        log.warning(doubt)
     made = Translation(job.run, {}, job.translator.recipe, adc=wanted is not None)
     if isinstance(pulses, Pulses):
         if out is not None:
@@ -242,25 +237,25 @@ def translate(
                 f"{out}: pulses in memory stay there; leave out the file, or write them with "
                 "cpunet.pulses.writing.write_pulses and give that file"
             )
-        return _in_memory(job, made, pulses, monitor)
+        return _in_memory(job, made, pulses)
     source = as_input(pulses, "pulses")
     if out is None:
-        return _in_memory(job, made, source, monitor)
-    counts = job(source, Path(out), resume=resume, force=force, monitor=monitor)
-    return replace(made, counts=counts, path=Path(out), notes=tuple(monitor.notes))
+        return _in_memory(job, made, source)
+    counts = job(source, Path(out), resume=resume, force=force)
+    return replace(made, counts=counts, path=Path(out))
 
 
 def _in_memory(
-    job: FileTranslation, made: Translation, given: Pulses | InputFile, monitor: NotesKept
+    job: FileTranslation, made: Translation, given: Pulses | InputFile
 ) -> Translation:
     pulses = given if isinstance(given, Pulses) else job.opened(given).read()
     if not len(pulses):
         raise CpunetError("there are no pulses to translate; give some")
     formed: list[Formed] = []
-    with monitor.stage("Translating", len(pulses)) as advance:
+    with stage("Translating", len(pulses)) as bar:
         for block in job.blocks([pulses]):
             formed.append(block)
-            advance(len(block.codes) // (job.options.realisations or 1))
+            bar.update(len(block.codes) // (job.options.realisations or 1))
     codes = np.concatenate([block.codes for block in formed])
     accepted = int((codes == Rejection.ACCEPTED).sum())
     reasons = Counter(Rejection(int(code)).label for code in codes if code)
@@ -278,7 +273,7 @@ def _in_memory(
     if made.adc:
         counts["saturated"] = int(sum(block.saturated.sum() for block in formed))
     whole = Pulses.concatenate([block.pulses for block in formed])
-    return replace(made, counts=counts, kept=(whole, codes), notes=tuple(monitor.notes))
+    return replace(made, counts=counts, kept=(whole, codes))
 
 
 def named_axis(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.simulate import HitFrame
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -169,11 +169,11 @@ def calibrate(
         seed=seed,
     )
     if plan:
-        for line in plan_lines(job.plan(out_folder, force=force, monitor=monitor())):
+        for line in plan_lines(job.plan(out_folder, force=force)):
             tell(line)
         return
     assert out_folder is not None
-    content = job.run(out_folder, force=force, monitor=monitor())
+    content = job.run(out_folder, force=force)
     for line in result_lines(content):
         tell(f"{out_folder}: {line}")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, out, tell
+from cpunet.cli.messages import out, tell
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -59,7 +59,7 @@ def check(
         if isinstance(pair, CpunetError):
             checked = Checked.refused("sim", pair)
         else:
-            checked = check(*pair, chosen, on.peak, monitor())
+            checked = check(*pair, chosen, on.peak)
         picture = out_file
         if name:
             tell(f"{name}:")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import Events, Kind, KindOption, Preset
 from cpunet.cli.values import wanted_events
@@ -61,7 +61,6 @@ def demo(
         seed=seed,
         device=device,
         force=force,
-        monitor=monitor(),
     )
     print_scores(metrics, leave_out=("FEP",))
     tell(f"{out_folder / 'report' / 'report.html'}")

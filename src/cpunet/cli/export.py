@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 
 
@@ -85,7 +85,6 @@ def export(
         inverse=inverse,
         report=report,
         force=force,
-        monitor=monitor(),
     )
     files = [done.graph, done.card] + ([done.noise] if done.noise else [])
     tell(f"{', '.join(map(str, files))}: within {done.difference:.1e} of the run")
@@ -109,7 +108,6 @@ def _legend_pars(
         report=report,
         library=library,
         force=force,
-        monitor=monitor(),
     )
     ((name, whole),) = told.items()
     two = whole["electronics"]["equivalent"]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.outputs import refuse_inputs
 
 DetectorFile = Annotated[
@@ -46,7 +46,6 @@ def fields(
         impurity_from=impurity_from.value,
         paths=paths,
         force=force,
-        monitor=monitor(),
     )
     width = max(map(len, told))
     for name, value in told.items():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, note, tell
+from cpunet.cli.messages import tell
+
+log = logging.getLogger(__name__)
 
 import_ = typer.Typer(
     help="Published weights become a run, pickled pulses an LH5 file; nothing is executed.",
@@ -58,7 +61,6 @@ def weights(
         dt_ns=dt,
         peak=peak,
         force=force,
-        monitor=monitor(),
     )
     tell(f"{out_folder}: a run of {', '.join(info['imported'])}")
 
@@ -78,12 +80,10 @@ def pulses(
     """
     from cpunet.jobs.training.import_published import import_pulses
 
-    told = import_pulses(
-        source, out_file, dt_ns=dt, table=table, units=units, force=force, monitor=monitor()
-    )
+    told = import_pulses(source, out_file, dt_ns=dt, table=table, units=units, force=force)
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
     tell(f"{out_file}: {told['written']} of {told['read']} pulses{rejected}")
     if told["truncated"]:
-        note(
+        log.info(
             f"{source}: ends within a pulse or is damaged there; what was before it is written"
         )

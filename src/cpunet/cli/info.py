@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,11 +13,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import tell, warn
+from cpunet.cli.messages import tell
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
 from cpunet.outputs import refuse_inputs
+
+log = logging.getLogger(__name__)
 
 Source = Annotated[Path, typer.Argument(help="File of pulses, or run folder.", metavar="FILE")]
 TableName = Annotated[
@@ -89,7 +92,7 @@ def info(
         force=force,
     )
     if told["kind"] == "run" and (wrong := problem(told)):
-        warn(f"{source}: its run.json is {wrong}")
+        log.warning(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
         tell(_tables(told))
         tell("one of them: --table NAME; each in full: --table all")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -156,7 +156,6 @@ def make(
         grid_mm=grid_mm,
         angles_deg=tuple(map(int, degrees)),
         force=force,
-        monitor=monitor(),
     )
     tell(
         f"{out_file}: {counts['written']} of {counts['templates']} places have a template; "
@@ -201,7 +200,6 @@ def translate(
         currents=currents,
         device=device,
         force=force,
-        monitor=monitor(),
     )
     rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
     tell(
@@ -281,7 +279,6 @@ def _for_simflow(
         detectors=detectors or (),
         rings=rings,
         rank=low_rank,
-        monitor=monitor(),
         **more,
     )
     for name, one in told.items():

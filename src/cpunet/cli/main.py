@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from typing import Annotated
@@ -20,7 +21,7 @@ from cpunet.cli.fields import fields
 from cpunet.cli.import_weights import import_
 from cpunet.cli.info import info
 from cpunet.cli.library import library
-from cpunet.cli.messages import out, warn
+from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
@@ -29,6 +30,8 @@ from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.installation import other_package
+
+log = logging.getLogger(__name__)
 
 DEBUG = "--debug"
 
@@ -88,13 +91,14 @@ def main() -> None:
     end = words.index("--") if "--" in words else len(words)  # then names only
     debug = DEBUG in words[:end]  # known wherever it stands, also before anything is imported
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
-        share_the_machine()
-        if clash := other_package():
-            warn(clash)
-        status = app(words, standalone_mode=False)
-    except BaseException as error:
-        status = ended_with(error, words, debug=debug)
+    with messages_to_stderr():
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, stop)
+            share_the_machine()
+            if clash := other_package():
+                log.warning(clash)
+            status = app(words, standalone_mode=False)
+        except BaseException as error:
+            status = ended_with(error, words, debug=debug)
     sys.exit(status or 0)

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+import logging
+import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
-from cpunet.jobs.common.monitor import Advance, Monitor
-
 # in FILE:key:, a picture would replace key
 out, err = Console(emoji=False), Console(emoji=False, stderr=True)
-
-LOG_EVERY_S = 30.0  # between lines of progress in a log file
 
 
 def tell(result: str | Table) -> None:
@@ -39,14 +28,30 @@ def fail(message: str) -> None:
     err.print(Text.assemble(("error:", "bold red"), " ", _one_line(message)), soft_wrap=True)
 
 
-def warn(message: str) -> None:
-    """Print a warning as one line."""
-    err.print(Text.assemble(("warning:", "bold"), " ", _one_line(message)), soft_wrap=True)
+class _Lines(logging.Formatter):
+    """One line for each record, which begins with its level if that is a warning or more."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = _one_line(super().format(record))
+        if record.levelno < logging.WARNING:
+            return line
+        level = f"{record.levelname.lower()}:"
+        return f"\033[1m{level}\033[0m {line}" if err.is_terminal else f"{level} {line}"
 
 
-def note(message: str) -> None:
-    """Print one line on stderr."""
-    err.print(_one_line(message), markup=False, highlight=False, soft_wrap=True)
+@contextmanager
+def messages_to_stderr() -> Iterator[None]:
+    """Print records of this package within the context, from level INFO up."""
+    logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines())
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
 
 
 def _print_table(table: Table) -> None:
@@ -71,94 +76,6 @@ def _print_table(table: Table) -> None:
         spare -= 0 if spare < 0 else more
     whole = out.width - room + sum(column.width or 0 for column in table.columns)
     Console(emoji=False, file=out.file, width=max(out.width, whole)).print(table)
-
-
-def monitor() -> Monitor:
-    """Progress bars on a terminal, now and then a line in a batch job's log."""
-    return BarMonitor() if err.is_terminal else LogMonitor()
-
-
-class BarMonitor(Monitor):
-    """A bar per stage with count, rate, and elapsed and remaining time."""
-
-    def __init__(self) -> None:
-        self._show: Callable[[str], None] = lambda _text: None
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Show a bar while the stage lasts."""
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TextColumn("{task.fields[state]}", markup=False),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=err) as progress:
-            task = progress.add_task(title, total=total, rate="", state="")
-            self._show = lambda text: progress.update(task, state=text)
-            start, done = time.monotonic(), 0
-
-            def advance(steps: int) -> None:
-                nonlocal done
-                done += steps
-                rate = f"{done / (time.monotonic() - start):.3g}/s"
-                most = None if total is None else max(done, total)
-                progress.update(task, advance=steps, rate=rate, total=most)
-
-            yield advance
-            if total is not None:
-                progress.update(task, completed=max(done, total))
-
-    def state(self, text: str) -> None:
-        """Show a text beside the bar."""
-        self._show(text)
-
-    def note(self, message: str) -> None:
-        """Print a line."""
-        note(message)
-
-
-class LogMonitor(Monitor):
-    """A line at the end of each stage, and every `LOG_EVERY_S` seconds in a long one."""
-
-    def __init__(self) -> None:
-        self._state = ""
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Print lines while the stage lasts."""
-        start = last = time.monotonic()
-        done = 0
-
-        def advance(steps: int) -> None:
-            nonlocal done, last
-            done += steps
-            now = time.monotonic()
-            if now - last >= LOG_EVERY_S:
-                last = now
-                rate = done / (now - start)
-                left = (
-                    f", {(total - done) / rate:.0f} s left"
-                    if total and 0 < done < total
-                    else ""
-                )
-                state = f", {self._state}" if self._state else ""
-                note(f"{title}: {done}/{total or '?'}, {rate:.3g}/s{left}{state}")
-
-        self._state = ""
-        yield advance
-        note(f"{title}: done in {time.monotonic() - start:.1f} s")
-
-    def state(self, text: str) -> None:
-        """Keep a text for the next line."""
-        self._state = text
-
-    def note(self, message: str) -> None:
-        """Print a line."""
-        note(message)
 
 
 def _one_line(text: str) -> str:

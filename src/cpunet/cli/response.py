@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,9 +13,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell, warn
+from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
+
+log = logging.getLogger(__name__)
 
 Stand = Annotated[
     Path | None, typer.Option("--stand", help="Test stand of the data: compare with its truth.")
@@ -74,7 +77,7 @@ def response(
         truth = stand_electronics(stand)
     elif electronics is not None:
         truth = read_electronics(electronics)
-    told = describe_responses(runs, truth=truth, out=out_folder, force=force, monitor=monitor())
+    told = describe_responses(runs, truth=truth, out=out_folder, force=force)
     if out_folder is None:
         tell(response_table(told))
     else:
@@ -82,7 +85,7 @@ def response(
         tell(f"{out_folder / 'response.png'}")
     for run in told["runs"]:
         for doubt in run["doubts"]:
-            warn(f"{Path(run['path']).name}: {doubt}")
+            log.warning(f"{Path(run['path']).name}: {doubt}")
 
 
 def response_table(told: dict[str, Any]) -> Table:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.values import parse_events, parse_numbers, parse_resolution
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -279,7 +279,6 @@ def simulate(
         resolution=parse_resolution(resolution),
         seed=seed,
         force=force,
-        monitor=monitor(),
     )
     for line in summary_lines(summary):
         tell(f"{out_file}: {line}")

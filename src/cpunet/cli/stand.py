@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.values import wanted_events
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -135,7 +135,6 @@ def stand(
         settings=read_settings(SimulationSettings, settings_file, values),
         seed=seed,
         force=force,
-        monitor=monitor(),
     )
     for line in _lines(summary):
         tell(f"{out_folder}: {line}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 import signal
 from pathlib import Path
@@ -12,9 +13,10 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
-from cpunet.cli.messages import fail, monitor, tell
-from cpunet.jobs.common.monitor import Monitor
+from cpunet.cli.messages import fail, tell
 from cpunet.outputs import refuse_inputs
+
+log = logging.getLogger(__name__)
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 Resume = Annotated[
@@ -60,11 +62,10 @@ def train(
     refuse_inputs(out_folder, on.recipe)
     if threads is not None:
         use_threads(threads)
-    shown = monitor()
     chosen = on.load()
     every = read_as.data_table == ALL
     work = train_channels if every else train_run
-    with _StopRequest(shown) as stop:
+    with _StopRequest() as stop:
         try:
             told = work(
                 read_as.sim(sim),
@@ -73,7 +74,6 @@ def train(
                 chosen,
                 TrainOptions(on.peak, seed, device, init, resume, force),
                 stop=stop,
-                monitor=shown,
             )
         except StoppedError as stopped:
             fail(str(stopped))
@@ -85,7 +85,7 @@ def train(
     words = ["cpunet", "validate", out_folder, "--sim", sim, "--data", data, "--out"]
     report = out_folder.with_name(f"{out_folder.name}-report")
     of_all = ["--data-table", ALL] if every else []
-    shown.note(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
+    log.info(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
 
 
 def _in_words(info: dict[str, Any]) -> str:
@@ -98,9 +98,8 @@ class _StopRequest:
     A second signal, or one before anyone asks whether to stop, acts as it did before.
     """
 
-    def __init__(self, shown: Monitor) -> None:
+    def __init__(self) -> None:
         self.signal = 0
-        self._shown = shown
         self._asked = False
         self._before: dict[int, signal._HANDLER] = {}
 
@@ -124,4 +123,4 @@ class _StopRequest:
             signal.raise_signal(number)
             return
         self.signal = number
-        self._shown.note("stopping after this iteration; once more to stop at once")
+        log.info("stopping after this iteration; once more to stop at once")

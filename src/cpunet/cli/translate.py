@@ -11,7 +11,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
@@ -186,7 +186,6 @@ def translate(
         inverse, noise, seed, out_table, realisations, adc, remains, pile_up_khz
     )
     how: dict[str, Any] = {"device": device, "resume": resume, "force": force}
-    how["monitor"] = monitor()
     if table == ALL:
         if len(files) > 1:
             raise CpunetError(f"--table {ALL} belongs to one file, not to {len(files)}")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cpunet.cli import options
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.outputs import refuse_inputs
 
 Out = Annotated[Path, typer.Option("--out", help="Folder of the search, to make or continue.")]
@@ -51,7 +51,6 @@ def tune(
         peak=on.peak,
         seed=seed,
         device=device,
-        monitor=monitor(),
     )
     best = study.best_trial
     values = ", ".join(f"{key} {value}" for key, value in best.params.items())

@@ -9,7 +9,7 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
-from cpunet.cli.messages import monitor, tell
+from cpunet.cli.messages import tell
 from cpunet.cli.scores import print_scores
 from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
@@ -72,7 +72,6 @@ def validate(
         out_folder,
         ValidateOptions(scored.truth, scored.fitted, seed, span, most, device),
         force=force,
-        monitor=monitor(),
     )
     if isinstance(metrics, Outcome):
         tell(f"{out_folder / INDEX}")

@@ -8,7 +8,6 @@ from typing import Any
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
 from cpunet.jobs.simulation.hit_sources import energy_windows
 from cpunet.jobs.simulation.stand import write_stand
@@ -22,7 +21,6 @@ from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.simulation.geometry import Detector
 
-QUIET = Monitor()
 _PEAK = "FEP"  # peak of the training
 _HALF_WINDOW_KEV = 0.5  # half-width of the deposited energies around each line
 
@@ -38,7 +36,6 @@ def demonstrate(
     seed: int = 0,
     device: str = "auto",
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Make a stand, train on its FEP, and score every method on all its lines.
 
@@ -55,7 +52,7 @@ def demonstrate(
         with the same options are kept.
     force
         Whether to make all parts again.
-    seed, device, monitor
+    seed, device
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
@@ -82,7 +79,7 @@ def demonstrate(
         remove_parts(out)
     require_same_parts(out, plan, recipe, _PEAK)
     if not is_there(out, "stand"):
-        write_stand(plan, stand, monitor=monitor)
+        write_stand(plan, stand)
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     if not is_there(out, "run"):
         train_run(
@@ -98,7 +95,6 @@ def demonstrate(
                 resume=isinstance(recipe.training, TrainingConfig) and not force,
                 force=force,
             ),
-            monitor=monitor,
         )
     return validate_run(
         run,
@@ -106,5 +102,4 @@ def demonstrate(
         data,
         report,
         ValidateOptions(stand / "truth.npz", seed=seed, device=device),
-        monitor=monitor,
     )

@@ -7,6 +7,7 @@ output folder.  Every process that is given the same folder works on the same se
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,10 +30,10 @@ from cpunet.jobs.common.inputs import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides, match
 from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.outputs import refuse_inputs, written_aside
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
@@ -49,7 +50,8 @@ from cpunet.translation.translator import REN
 if TYPE_CHECKING:
     from optuna import Study, Trial
 
-QUIET = Monitor()
+log = logging.getLogger(__name__)
+
 TRIALS = 30
 JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
 STARTS = 8  # random trials before the first Gaussian process
@@ -71,7 +73,6 @@ def tune_recipe(
     peak: str = "FEP",
     seed: int = 0,
     device: str = "auto",
-    monitor: Monitor = QUIET,
 ) -> Study:
     """Search for the settings that translate held-out pulses of the training's energies best.
 
@@ -88,8 +89,6 @@ def tune_recipe(
         Total number of trials, including completed and failed ones.
     seed
         Seed of the split into fitted and held-out pulses, of all trainings, and of the search.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -115,8 +114,8 @@ def tune_recipe(
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
-    simulated = load_simulated(sim, recipe, selection, monitor)
-    measured = load_measured(data, recipe, selection, monitor)
+    simulated = load_simulated(sim, recipe, selection)
+    measured = load_measured(data, recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, data, recipe, seed)
@@ -151,19 +150,19 @@ def tune_recipe(
             return held_out.score(held_out.train(with_values(recipe, values), seed, device))
         except CpunetError as error:
             trial.set_user_attr(REASON, str(error))
-            monitor.note(f"trial {trial.number} failed: {error}")
+            log.info(f"trial {trial.number} failed: {error}")
             raise
 
     done = len(study.get_trials(states=states))
-    with monitor.stage("Trials", trials) as advance:
-        advance(done)
+    with stage("Trials", trials) as bar:
+        bar.update(done)
         if done < trials:
             study.optimize(
                 objective,
                 catch=CpunetError,
                 callbacks=[
                     optuna.study.MaxTrialsCallback(trials, states),
-                    lambda *_: advance(1),
+                    lambda *_: bar.update(1),
                 ],
             )
     _write(out, study, recipe, space)
@@ -358,9 +357,9 @@ class HeldOut:
         """
         model: nn.Module
         if isinstance(recipe.training, MatchingConfig):
-            model, _, recipe = match(self.fit, recipe, seed, lambda *_step: None, QUIET)
+            model, _, recipe, *_ = match(self.fit, recipe, seed, lambda *_step: None)
         else:
-            outside, _ = outside_noise(self.fit, recipe, QUIET)
+            outside, _ = outside_noise(self.fit, recipe)
             sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
             model = train(*sides, recipe, seed=seed, device=device, outside=outside)
         info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}

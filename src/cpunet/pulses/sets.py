@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -49,6 +50,10 @@ class Source(Protocol):
     def path(self) -> Path:
         """Path of the file, for messages."""
 
+    @property
+    def n_pulses(self) -> int | None:
+        """Number of pulses; None if it is unknown without reading the whole file."""
+
     def blocks(self, size: int, /) -> Iterator[Pulses]:
         """The file's pulses in order, at most `size` at a time."""
 
@@ -61,7 +66,6 @@ def load_prepared(
     select: Select | None = None,
     peaks: PeakNames | None = None,
     most: int | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> Prepared:
     """Read, select, prepare and collect the pulses of a file.
 
@@ -79,8 +83,6 @@ def load_prepared(
     most
         Maximum number of accepted pulses to keep.  If there are more, a random sample of them
         is kept, always the same for the same file.  This bounds the memory.
-    progress
-        Function called after each block with the number of pulses read since the last call.
 
     Returns
     -------
@@ -95,16 +97,16 @@ def load_prepared(
     sets: list[Prepared] = []
     n_read = n_kept = 0
     rng, drawn = np.random.default_rng(0), list[FloatColumn]()
-    for block in source.blocks(BLOCK_SIZE):
-        part = _prepare_selected(block, config, kind, select, peaks, n_read)
-        n_read += len(block)
-        n_kept += len(part)
-        sets.append(part)
-        drawn.append(rng.random(len(part)))
-        if most is not None and n_kept > 1.5 * most:
-            n_kept = _thin(sets, drawn, most)
-        if progress is not None:
-            progress(len(block))
+    with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
+        for block in source.blocks(BLOCK_SIZE):
+            part = _prepare_selected(block, config, kind, select, peaks, n_read)
+            n_read += len(block)
+            n_kept += len(part)
+            sets.append(part)
+            drawn.append(rng.random(len(part)))
+            if most is not None and n_kept > 1.5 * most:
+                n_kept = _thin(sets, drawn, most)
+            bar.update(len(block))
     if not n_kept:
         raise CpunetError(_nothing_left(source, sets))
     if most is not None and n_kept > most:

@@ -14,13 +14,13 @@ from cpunet.pulses.container import Pulses
 from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import Progress, build_library
+from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import Task, drift_task, hit_table, point_signal
 from cpunet.simulation.velocity import FloatArray
 
-# Events between two calls of `progress`.
+# Events summed at once.
 _BLOCK = 2000
 # Events per task of a thread.
 _CHUNK = 25
@@ -80,7 +80,6 @@ def simulate_events(
     hits: Hits,
     settings: SimulationSettings,
     mode: Literal["exact", "library"] = "exact",
-    progress: Progress | None = None,
     library: Library | None = None,
 ) -> EventPulses:
     r"""Simulate the pulse of each event, in parallel over the events.
@@ -102,8 +101,6 @@ def simulate_events(
     mode
         ``"exact"`` drifts every hit. ``"library"`` interpolates between pre-computed pulses
         and drifts only the hits where these are not accurate enough.
-    progress
-        Called regularly with the numbers of completed events and of all events.
     library
         Pre-computed pulses for the same fields and settings; built if None.
 
@@ -132,8 +129,6 @@ def simulate_events(
             _sum_exact(maps, table, offsets, task, *sums)
         else:
             _sum_library(maps, library, table, offsets, task, *sums)
-        if progress:
-            progress(end, n)
     energy = hits.energy_kev
     return EventPulses(
         waveforms=waveforms,

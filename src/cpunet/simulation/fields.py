@@ -9,7 +9,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import DITCH, LI_CONTACT, Detector, FloatArray, RegionArray
 from cpunet.simulation.grid import Grid, point_types
-from cpunet.simulation.superposition import Progress, Superposition, solve
+from cpunet.simulation.superposition import Superposition, solve
 
 _V_PER_CM = 10.0  # of 1 V / mm
 
@@ -38,16 +38,14 @@ class FieldMaps:
     depletion_V: float
 
 
-def compute_fields(
-    detector: Detector, *, cache: bool = True, progress: Progress | None = None
-) -> FieldMaps:
+def compute_fields(detector: Detector, *, cache: bool = True) -> FieldMaps:
     """Solve for the fields of a fully depleted detector, or load them from the cache.
 
     Parameters
     ----------
     detector
         Geometry, impurities and bias.
-    cache, progress
+    cache
         See `cpunet.simulation.superposition.solve`.
 
     Raises
@@ -55,7 +53,7 @@ def compute_fields(
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    solution = solve(detector, cache=cache, progress=progress)
+    solution = solve(detector, cache=cache)
     return superposed_fields(
         solution,
         bias_V=detector.bias_V,

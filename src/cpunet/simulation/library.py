@@ -8,10 +8,10 @@ fail are later drifted individually.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
+from cpunet.progress import Stage, stage
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps
 from cpunet.simulation.library_drift import (
     MARGIN_NS,
@@ -25,35 +25,18 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import EXACT, WHOLE_ON_AVERAGE, Task, drift_task
 from cpunet.simulation.velocity import FloatArray
 
-Progress = Callable[[int, int], None]
-
 # Energies of the pulses of a self-repelling cloud: Chebyshev points in the squared width.
 _ENERGIES_KEV = (0.0, 430.0, 1820.0, 2700.0)
-# Grid points between two calls of `progress`.
+# Grid points drifted at once.
 _BLOCK = 256
 _CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 
 
-class _Meter:
-    """Count completed grid points. Their total grows as cells are halved."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self._progress = progress
-        self._done = self._total = 0
-
-    def blocks(self, n: int) -> list[slice]:
-        self._total += n
-        return [slice(b, min(b + _BLOCK, n)) for b in range(0, n, _BLOCK)]
-
-    def add(self, block: slice) -> None:
-        self._done += block.stop - block.start
-        if self._progress:
-            self._progress(self._done, self._total)
+def _blocks(n: int) -> list[slice]:
+    return [slice(b, min(b + _BLOCK, n)) for b in range(0, n, _BLOCK)]
 
 
-def build_library(
-    fields: Maps, settings: SimulationSettings, progress: Progress | None = None
-) -> Library:
+def build_library(fields: Maps, settings: SimulationSettings) -> Library:
     """Simulate pulses on an adaptive grid, in parallel.
 
     At the centre of each cell, at azimuths between those of its nodes, the interpolated pulse
@@ -67,25 +50,23 @@ def build_library(
         Field maps of the detector.
     settings
         Simulation settings, including those named `library_...`.
-    progress
-        Called with the numbers of grid points completed and known so far. The latter grows.
     """
     maps, task = drift_maps(fields, settings), _task(fields, settings)
     library = _empty(fields, settings)
-    meter = _Meter(progress)
     size = 2**settings.library_halvings
     nr, nz = library.cell.shape
     cells = size * _lattice(nr // size, nz // size)
-    while size > 0:
-        library = _with_nodes(library, maps, task, _new_corners(library, cells, size), meter)
-        complete, halved = _sorted(library, cells, size)
-        library = _with_cells(library, complete, size)
-        worst = _deviations(library, maps, task, complete + size / 2, meter)
-        bad = complete[worst > settings.library_tolerance]
-        _enter(library.cell, bad, size, np.zeros(len(bad), np.int64))
-        size //= 2
-        cells = np.concatenate([halved, bad])
-        cells = (cells[:, None] + size * _CORNERS).reshape(-1, 2)
+    with stage("Library of pulses") as bar:  # grid points; how many more is not known
+        while size > 0:
+            library = _with_nodes(library, maps, task, _new_corners(library, cells, size), bar)
+            complete, halved = _sorted(library, cells, size)
+            library = _with_cells(library, complete, size)
+            worst = _deviations(library, maps, task, complete + size / 2, bar)
+            bad = complete[worst > settings.library_tolerance]
+            _enter(library.cell, bad, size, np.zeros(len(bad), np.int64))
+            size //= 2
+            cells = np.concatenate([halved, bad])
+            cells = (cells[:, None] + size * _CORNERS).reshape(-1, 2)
     return library
 
 
@@ -144,7 +125,7 @@ def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
 
 
 def _with_nodes(
-    library: Library, maps: DriftMaps, task: Task, places: IntArray, meter: _Meter
+    library: Library, maps: DriftMaps, task: Task, places: IntArray, bar: Stage
 ) -> Library:
     """Add columns of pulses at further grid points (n, 2), given in fine steps."""
     azimuths = len(library.cos4)
@@ -152,7 +133,7 @@ def _with_nodes(
     rows = len(library.energies_kev) * library.phases
     pulses, found = [library.pulses], []
     n_columns = len(library.samples) // azimuths
-    for block in meter.blocks(len(places)):
+    for block in _blocks(len(places)):
         here = places[block]
         scratch = np.empty((len(here) * azimuths, rows, longest), np.float32)
         facts = np.zeros((len(here) * azimuths, 5))
@@ -168,7 +149,7 @@ def _with_nodes(
         within = np.arange(longest) < facts[:, 1, None]
         pulses.append(scratch[np.broadcast_to(within[:, None], scratch.shape)])
         found.append(facts)
-        meter.add(block)
+        bar.update(block.stop - block.start)
     new = np.concatenate([np.zeros((0, 5)), *found])
     samples = np.concatenate([library.samples, new[:, 1].astype(np.int64)])
     return library._replace(
@@ -199,12 +180,12 @@ def _with_cells(library: Library, cells: IntArray, size: int) -> Library:
 
 
 def _deviations(
-    library: Library, maps: DriftMaps, task: Task, places: FloatArray, meter: _Meter
+    library: Library, maps: DriftMaps, task: Task, places: FloatArray, bar: Stage
 ) -> FloatArray:
     worst = np.zeros(len(places))
-    for block in meter.blocks(len(places)):
+    for block in _blocks(len(places)):
         compare(library, maps, task, places[block], worst[block])
-        meter.add(block)
+        bar.update(block.stop - block.start)
     return worst
 
 

@@ -13,6 +13,7 @@ does not hold if part of the detector is not depleted. Such a potential has a po
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from cpunet.simulation.depletion import HIGHEST_BIAS_V, depletion_voltage, has_p
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.grid import Grid, make_grid
 from cpunet.simulation.poisson import Potentials, solve_potentials
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
 
@@ -144,9 +147,7 @@ class Superposition:
         )
 
 
-def solve(
-    detector: Detector, *, cache: bool = True, progress: Progress | None = None
-) -> Superposition:
+def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     """Solve for the parts of a detector's potential, or load them from the cache.
 
     Parameters
@@ -157,8 +158,6 @@ def solve(
         Whether to keep the parts on disk (in ``$CPUNET_CACHE`` or the user's cache folder)
         and to load them if the same detector was solved before, at any bias and any scale and
         tilt of its impurities.
-    progress
-        Called with a short description when each part starts.
 
     Raises
     ------
@@ -171,11 +170,10 @@ def solve(
     )
     if cache and (kept := field_cache.load(key, detector.grid_mm)) is not None:
         return Superposition(unit, *kept)
-    say = progress or (lambda _: None)
     grid = make_grid(unit)
-    say(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
+    log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
     potentials = solve_potentials(unit, grid)
-    say("depletion voltage")
+    log.debug("depletion voltage")
     fixed = potentials.impurities + potentials.surface
     depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     if cache:

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import os
 import pickle
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,6 +43,8 @@ from cpunet.outputs import (
 )
 from cpunet.training.loop import Record, State
 from cpunet.training.run_folder import LOSSES, RUN
+
+log = logging.getLogger(__name__)
 
 FORMAT = 3
 MARKER, CHECKPOINT, ASIDE = "unfinished.json", "checkpoint.pt", ".checkpoint.partial"
@@ -133,8 +136,6 @@ class UnfinishedRun:
         Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …).
     environment
         Facts that may change their last bits: device, threads, version.
-    note
-        Called with messages for the user.
     """
 
     def __init__(
@@ -142,13 +143,11 @@ class UnfinishedRun:
         folder: Path,
         fingerprint: dict[str, Any],
         environment: dict[str, Any],
-        note: Callable[[str], None],
     ) -> None:
         self.folder = folder
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
         self.resumed_at: list[int] = []
         self._fingerprint, self._environment = fingerprint, environment
-        self._note = note
         self._waiting: list[str] = []  # lines of the log, which has so many bytes before them
         self._logged = 0
         self._seconds_before = 0.0
@@ -173,7 +172,7 @@ class UnfinishedRun:
             state = self._take_up(_read(path))
         else:
             if resume:
-                self._note("no checkpoint to go on from; beginning at the beginning")
+                log.info("no checkpoint to go on from; beginning at the beginning")
             path.unlink(missing_ok=True)
         with (self.folder / LOSSES).open("ab") as stream:
             stream.truncate(self._logged)
@@ -189,12 +188,12 @@ class UnfinishedRun:
                     "begun with, or begin again with --force"
                 )
         for difference in differences(then["environment"], self._environment):
-            self._note(f"warning: resumed elsewhere: {difference}; the last bits may differ")
+            log.warning(f"resumed elsewhere: {difference}; the last bits may differ")
         state: State = then["state"]
         self.started, self._seconds_before = then["started"], then["seconds"]
         self.resumed_at = [*then["resumed_at"], state["iteration"]]
         self._logged = then["logged"]
-        self._note(f"going on after {state['iteration']} iterations")
+        log.info(f"going on after {state['iteration']} iterations")
         return state
 
     def log(self, records: Iterable[Record]) -> None:
@@ -227,8 +226,8 @@ class UnfinishedRun:
             aside.replace(self.folder / CHECKPOINT)
         except OSError as error:
             aside.unlink(missing_ok=True)  # free the space on a full disk
-            self._note(
-                f"warning: {self.folder}: no checkpoint after {state['iteration']} iterations "
+            log.warning(
+                f"{self.folder}: no checkpoint after {state['iteration']} iterations "
                 f"({error.strerror or error}); the one before is kept"
             )
 

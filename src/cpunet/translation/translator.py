@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self, TypeVar
@@ -185,7 +184,6 @@ class Translator:
         *,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
         second: SecondPulses | None = None,
     ) -> Translated:
@@ -200,8 +198,6 @@ class Translator:
             and pulses without energy are rejected.
         generator
             Random generator of the noise.
-        progress
-            Function called with the number of pulses completed since the last call.
         remains_kev
             Remains of earlier pulses under each pulse in keV, shape ``(n,)``.
         second
@@ -229,7 +225,6 @@ class Translator:
         waveforms[index], codes[index] = self.apply_with_codes(
             prepared.pulses.waveforms[rows],
             Drawn(pulses.energy_kev, noise, generator, remains_kev, second).of_rows(index),
-            progress,
         )
         return Translated(pulses.with_waveforms(waveforms), codes)
 
@@ -253,18 +248,16 @@ class Translator:
         energy_kev: Energies | None = None,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        progress: Callable[[int], None] | None = None,
         remains_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
         drawn = Drawn(energy_kev, noise, generator, remains_kev)
-        return self.apply_with_codes(windows, drawn, progress)[0]
+        return self.apply_with_codes(windows, drawn)[0]
 
     def apply_with_codes(
         self,
         windows: FloatArray,
         drawn: Drawn,
-        progress: Callable[[int], None] | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Like `apply`, with a `Rejection` for each row."""
         result = np.empty_like(windows)
@@ -273,8 +266,6 @@ class Translator:
             for first in range(0, len(windows), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(windows)))
                 result[rows], codes[rows] = self.backend(windows[rows], drawn.of_rows(rows))
-                if progress is not None:
-                    progress(len(rows))
         return result, codes
 
     def seeded(self, seed: int | None) -> torch.Generator:

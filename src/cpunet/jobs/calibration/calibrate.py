@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -36,19 +37,20 @@ from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
 from cpunet.jobs.common.memory import keep_freed_memory
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.progress import stage
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run_folder import RUN, write_run
 
-QUIET = Monitor()
+log = logging.getLogger(__name__)
+
 CALIBRATION, SIM = "calibration.json", "sim.lh5"
 DPI = 110
 DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
@@ -106,9 +108,7 @@ class Calibration:
         return (*self.start.files, *self.data.files)
 
     @one_thread_for_matrices()
-    def run(
-        self, out: Path, *, force: bool = False, monitor: Monitor = QUIET
-    ) -> dict[str, Any]:
+    def run(self, out: Path, *, force: bool = False) -> dict[str, Any]:
         """Calibrate detector and readout together, and write a run folder of the result.
 
         The folder is a run like those of `cpunet.jobs.training.train.train_run`, and contains
@@ -121,7 +121,7 @@ class Calibration:
         ----------
         out
             Output folder; it appears when it is complete.
-        force, monitor
+        force
             See `cpunet.jobs.training.train.train_run`.
 
         Returns
@@ -138,22 +138,20 @@ class Calibration:
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
         with folder_written_aside(out, RUN, *self.files, force=force) as folder:
-            sides = self._sides(folder, monitor)
-            with monitor.stage("Calibrating") as advance:
-                calibrated = self._search(sides, monitor, lambda: advance(1)).run()
+            sides = self._sides(folder)
+            with stage("Calibrating") as bar:
+                calibrated = self._search(sides, bar.update).run()
             self._require_hope(calibrated, sides)
             content = self._content(calibrated, sides)
             for note in content["notes"]:
-                monitor.note(titled(note))
-            _simulate_calibrated(calibrated, sides, folder, self.seed, monitor)
-            again = load_simulated(
-                InputFile(folder / SIM), self.recipe, sides.selection, monitor
-            )
+                log.info(titled(note))
+            _simulate_calibrated(calibrated, sides, folder, self.seed)
+            again = load_simulated(InputFile(folder / SIM), self.recipe, sides.selection)
             # not stretched: what is off in the drift is for the physics to explain
             training = self.recipe.training.model_copy(update={"drift_terms": 0})
             recipe = self.recipe.model_copy(update={"training": training})
             how = TrainOptions(self.peak, self.seed, "cpu")
-            job = TrainingJob(recipe, how, again, sides.data, self.data, folder, monitor)
+            job = TrainingJob(recipe, how, again, sides.data, self.data, folder)
             model, info, recipe = ResponseTrainer(recipe).train(job, known=calibrated.response)
             info["sim"]["file"] = str(out / SIM)
             info["started"] = started.isoformat(timespec="seconds")
@@ -166,16 +164,14 @@ class Calibration:
         return content
 
     @one_thread_for_matrices()
-    def plan(
-        self, out: Path | None = None, *, force: bool = False, monitor: Monitor = QUIET
-    ) -> dict[str, Any]:
+    def plan(self, out: Path | None = None, *, force: bool = False) -> dict[str, Any]:
         """Forecast how well the pulses constrain the physics, before any fit.
 
         Parameters
         ----------
         out
             Folder for ``plan.json`` and ``plan.png``; None for none.
-        force, monitor
+        force
             See `run`.
 
         Returns
@@ -186,18 +182,18 @@ class Calibration:
         """
         if out is None:
             with tempfile.TemporaryDirectory() as aside:
-                return self._planned(Path(aside), monitor)
+                return self._planned(Path(aside))
         with folder_written_aside(out, PLAN, *self.files, force=force) as folder:
-            content = self._planned(folder, monitor)
+            content = self._planned(folder)
             (folder / "plan.json").write_text(json.dumps(content, indent=1) + "\n")
             figure = directions_figure(content["directions"][str(PLANNED[1])])
             figure.savefig(folder / "plan.png", dpi=DPI)
         return content
 
-    def _planned(self, folder: Path, monitor: Monitor) -> dict[str, Any]:
-        sides = self._sides(folder, monitor)
-        with monitor.stage("Planning") as advance:
-            search = self._search(sides, monitor, lambda: advance(1))
+    def _planned(self, folder: Path) -> dict[str, Any]:
+        sides = self._sides(folder)
+        with stage("Planning") as bar:
+            search = self._search(sides, bar.update)
             information = search.plan()
         sides.forget()
         directions = {
@@ -212,11 +208,11 @@ class Calibration:
             "directions": directions,
         }
 
-    def _sides(self, folder: Path, monitor: Monitor) -> Sides:
+    def _sides(self, folder: Path) -> Sides:
         inputs = self.start, self.data, self.recipe, self.peak, self.events, self.seed
-        return read_sides(*inputs, folder, monitor)
+        return read_sides(*inputs, folder)
 
-    def _search(self, sides: Sides, monitor: Monitor, simulated: Callable[[], None]) -> Search:
+    def _search(self, sides: Sides, simulated: Callable[[], None]) -> Search:
         """The search, ready to start."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
         preparation = self.recipe.preparation
@@ -226,7 +222,7 @@ class Calibration:
             drawn = drawn_like(remains, self.data, sides.data, preparation)
         noise, note = measured_noise(self.data, measured, preparation, remains)
         if note is not None:
-            monitor.note(f"warning: {note}")
+            log.warning(note)
         physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors
         hits = sides.stored.hits[sides.sim.prepared.index]
         rng = np.random.default_rng(self.seed)
@@ -239,7 +235,6 @@ class Calibration:
             given={k: v for k, v in given.items() if k != DEPLETION},
             known=known_depletion(physics, given.get(DEPLETION)),
             free=None if free is None else list(range(len(free))),
-            note=monitor.note,
         )
 
     def _require_hope(self, calibrated: Calibrated, sides: Sides) -> None:
@@ -267,9 +262,7 @@ class Calibration:
         }
 
 
-def _simulate_calibrated(
-    calibrated: Calibrated, sides: Sides, folder: Path, seed: int, monitor: Monitor
-) -> None:
+def _simulate_calibrated(calibrated: Calibrated, sides: Sides, folder: Path, seed: int) -> None:
     """Write the calibrated physics, and all events simulated with it."""
     parameters = calibrated.problem.parameters
     detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
@@ -281,7 +274,6 @@ def _simulate_calibrated(
         settings,
         cluster_mm=0.0,
         seed=seed,
-        monitor=monitor,
     )
     sides.forget()
 

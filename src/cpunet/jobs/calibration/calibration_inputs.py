@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,6 @@ from cpunet.jobs.common.inputs import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
@@ -29,6 +29,8 @@ from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import solve
+
+log = logging.getLogger(__name__)
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
@@ -171,7 +173,6 @@ def read_sides(
     events: int,
     seed: int,
     folder: Path,
-    monitor: Monitor,
 ) -> Sides:
     """Read and prepare both sides; if hits are given, simulate them first.
 
@@ -181,8 +182,6 @@ def read_sides(
         See `cpunet.jobs.calibration.calibrate.Calibration`.
     folder
         Folder for pulses that are simulated only as a starting point.
-    monitor
-        Receiver of the progress.
 
     Raises
     ------
@@ -190,16 +189,16 @@ def read_sides(
         If an input cannot be used.
     """
     selection = parse_selection(peak, recipe.peaks)
-    data = load_measured(data_file, recipe, selection, monitor)
+    data = load_measured(data_file, recipe, selection)
     sim, temporary = start.sim, None
     if sim is None:
         temporary = folder / "as_simulated.lh5"
-        sim = InputFile(_simulated(start, temporary, data.dt_ns, monitor))
+        sim = InputFile(_simulated(start, temporary, data.dt_ns))
     stored = StoredSimulation.read(sim.path)
-    simulated = load_simulated(sim, recipe, selection, monitor)
+    simulated = load_simulated(sim, recipe, selection)
     require_same_sampling(simulated, data)
     for note in require_both_sides(simulated, data, selection):
-        monitor.note(note)
+        log.warning(note)
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
@@ -213,14 +212,12 @@ def read_sides(
     return Sides(some, data, sim.path, physics, stored, selection, temporary)
 
 
-def _simulated(start: Start, path: Path, dt_ns: float, monitor: Monitor) -> Path:
+def _simulated(start: Start, path: Path, dt_ns: float) -> Path:
     """Simulate the pulses of hits with the given physics."""
     assert start.hits is not None
     assert start.detector is not None
     settings = start.settings or SimulationSettings(dt_ns=dt_ns)
-    simulate_file(
-        start.detector, start.hits, path, settings, cluster_mm=start.cluster_mm, monitor=monitor
-    )
+    simulate_file(start.detector, start.hits, path, settings, cluster_mm=start.cluster_mm)
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,8 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.outputs import MARKER
 from cpunet.pulses.reading.opening import tables_of
+
+log = logging.getLogger(__name__)
 
 ALL = "all"  # in place of the name of a table
 CHANNEL = "{channel}"  # in the name of an energy column
@@ -116,7 +119,6 @@ def one_by_one(
     channels: Mapping[str, Pair | CpunetError],
     out: Path,
     do: Callable[[str, Pair, Path], R],
-    note: Callable[[str], None],
     ends: type[CpunetError] | tuple[type[CpunetError], ...] = (),
 ) -> Outcome[R]:
     """Process each channel; a failed channel does not stop the others.
@@ -129,8 +131,6 @@ def one_by_one(
         Folder of the outputs; each is a folder (or file) named after its channel.
     do
         Function called with the name of a channel, its two files and the path of its output.
-    note
-        Receiver of the names of the channels and the reasons of failures.
     ends
         Errors that end the loop, such as a request to stop.
 
@@ -149,13 +149,13 @@ def one_by_one(
         try:
             if isinstance(pair, CpunetError):
                 raise pair
-            note(f"{name}:")
+            log.info(f"{name}:")
             outcome.done[name] = do(name, pair, out / name)
         except CpunetError as error:
             if isinstance(error, ends):
                 raise
             outcome.failed[name] = str(error)
-            note(f"{name}: failed: {error}")
+            log.info(f"{name}: failed: {error}")
     return outcome
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
@@ -23,6 +23,8 @@ from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
+
+log = logging.getLogger(__name__)
 
 _READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
 Energies = npt.NDArray[np.float64]
@@ -124,24 +126,27 @@ def load_simulated(
     file: InputFile,
     recipe: Recipe,
     selection: EnergySelection,
-    monitor: Monitor,
     *,
     most: int | None = None,
+    tell: bool = True,
 ) -> InputSet:
-    """Read and prepare the selected simulated pulses of a file, or a sample of `most`."""
-    return _load(file, "simulated", recipe, selection, monitor, most)
+    """Read and prepare the selected simulated pulses of a file, or a sample of `most`.
+
+    Without `tell` the log does not say what was found.
+    """
+    return _load(file, "simulated", recipe, selection, most, tell=tell)
 
 
 def load_measured(
     file: InputFile,
     recipe: Recipe,
     selection: EnergySelection,
-    monitor: Monitor,
     *,
     most: int | None = None,
+    tell: bool = True,
 ) -> InputSet:
-    """Read, prepare and cut the selected measured pulses of a file, or a sample of `most`."""
-    return _load(file, "measured", recipe, selection, monitor, most)
+    """Like `load_simulated`, of measured pulses, with their quality cuts."""
+    return _load(file, "measured", recipe, selection, most, tell=tell)
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
@@ -176,9 +181,7 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
     if not lines:
         return []
     are = "is" if len(lines) == 1 else "are"
-    return [
-        f"warning: {', '.join(lines)} {are} in the range trained on, and no test of it any more"
-    ]
+    return [f"{', '.join(lines)} {are} in the range trained on, and no test of it any more"]
 
 
 def require_same_sampling(sim: InputSet, data: InputSet) -> None:
@@ -195,8 +198,9 @@ def _load(
     side: Kind,
     recipe: Recipe,
     selection: EnergySelection,
-    monitor: Monitor,
     most: int | None,
+    *,
+    tell: bool,
 ) -> InputSet:
     source = file.open()
     require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
@@ -206,20 +210,18 @@ def _load(
         seen.append(np.array(energy_kev, float))
         return selection.select(energy_kev)
 
-    with monitor.stage(f"Preparing {file.path.name}", source.n_pulses) as advance:
-        try:
-            prepared = load_prepared(
-                source,
-                recipe.preparation,
-                side,
-                select=select,
-                peaks=lambda energies: label_peaks(energies, recipe.peaks),
-                most=most,
-                progress=advance,
-            )
-        except CpunetError as error:
-            hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
-            raise CpunetError(f"{error}{hint}") from error
+    try:
+        prepared = load_prepared(
+            source,
+            recipe.preparation,
+            side,
+            select=select,
+            peaks=lambda energies: label_peaks(energies, recipe.peaks),
+            most=most,
+        )
+    except CpunetError as error:
+        hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
+        raise CpunetError(f"{error}{hint}") from error
     cuts = None
     if side == "measured":
         cuts = fit_cuts(prepared, recipe.cuts)
@@ -228,16 +230,17 @@ def _load(
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
             )
-    elif _decays(prepared, recipe):
-        monitor.note(
-            f"warning: {file.path.name}: these pulses decay; "
+    elif tell and _decays(prepared, recipe):
+        log.warning(
+            f"{file.path.name}: these pulses decay; "
             "are they simulated ones, without electronics?"
         )
     rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-    monitor.note(
-        f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
-        + (f" (left out: {rejected})" if rejected else "")
-    )
+    if tell:
+        log.info(
+            f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
+            + (f" (left out: {rejected})" if rejected else "")
+        )
     return InputSet(
         prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options,
         recorded_detector(source),

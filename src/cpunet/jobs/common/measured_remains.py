@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from itertools import islice
 from typing import Any, NamedTuple
@@ -12,10 +13,11 @@ from cpunet.electronics.drawn_remains import DrawnRemains, passing
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import PreparationConfig
+
+log = logging.getLogger(__name__)
 
 BLOCK = 4096  # traces per block
 LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
@@ -42,7 +44,7 @@ class FoundRemains(NamedTuple):
 
 
 def find_remains(
-    data_file: InputFile, data: InputSet, config: PreparationConfig, monitor: Monitor
+    data_file: InputFile, data: InputSet, config: PreparationConfig
 ) -> FoundRemains:
     """Measure the remains in a file for a training, and note what was found.
 
@@ -52,12 +54,10 @@ def find_remains(
         Measured file, and its pulses that passed the cuts.
     config
         Preparation of the pulses.
-    monitor
-        Receiver of a note on the rate, or on why it is unknown.
     """
     found, reason = measured_remains(data_file, config)
     if found is None:
-        monitor.note(f"remains of earlier pulses are not looked for: {reason}")
+        log.info(f"remains of earlier pulses are not looked for: {reason}")
         return FoundRemains(None, None, {"missing": reason})
     drawn = drawn_like(found, data_file, data, config)
     told = found.describe() | {"sizes": _sizes(found), "drawn": drawn.describe()}
@@ -65,7 +65,7 @@ def find_remains(
         return FoundRemains(found, None, told)
     tenth = told["percent_above"]["10_kev"]["law"]
     alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
-    monitor.note(
+    log.info(
         f"remains of earlier pulses: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
         f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are given "
         "them"

@@ -22,7 +22,6 @@ from cpunet.analysis.response_figure import (
 )
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.closed_forms import (
     learned_chain,
     slow_numbers,
@@ -40,7 +39,6 @@ from cpunet.settings import checked, read_json
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run_folder import load_network, read_info, read_recipe
 
-QUIET = Monitor()
 MARKER = "response.json"
 RESPONSE = FolderKind(
     name="response",
@@ -76,7 +74,6 @@ def describe_responses(
     truth: Electronics | None = None,
     out: Path | None = None,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Describe the fitted readout chains of trainings by physical quantities.
 
@@ -90,8 +87,6 @@ def describe_responses(
         Folder to create, with ``response.json`` and ``response.png``; None for none.
     force
         Whether to replace an existing folder.
-    monitor
-        Receiver of notes about files kept from a replaced folder.
 
     Returns
     -------

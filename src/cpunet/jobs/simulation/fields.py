@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.simulate import ImpurityFrom, solved
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.progress import stage
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import LI_CONTACT, Detector, FloatArray
 from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE
 
-QUIET = Monitor()
 _DPI = 200
 
 
@@ -26,7 +25,6 @@ def describe_fields(
     impurity_from: ImpurityFrom = "file",
     paths: bool = True,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, str]:
     """Solve for the fields (or take them from the cache), and draw them if requested.
 
@@ -43,8 +41,6 @@ def describe_fields(
         Whether to draw drift paths.
     force
         Whether to replace an existing picture.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -63,13 +59,13 @@ def describe_fields(
         if picture.suffix.lower() not in PICTURE_FORMATS:
             raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
         refuse_existing(picture, force=force)
-    detector, fields = solved(detector, impurity_from, monitor)
+    detector, fields = solved(detector, impurity_from)
     told = _told(detector, fields)
     if picture is not None:
         # matplotlib and the compiled drift are needed only for the picture
         from cpunet.analysis.detector_figure import detector_figure
 
-        with monitor.stage("Picture"):
+        with stage("Picture"):
             figure = detector_figure(detector, fields, paths=paths)
             with written_aside(picture) as aside:
                 figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=_DPI)

@@ -10,16 +10,15 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import put_column
 from cpunet.outputs import refuse_existing, written_aside
+from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 
-QUIET = Monitor()
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
 DT_NS, LENGTH_NS = 1.0, 5000.0
 ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
@@ -34,7 +33,6 @@ def write_library(
     grid_mm: float = 1.0,
     angles_deg: tuple[int, ...] = ANGLES_DEG,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Simulate the charge pulses of all points of a grid and write them as a library.
 
@@ -77,7 +75,7 @@ def write_library(
     if wrong or not angles_deg or len(set(angles_deg)) < len(angles_deg):
         raise CpunetError(f"angles {angles_deg}: give different ones from 0 to 359 degrees")
     settings = settings or SimulationSettings(dt_ns=DT_NS, length_ns=LENGTH_NS)
-    with monitor.stage(f"Fields of {detector.name or 'the detector'}"):
+    with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
     counts = {"templates": 0, "written": 0, "outside": 0, "late": 0}
@@ -85,7 +83,7 @@ def write_library(
     with (
         written_aside(out) as aside,
         FileInTheMaking(aside, out) as made,
-        monitor.stage("Templates", total) as advance,
+        stage("Templates", total) as bar,
     ):
         library = made.h5.create_group(detector.name or "detector")
         put_column(library, "r", r_mm, "mm")
@@ -93,7 +91,7 @@ def write_library(
         put_column(library, "dt", settings.dt_ns, "ns")
         put_column(library, "t0", 0.0, "ns")
         for angle in angles_deg:
-            _fill(library, angle, fields, settings, counts, advance)
+            _fill(library, angle, fields, settings, counts, bar)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
         if not counts["written"]:
             raise CpunetError(
@@ -115,7 +113,7 @@ def _fill(
     fields: FieldMaps,
     settings: SimulationSettings,
     counts: dict[str, int],
-    advance: Advance,
+    bar: Stage,
 ) -> None:
     """Simulate the grid points of one azimuth, row by row in r."""
     r_mm, z_mm = library["r"][()], library["z"][()]
@@ -134,7 +132,7 @@ def _fill(
         counts["written"] += int(good.sum())
         counts["outside"] += int((~signals.valid).sum())
         counts["late"] += int((signals.valid & ~signals.collected).sum())
-        advance(len(z_mm))
+        bar.update(len(z_mm))
 
 
 def _array(

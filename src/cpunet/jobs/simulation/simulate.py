@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -13,10 +14,10 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile, HitSource, Window
 from cpunet.jobs.simulation.simulation_summary import Clock, Summary
 from cpunet.outputs import refuse_inputs
+from cpunet.progress import stage
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.clustering import MERGING_MM, cluster_hits, merge_hits
 from cpunet.simulation.events import EventPulses, simulate_events
@@ -27,10 +28,10 @@ from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
 from cpunet.simulation.hit_readers.hit_table import hit_columns
 from cpunet.simulation.hits import FloatArray, Hits
 from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
 
-QUIET = Monitor()
+log = logging.getLogger(__name__)
+
 Mode = Literal["exact", "library", "auto"]
 ImpurityFrom = Literal["file", "depletion"]
 
@@ -66,7 +67,6 @@ def simulate_file(
     resolution: Resolution | None = None,
     seed: int = 0,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> Summary:
     """Simulate the pulses of a detector and write them, with their hits, to an LH5 file.
 
@@ -101,7 +101,7 @@ def simulate_file(
         Resolution of the written energies; the pulses are unchanged.
     seed
         Seed of the resolution (the Monte Carlo has its own).
-    force, monitor
+    force
         See `cpunet.jobs.training.train.train_run`.
 
     Raises
@@ -118,8 +118,8 @@ def simulate_file(
     opened = source.open(detector)
     clock.lap("reading")
     if opened.warning:
-        monitor.note(f"warning: {opened.warning}")
-    detector, fields = solved(detector, impurity_from, monitor)
+        log.warning(opened.warning)
+    detector, fields = solved(detector, impurity_from)
     clock.lap("fields")
     summary = Summary()
     blocks = _merged(opened.blocks, detector, cluster_mm, summary)
@@ -127,18 +127,17 @@ def simulate_file(
     clock.lap("first hits")
     resolved = _resolved(mode, len(first.edep_kev) / len(first) * opened.n_events)
     summary.mode = resolved
-    library = _library(fields, settings, monitor) if resolved == "library" else None
+    library = build_library(fields, settings) if resolved == "library" else None
     clock.lap("library")
-    with writer, monitor.stage(f"Simulating {detector.name}", opened.n_events) as advance:
+    with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
         for block in chain([first], blocks):
             clock.lap("waiting for hits")
-            events = simulate_events(
-                fields, block, settings, resolved, _steps_of(advance), library
-            )
+            events = simulate_events(fields, block, settings, resolved, library)
             clock.lap("pulses")
             summary.add(detector, block, events, windows)
             _append(writer, block, events, settings, resolution, seed)
             clock.lap("writing")
+            bar.update(len(block))
         if not writer.n_pulses:
             raise CpunetError(
                 f"{out}: none of {summary.n_events} events gives a signal: their hits lie "
@@ -159,16 +158,14 @@ def _check(cluster_mm: float, resolution: Resolution | None) -> None:
         resolution.smear(np.zeros(0), seed=0)
 
 
-def solved(
-    detector: Detector, impurity_from: ImpurityFrom, monitor: Monitor
-) -> tuple[Detector, FieldMaps]:
+def solved(detector: Detector, impurity_from: ImpurityFrom) -> tuple[Detector, FieldMaps]:
     """The detector with the requested impurities, and its fields."""
-    with monitor.stage(f"Fields of {detector.name}"):
+    with stage(f"Fields of {detector.name}"):
         if impurity_from == "depletion":
             detector = scaled_to_depletion(detector)
         fields = compute_fields(detector)
     if impurity_from == "depletion":
-        monitor.note(
+        log.info(
             f"{detector.name}: impurities times {detector.impurity_scale:.4g}, so that it "
             f"depletes at the measured {detector.measured_depletion_V:g} V"
         )
@@ -181,29 +178,12 @@ def _resolved(mode: Mode, expected_hits: float) -> Literal["exact", "library"]:
     return "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
 
 
-def _library(fields: FieldMaps, settings: SimulationSettings, monitor: Monitor) -> Library:
-    with monitor.stage("Library of pulses") as advance:
-        return build_library(fields, settings, _steps_of(advance))
-
-
 def _merged(
     blocks: Iterator[Hits], detector: Detector, distance_mm: float, summary: Summary
 ) -> Iterator[Hits]:
     for block in blocks:
         summary.hits_before_merging += len(block.edep_kev)
         yield merge_hits(block, detector, distance_mm)
-
-
-def _steps_of(advance: Advance) -> Callable[[int, int], None]:
-    """Convert the number done so far, as the simulation reports it, to steps of a stage."""
-    before = 0
-
-    def progress(done: int, _total: int) -> None:
-        nonlocal before
-        advance(done - before)
-        before = done
-
-    return progress
 
 
 def _append(

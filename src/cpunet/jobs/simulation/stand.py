@@ -16,7 +16,6 @@ from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.growing_archive import GrowingArchive
 from cpunet.jobs.simulation.hit_sources import Window
 from cpunet.jobs.simulation.stand_plan import (
@@ -39,7 +38,6 @@ from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
 
-QUIET = Monitor()
 MARKER = "stand.json"
 STAND = FolderKind(
     name="stand",
@@ -83,7 +81,6 @@ def make_stand(
     settings: SimulationSettings | None = None,
     seed: int = 0,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> StandSummary:
     """Make a stand of two independent sets of Tl-208 events.
 
@@ -117,7 +114,7 @@ def make_stand(
         shift.
     seed
         Seed of all random numbers; the sides are independent.
-    force, monitor
+    force
         See `cpunet.jobs.training.train.train_run`.
 
     Raises
@@ -136,21 +133,19 @@ def make_stand(
         settings=settings,
         seed=seed,
     )
-    return write_stand(plan, out, force=force, monitor=monitor)
+    return write_stand(plan, out, force=force)
 
 
-def write_stand(
-    plan: StandPlan, out: Path, *, force: bool = False, monitor: Monitor = QUIET
-) -> StandSummary:
+def write_stand(plan: StandPlan, out: Path, *, force: bool = False) -> StandSummary:
     """Make a planned stand, see `make_stand`."""
     many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
     summary = StandSummary()
     with folder_written_aside(out, STAND, force=force) as folder:
-        library = plan.sim.library(monitor) if many else None
-        _write_sim(folder, plan, library, summary, monitor)
+        library = plan.sim.library() if many else None
+        _write_sim(folder, plan, library, summary)
         if many and plan.shift is not None:
-            library = plan.data.library(monitor)
-        _write_data(folder, plan, library, summary, monitor)
+            library = plan.data.library()
+        _write_data(folder, plan, library, summary)
         made = {"cpunet": cpunet.__version__, **plan.provenance(), "counts": vars(summary)}
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
     return summary
@@ -161,7 +156,6 @@ def _write_sim(
     plan: StandPlan,
     library: Library | None,
     summary: StandSummary,
-    monitor: Monitor,
 ) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
@@ -170,7 +164,7 @@ def _write_sim(
     writer = PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated"))
     with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
         with writer:
-            for fine, label, hits in side.blocks("Simulated events", library, monitor):
+            for fine, label, hits in side.blocks("Simulated events", library):
                 writer.append(_block_means(fine, per_sample))
                 writer.append_rows(HIT_TABLE, hit_columns(hits))
                 truth.append(respond(fine, electronics))
@@ -187,7 +181,6 @@ def _write_data(
     plan: StandPlan,
     library: Library | None,
     summary: StandSummary,
-    monitor: Monitor,
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = plan.electronics
@@ -197,7 +190,7 @@ def _write_data(
         folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
     )
     with writer:
-        for fine, label, _ in plan.data.blocks("Measured events", library, monitor):
+        for fine, label, _ in plan.data.blocks("Measured events", library):
             block_seed = np.random.SeedSequence(
                 (plan.readout_seed, writer.n_pulses)
             ).generate_state(1)

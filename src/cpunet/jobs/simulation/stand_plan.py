@@ -12,12 +12,12 @@ from pydantic import ValidationError
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import GammaSource, Window
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.clustering import MERGING_MM, merge_hits
 from cpunet.simulation.events import simulate_events
-from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
@@ -44,13 +44,16 @@ class Side:
     settings: SimulationSettings
     source: GammaSource
 
-    def library(self, monitor: Monitor) -> Library:
+    def _fields(self) -> FieldMaps:
+        with stage(f"Fields of {self.detector.name}"):
+            return compute_fields(self.detector)
+
+    def library(self) -> Library:
         """Pre-computed pulses."""
-        with monitor.stage(f"Library of pulses of {self.detector.name}"):
-            return build_library(compute_fields(self.detector), self.settings)
+        return build_library(self._fields(), self.settings)
 
     def blocks(
-        self, title: str, library: Library | None, monitor: Monitor
+        self, title: str, library: Library | None
     ) -> Iterator[tuple[Pulses, Labels, Hits]]:
         """Finely sampled pulses, their lines and their hits, block by block.
 
@@ -62,12 +65,11 @@ class Side:
         CpunetError
             If no event gives a signal.
         """
-        with monitor.stage(f"Fields of {self.detector.name}"):
-            fields = compute_fields(self.detector)
+        fields = self._fields()
         mode: Literal["exact", "library"] = "exact" if library is None else "library"
         opened = self.source.open(self.detector)
         gain = 0.0
-        with monitor.stage(title, opened.n_events) as advance:
+        with stage(title, opened.n_events) as bar:
             for hits in opened.blocks:
                 merged = merge_hits(hits, self.detector, MERGING_MM)
                 events = simulate_events(fields, merged, self.settings, mode, library=library)
@@ -79,7 +81,7 @@ class Side:
                     gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
                     calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
-                advance(len(hits))
+                bar.update(len(hits))
         if not gain:
             raise CpunetError(
                 f"none of {opened.n_events} events gives a signal in {self.detector.name}; "

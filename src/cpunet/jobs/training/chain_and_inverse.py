@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import nn
 
@@ -14,7 +14,6 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.pulses.container import Pulses
@@ -27,6 +26,8 @@ from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run_folder import load_network, read_recipe
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +64,61 @@ def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
     return known
 
 
+class Matched(NamedTuple):
+    """A fitted chain.
+
+    Parameters
+    ----------
+    model
+        Module with ``ren`` and ``iren``.
+    told
+        The entry on the fit for ``run.json``.
+    recipe
+        Recipe of the response as fitted: a ringing or a stretch may have been added.
+    fit
+        Result of the fit.
+    remark
+        Remark on the noise, if any.
+    """
+
+    model: nn.Module
+    told: dict[str, Any]
+    recipe: Recipe
+    fit: Fit
+    remark: str | None
+
+    def log(self) -> None:
+        """Tell which pulses were compared, how well the fit describes them, and why not."""
+        fit, told = self.fit, self.told
+        if self.remark is not None:
+            log.warning(self.remark)
+        compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+        log.info(f"compared (simulated/measured pulses): {compared}")
+        beside = told["in_no_band"]
+        if any(beside.values()):
+            log.info(
+                f"in no band, since one side has too few of their energies: {beside['sim']} "
+                f"simulated and {beside['data']} measured pulses"
+            )
+        if fit.poor:
+            log.warning(f"poor fit: {fit.verdict}")
+        else:
+            log.info(f"fit: {fit.verdict}")
+        if fit.drift is not None:
+            log.info(str(fit.drift))
+        for number, cause in enumerate(told["causes"], 1):
+            log.info(f"  {number}. {cause}")
+        for found in beyond(told["parameters"]) + stretched(told["parameters"]):
+            log.warning(found)
+
+
 def match(
     sides: Sides,
     recipe: Recipe,
     seed: int,
     listen: Listener,
-    monitor: Monitor,
     known: Readout | None = None,
-) -> tuple[nn.Module, dict[str, Any], Recipe]:
+) -> Matched:
     """Measure the noise, fit the response, and invert it.
 
     Parameters
@@ -83,27 +131,16 @@ def match(
         Seed of all random numbers.
     listen
         Function called with step and chi-square.
-    monitor
-        Receiver of notes.
     known
         Response to start from, if any.
-
-    Returns
-    -------
-    tuple
-        Module with ``ren`` and ``iren``, the entry on the fit for ``run.json``, and the recipe
-        of the response as fitted.
 
     Raises
     ------
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    remains, drawn, told_of_remains = remains_of_sides(sides, recipe, monitor)
-    noise, note = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
-    if note is not None:
-        monitor.note(f"warning: {note}")
-
+    remains, drawn, told_of_remains = remains_of_sides(sides, recipe)
+    noise, remark = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
@@ -118,17 +155,16 @@ def match(
     fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
     response, fit = fitted(sides.sim, sides.data, noise, recipe, **given)
     told = _described(fit, response, noise, sides)
-    _note(fit, told, monitor)
     if told_of_remains is not None:
         told["remains"] = told_of_remains
-    # as fitted: a ringing or a stretch may have been added
     recipe = recipe.model_copy(update={"generator": response.config})
     chain = ResponseGenerator(response.config, sides.sim.dt_ns)
     chain.response = response
     chain.set_noise(noise)
     chain.remains = drawn
     iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
-    return nn.ModuleDict({"ren": chain, "iren": iren}), {"fit": told}, recipe
+    model = nn.ModuleDict({"ren": chain, "iren": iren})
+    return Matched(model, told, recipe, fit, remark)
 
 
 def _described(
@@ -154,27 +190,8 @@ def _described(
     }
 
 
-def _note(fit: Fit, told: Mapping[str, Any], monitor: Monitor) -> None:
-    """Note which pulses were compared, how well the fit describes them, and why not."""
-    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
-    monitor.note(f"compared (simulated/measured pulses): {compared}")
-    beside = told["in_no_band"]
-    if any(beside.values()):
-        monitor.note(
-            f"in no band, since one side has too few of their energies: {beside['sim']} "
-            f"simulated and {beside['data']} measured pulses"
-        )
-    monitor.note(f"{'warning: poor fit: ' if fit.poor else 'fit: '}{fit.verdict}")
-    if fit.drift is not None:
-        monitor.note(str(fit.drift))
-    for number, cause in enumerate(told["causes"], 1):
-        monitor.note(f"  {number}. {cause}")
-    for found in beyond(told["parameters"]) + stretched(told["parameters"]):
-        monitor.note(f"warning: {found}")
-
-
-def remains_of_sides(sides: Sides, recipe: Recipe, monitor: Monitor) -> FoundRemains:
+def remains_of_sides(sides: Sides, recipe: Recipe) -> FoundRemains:
     """Remains of earlier pulses in the data; not looked for without `data_set`."""
     if sides.data_set is None:
         return FoundRemains(None, None, None)
-    return find_remains(sides.data_file, sides.data_set, recipe.preparation, monitor)
+    return find_remains(sides.data_file, sides.data_set, recipe.preparation)

@@ -9,7 +9,6 @@ equally), and current amplitudes (a readout only makes pulses slower).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -25,7 +24,6 @@ from cpunet.jobs.common.inputs import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, current_amplitude
@@ -99,9 +97,7 @@ class Checked:
         return max(levels, key=list(Level).index, default=Level.FINE)
 
 
-def check(
-    sim: InputFile, data: InputFile, recipe: Recipe, peak: str, monitor: Monitor
-) -> Checked:
+def check(sim: InputFile, data: InputFile, recipe: Recipe, peak: str) -> Checked:
     """Read both sides as in a training, and check them.
 
     Parameters
@@ -112,8 +108,6 @@ def check(
         Recipe with preparation and cuts.
     peak
         Energies, as for a training.
-    monitor
-        Receiver of the progress.
 
     Raises
     ------
@@ -123,10 +117,9 @@ def check(
     selection = parse_selection(peak, recipe.peaks)
     findings: list[Finding] = []
     sets: dict[str, InputSet] = {}
-    progress = _ProgressOnly(monitor)
     for side, load, file in (("sim", load_simulated, sim), ("data", load_measured, data)):
         try:
-            sets[side] = load(file, recipe, selection, progress)
+            sets[side] = load(file, recipe, selection, tell=False)
         except CpunetError as error:
             findings.append(_refusal(f"{side} pulses", error))
     if len(sets) < 2:
@@ -163,19 +156,6 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
         figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=DPI)
 
 
-class _ProgressOnly(Monitor):
-    """Passes on progress but not notes, since problems become findings."""
-
-    def __init__(self, monitor: Monitor) -> None:
-        self._monitor = monitor
-
-    @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Pass on a stage."""
-        with self._monitor.stage(title, total) as advance:
-            yield advance
-
-
 def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[Finding]:
     """Compare two prepared sets."""
     findings = [*_required(sim, data, selection)]
@@ -210,7 +190,7 @@ def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iter
         yield _refusal("energies", error)
     else:
         for note in notes:
-            yield Finding("energies", Level.WARNING, note.removeprefix("warning: "))
+            yield Finding("energies", Level.WARNING, note)
 
 
 def _count(one: InputSet, side: str) -> Finding:

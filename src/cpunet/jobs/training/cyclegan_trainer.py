@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -13,9 +14,9 @@ import torch
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
+from cpunet.progress import stage
 from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import UnfinishedRun, unfinished_folder
@@ -23,6 +24,8 @@ from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
 from cpunet.training.run_folder import fill_networks, read_losses, read_recipe, weights_sha256
+
+log = logging.getLogger(__name__)
 
 # settings of logs and checkpoints, which do not affect the weights
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
@@ -47,15 +50,15 @@ class CycleGanTrainer:
     def train(self, job: TrainingJob) -> Trained:
         """Train or resume."""
         recipe, how = self.recipe, job.options
-        run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job), job.monitor.note)
+        run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
         state = run.begin(resume=how.resume)
-        outside, told = outside_noise(job.sides, recipe, job.monitor)
+        outside, told = outside_noise(job.sides, recipe)
         left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
-        with job.monitor.stage("Training", left) as advance:
+        with stage("Training", left) as bar:
 
             def listen(records: list[Record]) -> None:
                 run.log(records)
-                advance(len(records))
+                bar.update(len(records))
 
             model = train(
                 job.sim.prepared.pulses.waveforms,
@@ -70,14 +73,12 @@ class CycleGanTrainer:
             )
         run.finish()
         for line in judges_noted(read_losses(job.folder)):
-            job.monitor.note(f"warning: {line}")
+            log.warning(line)
         resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
         return Trained(model, job.info(run.started, run.seconds) | resumed | told, recipe)
 
 
-def outside_noise(
-    sides: Sides, recipe: Recipe, monitor: Monitor
-) -> tuple[Outside | None, dict[str, Any]]:
+def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, dict[str, Any]]:
     """Noise for the translations of the simulated pulses, and its entry for ``run.json``.
 
     Raises
@@ -88,7 +89,7 @@ def outside_noise(
     if recipe.cyclegan.training.noise == "none":
         return None, {}
     try:
-        found = remains_of_sides(sides, recipe, monitor)
+        found = remains_of_sides(sides, recipe)
         noise, note = measured_noise(
             sides.data_file, sides.data, recipe.preparation, found.measured
         )
@@ -98,7 +99,7 @@ def outside_noise(
             "without it (--set training.noise=none)"
         ) from error
     if note is not None:
-        monitor.note(f"warning: {note}")
+        log.warning(note)
     drawn = TraceNoise(noise, found.drawn)
     outside = Outside(drawn, sides.sim.energy_kev, recipe.preparation)
     return outside, {} if found.told is None else {"fit": {"remains": found.told}}

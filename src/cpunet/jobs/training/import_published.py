@@ -14,8 +14,8 @@ import numpy.typing as npt
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import folder_written_aside, refuse_existing
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.pickles import PickledPulse, TruncatedError, as_pulse, entries
@@ -25,7 +25,6 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import RUN, versions, write_run
 from cpunet.translation.published import read_discriminator, read_generator
 
-QUIET = Monitor()
 BLOCK = 1024
 TABLE = "geds/raw"
 # Entries on the training for a report; its pulses were not published.
@@ -42,7 +41,6 @@ def import_weights(
     dt_ns: float = 16.0,
     peak: str = "FEP",
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Make a run folder for `REN.load` and `IREN.load` from published state dicts.
 
@@ -60,8 +58,6 @@ def import_weights(
         Energies of the training.
     force
         Whether to replace an existing run folder.
-    monitor
-        Receiver of notes on files kept from a replaced folder.
 
     Returns
     -------
@@ -142,7 +138,6 @@ def import_pulses(
     table: str = TABLE,
     units: str = "ADC",
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Convert a pickled list of pulses to LH5 without executing code of the pickle.
 
@@ -161,8 +156,6 @@ def import_pulses(
         Table of the LH5 file for the pulses, and the units of their samples.
     force
         Whether to replace an existing file.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -186,7 +179,7 @@ def import_pulses(
         attrs={"imported_from": source.name},
         force=force,
     )
-    with writer, monitor.stage("Pulses") as advance:
+    with writer, stage("Pulses") as bar:
         for block in _blocks(_entries(source, ended), counts):
             length = length or len(block[0].samples)
             same = [pulse for pulse in block if len(pulse.samples) == length]
@@ -194,7 +187,7 @@ def import_pulses(
             if same:
                 writer.append(*_columns(same, dt_ns))
             counts["written"] += len(same)
-            advance(len(block))
+            bar.update(len(block))
         if not counts["written"]:
             why = f"; it ends early ({ended[0]})" if ended else ""
             raise CpunetError(

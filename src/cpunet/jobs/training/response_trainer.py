@@ -13,6 +13,7 @@ from cpunet.jobs.training.chain_and_inverse import known_response, match
 from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
 from cpunet.networks.response_layer import Readout
 from cpunet.outputs import folder_written_aside
+from cpunet.progress import stage
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
 from cpunet.training.run_folder import RUN, append_losses
@@ -47,20 +48,17 @@ class ResponseTrainer:
         started, clock = datetime.now(UTC), time.perf_counter()
         if job.options.init is not None:
             known = known_response(job.options.init, job.data.dt_ns, self.recipe)
-        # upper limit for one start; most fits need fewer steps
-        steps = self.recipe.matching.training.steps
-        with job.monitor.stage("Matching", steps) as advance:
+        with stage("Matching") as bar:  # how many steps a fit needs is not known
 
             def listen(step: int, chi_square: float) -> None:
                 losses = {"chi_square": chi_square}
                 record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
                 append_losses(job.folder, [record])
-                advance(1)
-                job.monitor.state(f"chi-square {chi_square:.4g}")
+                bar.update(1)
+                bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-            model, told, recipe = match(
-                job.sides, self.recipe, job.options.seed, listen, job.monitor, known
-            )
+            found = match(job.sides, self.recipe, job.options.seed, listen, known)
+        found.log()
         seconds = time.perf_counter() - clock
         info = job.info(started.isoformat(timespec="seconds"), seconds)
-        return Trained(model, info | told, recipe)
+        return Trained(found.model, info | {"fit": found.told}, found.recipe)

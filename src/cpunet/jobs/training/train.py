@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,6 @@ from cpunet.jobs.common.inputs import (
 )
 from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
 from cpunet.jobs.training.trainers import trainer_for
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
@@ -29,7 +29,9 @@ from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import read_info, write_run
 
-QUIET, AS_USUAL = Monitor(), TrainOptions()
+log = logging.getLogger(__name__)
+
+AS_USUAL = TrainOptions()
 
 
 @one_thread_for_matrices()
@@ -41,7 +43,6 @@ def train_run(
     options: TrainOptions = AS_USUAL,
     *,
     stop: Callable[[], bool] = lambda: False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Train REN and IREN on the pulses of a peak and write the run folder.
 
@@ -54,8 +55,6 @@ def train_run(
         ``OUT.unfinished``, see `cpunet.training.checkpoints`.
     stop
         Called after each iteration of a CycleGAN; returns whether to store its state and stop.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -76,10 +75,10 @@ def train_run(
     selection = parse_selection(options.peak, recipe.peaks)
     read = (*sim.files, *data.files, options.init)
     with trainer.workplace(out, read, options) as folder:
-        sim_set, data_set = _read(sim, data, recipe, selection, monitor)
+        sim_set, data_set = _read(sim, data, recipe, selection)
         if options.init is not None:
             _require_sampling(options.init, data_set)
-        job = TrainingJob(recipe, options, sim_set, data_set, data, folder, monitor, stop)
+        job = TrainingJob(recipe, options, sim_set, data_set, data, folder, stop)
         done = trainer.train(job)
         return write_run(folder, done.model, done.recipe, done.info)
 
@@ -89,16 +88,15 @@ def _read(
     data: InputFile,
     recipe: Recipe,
     selection: EnergySelection,
-    monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
     """Read and prepare both sides, and warn of what makes a training on them doubtful."""
-    sim_set = load_simulated(sim, recipe, selection, monitor)
-    data_set = load_measured(data, recipe, selection, monitor)
+    sim_set = load_simulated(sim, recipe, selection)
+    data_set = load_measured(data, recipe, selection)
     require_same_sampling(sim_set, data_set)
     require_both_sides(sim_set, data_set, selection)
     for finding in compare_sides(sim_set, data_set, selection):
         if finding.level != Level.FINE:
-            monitor.note(f"warning: {finding}")
+            log.warning(finding)
     return sim_set, data_set
 
 

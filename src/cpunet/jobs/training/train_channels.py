@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
@@ -17,7 +17,9 @@ from cpunet.training.checkpoints import unfinished_name
 from cpunet.training.loop import StoppedError
 from cpunet.training.run_folder import INFO, read_info
 
-QUIET, AS_USUAL = Monitor(), TrainOptions()
+log = logging.getLogger(__name__)
+
+AS_USUAL = TrainOptions()
 
 
 def train_channels(
@@ -28,7 +30,6 @@ def train_channels(
     options: TrainOptions = AS_USUAL,
     *,
     stop: Callable[[], bool] = lambda: False,
-    monitor: Monitor = QUIET,
 ) -> Outcome[dict[str, Any]]:
     """Train a run for each channel of the data, in the folder ``OUT/CHANNEL``.
 
@@ -59,13 +60,13 @@ def train_channels(
 
     def train(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
         if options.resume and (folder / INFO).is_file():
-            monitor.note(f"{name}: trained already")
+            log.info(f"{name}: trained already")
             return read_info(folder)
         own = replace(
             options,
             init=None if options.init is None else own_folder(options.init, name, INFO),
             resume=options.resume and unfinished_name(folder).exists(),
         )
-        return train_run(*pair, folder, recipe, own, stop=stop, monitor=monitor)
+        return train_run(*pair, folder, recipe, own, stop=stop)
 
-    return one_by_one(paired(sim, data), out, train, monitor.note, StoppedError)
+    return one_by_one(paired(sim, data), out, train, StoppedError)

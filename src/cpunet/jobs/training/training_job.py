@@ -12,7 +12,6 @@ from torch import nn
 
 from cpunet.jobs.common.devices import peak_memory_mb
 from cpunet.jobs.common.inputs import InputFile, InputSet
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run_folder import versions
@@ -86,7 +85,6 @@ class TrainingJob:
     data: InputSet
     data_file: InputFile
     folder: Path
-    monitor: Monitor
     stop: Callable[[], bool] = lambda: False
 
     @property

@@ -12,10 +12,10 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
+from cpunet.progress import stage
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.settings import read_json
 from cpunet.training.run_folder import read_info
@@ -28,7 +28,6 @@ from cpunet.translation.backends import (
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
 from cpunet.translation.translator import IREN, REN, Translator
 
-QUIET = Monitor()
 _LANGUAGES = {
     "onnx": f"ONNX, opset {OPSET}",
     "torchscript": "TorchScript (`torch.jit.load`)",
@@ -54,7 +53,6 @@ def export_run(
     inverse: bool = False,
     report: Path | None = None,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> Exported:
     """Export the deterministic part of a run for other software, and check it against the run.
 
@@ -76,8 +74,6 @@ def export_run(
         Folder of a report on this run, whose scores are copied to the card.
     force
         Whether to replace existing files; those of noise are removed if there is none.
-    monitor
-        Receiver of the progress.
 
     Raises
     ------
@@ -94,7 +90,7 @@ def export_run(
     scores = None if report is None else _scores(report)
     noise = _kept_noise(translator.backend)
     with (
-        monitor.stage("Exporting"),
+        stage("Exporting"),
         written_aside(out) as graph,
         written_aside(card) as text,
     ):

@@ -6,6 +6,7 @@ The files are those of legend-simflow: electronics (``elecmod``), the mean of A/
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +22,6 @@ from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
 from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
@@ -30,10 +30,12 @@ from cpunet.jobs.translation.simflow_checks import (
     known_detector,
 )
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
+from cpunet.progress import stage
 from cpunet.settings import plain, read_json
 from cpunet.training.run_folder import read_info, weights_sha256
 
-QUIET = Monitor()
+log = logging.getLogger(__name__)
+
 WHOLE = "cpunet.yaml"
 LEGEND_PARS = FolderKind(
     name="legend-pars",
@@ -54,7 +56,6 @@ def export_legend_pars(
     report: Path | None = None,
     library: Path | None = None,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Write a folder of parameters for LEGEND's simulation chain.
 
@@ -77,7 +78,7 @@ def export_legend_pars(
         are not written.
     library
         Library of ideal charge pulses on which the error of the kernel is determined.
-    force, monitor
+    force
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
@@ -95,12 +96,12 @@ def export_legend_pars(
     info = read_info(run)
     told = describe_responses([run])["runs"][0]
     for doubt in told["doubts"]:
-        monitor.note(f"warning: {doubt}")
+        log.warning(doubt)
     known = known_detector(run, info)
     name = detector or known or EVERY_DETECTOR
     methods, ae_pars = ({}, {}) if report is None else _against_energy(report, info)
     undecayed = chain_of(run).undecayed
-    with monitor.stage("Two numbers for the chain"):
+    with stage("Two numbers for the chain"):
         nearest = fitted_kernel(undecayed)
         equivalent: dict[str, Any] = asdict(nearest)
         if library is not None:

@@ -20,7 +20,6 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
@@ -30,6 +29,7 @@ from cpunet.jobs.translation.simflow_checks import (
 )
 from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing, written_aside
+from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.run_folder import read_info, weights_sha256
 from cpunet.translation.library_mode import TemplateTranslator
@@ -43,7 +43,6 @@ from cpunet.translation.peak_currents import (
 from cpunet.translation.ring_padding import RINGS, continued, with_rings
 from cpunet.translation.translator import REN
 
-QUIET = Monitor()
 ROWS = 16  # rows of r translated at a time
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
@@ -60,7 +59,6 @@ def translate_for_simflow(
     rank: int | None = None,
     device: str = "auto",
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Translate libraries of ideal charge pulses to the format of LEGEND's production.
 
@@ -86,7 +84,7 @@ def translate_for_simflow(
     rank
         Number of components to write, with the coefficients of each grid point, instead of
         templates; see `cpunet.jobs.translation.simflow_files.read_library`.
-    device, force, monitor
+    device, force
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
@@ -116,10 +114,10 @@ def translate_for_simflow(
         made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
-                looked = _look(ren, library, given[library.path], source, monitor)
+                looked = _look(ren, library, given[library.path], source)
                 group = made.h5.require_group(library.path)
                 job = _Writing(looked, library, rings, rank)
-                told[library.path] = job.write(given[library.path], group, made_from, monitor)
+                told[library.path] = job.write(given[library.path], group, made_from)
     return told
 
 
@@ -139,7 +137,6 @@ def _look(
     library: IdealLibrary,
     given: h5py.Group,
     source: Path,
-    monitor: Monitor,
 ) -> _Looked:
     """First pass over all templates, to find the mode of A/E before any is written."""
     translate = TemplateTranslator(ren, library.dt_ns)
@@ -150,7 +147,7 @@ def _look(
     share = min(1.0, 2 * MOST / max(library.n_templates, 1))
     amplitudes, kept, inside = [], [], {}
     moving = not_ending = 0
-    with monitor.stage(f"A/E of {library.path}", library.n_templates) as advance:
+    with stage(f"A/E of {library.path}", library.n_templates) as bar:
         for angle in library.angles:
             mask = np.zeros((len(library.r_mm), len(library.z_mm)), bool)
             for first, block in _blocks(given[f"waveform_{angle}"], library, source):
@@ -164,7 +161,7 @@ def _look(
                 not_ending += n_not_ending(templates[good])
                 amplitudes.append(heights(currents[good]))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
-                advance(block.shape[0] * block.shape[1])
+                bar.update(block.shape[0] * block.shape[1])
             inside[angle] = mask
     require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
     require_complete(inside, library, source)
@@ -187,7 +184,7 @@ class _Writing:
     rank: int | None
 
     def write(
-        self, given: h5py.Group, group: h5py.Group, made_from: dict[str, str], monitor: Monitor
+        self, given: h5py.Group, group: h5py.Group, made_from: dict[str, str]
     ) -> dict[str, Any]:
         looked, library = self.looked, self.library
         r_mm, z_mm = library.padded_axes(self.rings)
@@ -199,8 +196,8 @@ class _Writing:
             arrays = made.angle(angle)
             mask = looked.inside[angle]
             times = np.full((len(r_mm), len(z_mm)), np.nan)
-            with monitor.stage(f"{library.path}, {angle}", len(r_mm)) as advance:
-                for rows, currents, when in self._rows(given[f"waveform_{angle}"], advance):
+            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
+                for rows, currents, when in self._rows(given[f"waveform_{angle}"], bar):
                     arrays.put(rows, currents, loss)
                     times[rows] = when
             times = continued(times, self.rings)
@@ -225,7 +222,7 @@ class _Writing:
         return numbers
 
     def _rows(
-        self, given: h5py.Dataset, advance: Advance
+        self, given: h5py.Dataset, bar: Stage
     ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
         """Rows of the padded grid: normalised currents, and drift times within the crystal."""
         n_r, n_z, _ = given.shape
@@ -246,7 +243,7 @@ class _Writing:
                 times[inner][there] = when - looked.delay_ns
             own = slice(first - low, last - low)
             yield slice(first, last), with_rings(currents, rings)[own], times[own]
-            advance(last - first)
+            bar.update(last - first)
 
 
 def _blocks(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.memory import give_back_large_arrays
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.jobs.translation.translation_blocks import (
     NOISE_ROWS,
@@ -31,6 +31,7 @@ from cpunet.jobs.translation.translation_record import (
     source_print,
 )
 from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
@@ -41,7 +42,9 @@ from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
 
-QUIET, DEFAULTS = Monitor(), TranslateOptions()
+log = logging.getLogger(__name__)
+
+DEFAULTS = TranslateOptions()
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
@@ -76,12 +79,12 @@ class FileTranslation:
         self._print = run_print(run)
 
     @property
-    def notes(self) -> list[str]:
-        """Notes on the output for the user."""
+    def doubts(self) -> list[str]:
+        """What the user should know of the output."""
         if isinstance(self.form, AdcForm) and self.form.fills_in:
             window = self.form.config.length
             return [
-                f"warning: a network knows windows of {window} samples alone; beyond them "
+                f"a network knows windows of {window} samples alone; beyond them "
                 "stand baseline and decay without noise"
             ]
         return []
@@ -94,7 +97,6 @@ class FileTranslation:
         noise_key: str | None = None,
         resume: bool = False,
         force: bool = False,
-        monitor: Monitor = QUIET,
     ) -> dict[str, Any]:
         """Translate a file; see `translate_file`.
 
@@ -111,7 +113,7 @@ class FileTranslation:
             return finished(out, made) | {"skipped": True}
         refuse_existing(out, force=force)
         pulses = self.opened(source)
-        others = _other_columns(pulses, monitor.note)
+        others = _other_columns(pulses)
         writer = PulseWriter(
             out,
             table=self.options.table or f"geds/{self.kind.part}",
@@ -121,8 +123,8 @@ class FileTranslation:
             samples=self.form.samples,
             force=force,
         )
-        with monitor.stage("Translating", pulses.n_pulses) as advance, writer:
-            counts = self._translate(pulses, noise_key, writer, others, advance)
+        with stage("Translating", pulses.n_pulses) as bar, writer:
+            counts = self._translate(pulses, noise_key, writer, others, bar)
             self._require_some(source, counts)
             require_unchanged(source, before)
             told = counts.told(adc=self.options.adc is not None)
@@ -190,12 +192,12 @@ class FileTranslation:
         noise_key: str | None,
         writer: PulseWriter,
         others: RowColumns,
-        advance: Advance,
+        bar: Stage,
     ) -> Counts:
         give_back_large_arrays()
         counts, start = Counts(), 0
         times = self.options.realisations
-        for formed in self.blocks(_read(pulses, advance), noise_key):
+        for formed in self.blocks(_read(pulses, bar), noise_key):
             columns: dict[str, Any] = {"rejection": (formed.codes, ""), **formed.truth}
             given = len(formed.codes) // (times or 1)
             if times is not None:
@@ -235,7 +237,6 @@ def translate_file(
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Translate all pulses of a file, block by block, keeping their rows and other columns.
 
@@ -253,7 +254,7 @@ def translate_file(
         None for the noise of `cpunet.translation.translator.Translator.translate`.
     resume
         Whether to keep an output that was made from this source with this run and options.
-    device, force, monitor
+    device, force
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
@@ -269,22 +270,20 @@ def translate_file(
         translated, the source changes meanwhile, or another process writes the same output.
     """
     translation = FileTranslation(run, options, device)
-    for note in translation.notes:
-        monitor.note(note)
-    return translation(
-        source, out, noise_key=noise_key, resume=resume, force=force, monitor=monitor
-    )
+    for doubt in translation.doubts:
+        log.warning(doubt)
+    return translation(source, out, noise_key=noise_key, resume=resume, force=force)
 
 
-def _read(pulses: PulseSource, advance: Advance) -> Iterator[Pulses]:
+def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
     """Blocks of a file that fit in memory, whatever the length of its traces."""
     for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
         yield block
-        advance(len(block))
+        bar.update(len(block))
 
 
-def _other_columns(pulses: PulseSource, note: Callable[[str], None]) -> RowColumns:
-    """Find the columns to be copied to the output; `note` reports those left out."""
+def _other_columns(pulses: PulseSource) -> RowColumns:
+    """Find the columns to be copied to the output, and report those left out."""
     told = pulses.describe()
     if told["format"] in ("LH5", "HDF5"):
         n_pulses = pulses.n_pulses or 0
@@ -292,5 +291,5 @@ def _other_columns(pulses: PulseSource, note: Callable[[str], None]) -> RowColum
     else:
         others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
     for column, reason in others.left_out.items():
-        note(f"warning: {pulses.path.name}: column {column} is left out: {reason}")
+        log.warning(f"{pulses.path.name}: column {column} is left out: {reason}")
     return others

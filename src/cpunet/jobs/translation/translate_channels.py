@@ -7,12 +7,11 @@ from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, own_folder
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.training.run_folder import INFO
 
-QUIET, DEFAULTS = Monitor(), TranslateOptions()
+DEFAULTS = TranslateOptions()
 
 
 def translate_channels(
@@ -20,8 +19,6 @@ def translate_channels(
     source: InputFile,
     out: Path,
     options: TranslateOptions = DEFAULTS,
-    *,
-    monitor: Monitor = QUIET,
     **how: Any,
 ) -> Outcome[dict[str, Any]]:
     """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
@@ -55,13 +52,11 @@ def translate_channels(
     def translate(name: str, pair: Pair, place: Path) -> dict[str, Any]:
         run = own_folder(runs, name, INFO)
         target = place.with_name(f"{name}.lh5")
-        return translate_file(
-            run, pair[0], target, options, noise_key=name, monitor=monitor, **how
-        )
+        return translate_file(run, pair[0], target, options, noise_key=name, **how)
 
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
     if len(channels) == 1 and not any(own_folder(runs, n, INFO).is_dir() for n in channels):
         (single,) = channels.values()
         trained = sorted(info.parent.name for info in runs.glob(f"*/{INFO}"))
         channels = dict.fromkeys(trained, single) or channels
-    return one_by_one(channels, out, translate, monitor.note)
+    return one_by_one(channels, out, translate)

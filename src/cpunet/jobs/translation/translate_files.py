@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import logging
 import multiprocessing
 import os
 import signal
@@ -15,8 +16,9 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.queues import SimpleQueue
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from types import FrameType
 from typing import Any
 
@@ -24,16 +26,16 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Advance, Monitor, Relay
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.progress import stage
 
-QUIET = Monitor()
+log = logging.getLogger(__name__)
+
 DEFAULTS = TranslateOptions()
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
-TELL_EVERY_S = 0.5  # interval of the progress of several processes
 
 Told = dict[str, Any]
 _Outcomes = Generator[tuple["_Task", Told | str]]
@@ -55,7 +57,6 @@ def translate_files(
     device: str = "auto",
     resume: bool = False,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> Told:
     """Translate files into files of the same names in a folder.
 
@@ -80,8 +81,6 @@ def translate_files(
         Whether to skip files whose outputs exist, made from the same sources in the same way.
     force
         Whether to replace existing outputs.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -100,18 +99,19 @@ def translate_files(
     _refuse_inputs(tasks, run)
     _require_apart(tasks, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
-    for note in FileTranslation(run, options, device).notes:
-        monitor.note(note)
+    for doubt in FileTranslation(run, options, device).doubts:
+        log.warning(doubt)
     told: list[Told] = []
     failed: list[str] = []
     with (
-        monitor.stage("Translating", _rows(sources)) as advance,
-        closing(_outcomes(make, tasks, jobs, advance, monitor)) as outcomes,
+        stage("Translating", len(tasks)) as bar,
+        closing(_outcomes(make, tasks, jobs)) as outcomes,
     ):
         for task, outcome in outcomes:
+            bar.update()
             if isinstance(outcome, str):
                 failed.append(_naming(task, outcome))
-                monitor.note(f"error: {failed[-1]}")
+                log.error(failed[-1])
             else:
                 told.append(outcome)
     if failed:
@@ -153,7 +153,7 @@ class _Maker:
     resume: bool
     force: bool
 
-    def work(self, monitor: Monitor) -> Callable[[_Task], Told]:
+    def work(self) -> Callable[[_Task], Told]:
         """Return a function that translates a file."""
         # the last bits of a network depend on the number of threads, and processes share cores
         torch.set_num_threads(1)
@@ -166,21 +166,18 @@ class _Maker:
                 noise_key=task.out.name,
                 resume=self.resume,
                 force=self.force,
-                monitor=monitor,
             )
 
         return work
 
 
-def _outcomes(
-    make: _Maker, tasks: Sequence[_Task], jobs: int, advance: Advance, monitor: Monitor
-) -> _Outcomes:
+def _outcomes(make: _Maker, tasks: Sequence[_Task], jobs: int) -> _Outcomes:
     """Yield the result of each task, or the reason why it failed."""
     if (jobs := min(jobs, len(tasks))) > 1:
-        yield from _in_processes(make, tasks, jobs, advance, monitor)
+        yield from _in_processes(make, tasks, jobs)
         return
     with _threads_kept():
-        work = make.work(Relay(advance, monitor.note))
+        work = make.work()
         for task in tasks:
             yield task, _outcome(partial(work, task))
 
@@ -192,28 +189,24 @@ def _outcome(result: Callable[[], Told]) -> Told | str:
         return str(error)
 
 
-def _in_processes(
-    make: _Maker, tasks: Sequence[_Task], jobs: int, advance: Advance, monitor: Monitor
-) -> _Outcomes:
+def _in_processes(make: _Maker, tasks: Sequence[_Task], jobs: int) -> _Outcomes:
     """Yield outcomes as they arrive; the processes end when the iterator is closed."""
     context = multiprocessing.get_context("spawn")  # torch does not survive a fork
     others = {*multiprocessing.active_children()}
-    told: SimpleQueue[int | str] = context.SimpleQueue()
-    noted: set[int | str] = set()
-    left: dict[Future[Told], _Task] = {}
-    with ProcessPoolExecutor(jobs, context, _begin, (make, told)) as pool:
+    noted: set[str] = set()
+    left: dict[Future[tuple[Told | str, list[logging.LogRecord]]], _Task] = {}
+    with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
         try:
             left |= {pool.submit(_work, task): task for task in tasks}
             while left:
-                done, _ = wait(left, TELL_EVERY_S, FIRST_COMPLETED)
-                while not told.empty():
-                    if isinstance(message := told.get(), int):
-                        advance(message)
-                    elif message not in noted:
-                        monitor.note(message)
-                        noted.add(message)
-                for future in done:
-                    yield left.pop(future), _outcome(future.result)
+                for future in wait(left, return_when=FIRST_COMPLETED).done:
+                    outcome, records = future.result()
+                    for record in records:
+                        logger = logging.getLogger(record.name)
+                        if record.msg not in noted and logger.isEnabledFor(record.levelno):
+                            logger.handle(record)
+                        noted.add(record.msg)
+                    yield left.pop(future), outcome
         except BrokenProcessPool as error:
             raise CpunetError(
                 "a process was ended, perhaps for lack of memory; try fewer --jobs, and "
@@ -226,17 +219,23 @@ def _in_processes(
                 pool.shutdown(cancel_futures=True)
 
 
-_translate: Callable[[_Task], Told]  # in a process of the pool
+# in a process of the pool: its work, and what it has to say
+_translate: Callable[[_Task], Told]
+_said: SimpleQueue[logging.LogRecord] = SimpleQueue()
 
 
-def _begin(make: _Maker, told: SimpleQueue[int | str]) -> None:
+def _begin(make: _Maker) -> None:
     """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     use_threads(1)
     global _translate
-    _translate = make.work(Relay(told.put, told.put))
+    _translate = make.work()
+    logger = logging.getLogger("cpunet")
+    logger.addHandler(QueueHandler(_said))
+    logger.setLevel(logging.INFO)
+    logging.getLogger("cpunet.progress").setLevel(logging.ERROR)  # the parent counts files
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:
@@ -252,11 +251,12 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(task: _Task) -> Told:
+def _work(task: _Task) -> tuple[Told | str, list[logging.LogRecord]]:
     try:
-        return _translate(task)
+        outcome = _outcome(partial(_translate, task))
     except SystemExit:  # which the pool would take for an outcome
         os._exit(1)
+    return outcome, [_said.get() for _ in range(_said.qsize())]
 
 
 @contextmanager
@@ -309,20 +309,6 @@ def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None
     for task in tasks:
         if not resume:
             refuse_existing(task.out, force=force)
-
-
-def _rows(sources: Sequence[InputFile]) -> int | None:
-    """Number of pulses in all files; None if that of one file is unknown."""
-    total = 0
-    for source in sources:
-        try:
-            n = source.open().n_pulses
-        except CpunetError:
-            n = 0  # its error is reported when it is translated
-        if n is None:
-            return None
-        total += n
-    return total
 
 
 def _naming(task: _Task, text: str) -> str:

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.monitor import Advance, Monitor
 from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.translation.library_file import (
     WAVEFORM,
@@ -24,6 +23,7 @@ from cpunet.jobs.translation.library_file import (
     sampling_period_ns,
 )
 from cpunet.outputs import refuse_existing, written_aside
+from cpunet.progress import Stage, stage
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.source import BLOCK_BYTES
@@ -31,7 +31,6 @@ from cpunet.pulses.writing import FileInTheMaking
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 
-QUIET = Monitor()
 TEMPLATES_AT_A_TIME = 1024
 KEPT = 256  # templates to measure the linearity with
 
@@ -87,7 +86,6 @@ def translate_library(
     currents: bool = False,
     device: str = "auto",
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Translate every template of a library without noise, and copy everything else unchanged.
 
@@ -111,7 +109,7 @@ def translate_library(
         averaged as for the current amplitude, with the maximum at time 0 (``t0`` is negative);
         ``drift_time_*_deg`` become the times of the maxima, by which a template must be
         shifted to be in its original position.
-    device, force, monitor
+    device, force
         See `cpunet.jobs.training.train.train_run`.
 
     Returns
@@ -133,8 +131,8 @@ def translate_library(
         paths = libraries(given, source)
         total = sum(n_templates(given, path, source) for path in paths)
     with opened(source) as given, written_aside(out) as aside:
-        with FileInTheMaking(aside, out) as made, monitor.stage("Templates", total) as advance:
-            _copy(given, made.h5, _Job(ren, tally, source, advance))
+        with FileInTheMaking(aside, out) as made, stage("Templates", total) as bar:
+            _copy(given, made.h5, _Job(ren, tally, source, bar))
         counts = tally.counts
         require_charge(str(source), counts["templates"], counts["moving"], tally.not_ending)
         assert tally.translate is not None
@@ -155,7 +153,7 @@ class _Job:
     ren: REN
     tally: _Tally
     source: Path
-    advance: Advance
+    bar: Stage
 
 
 def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
@@ -203,4 +201,4 @@ def _translate(
         results[unknown] = templates[unknown]
         made.put(rows, results, translate.dt_ns)
         job.tally.add(templates, codes, translate, seed=first)
-        job.advance(len(templates))
+        job.bar.update(len(templates))

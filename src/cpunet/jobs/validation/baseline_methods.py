@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,9 +16,11 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.measured_noise import noise_of_traces
 from cpunet.jobs.common.measured_remains import measured_remains
-from cpunet.jobs.common.monitor import Monitor
+from cpunet.progress import stage
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -51,7 +54,6 @@ def fit_baseline_methods(
     *,
     remains: DrawnRemains | None = None,
     fitted: bool,
-    monitor: Monitor,
 ) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
 
@@ -69,8 +71,6 @@ def fit_baseline_methods(
         Remains of earlier pulses as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
-    monitor
-        Receiver of the progress.
 
     Returns
     -------
@@ -91,15 +91,15 @@ def fit_baseline_methods(
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
-    with monitor.stage("Fitting baseline methods", len(kinds)) as advance:
+    with stage("Fitting baseline methods", len(kinds)) as bar:
         for name, kind in kinds.items():
             fit = partial(kind.fit, fit_sim, fit_data, sim.dt_ns, config.samples_before)
             method = _or_reason(result.missing, name, fit)
             if method is not None:
                 result.methods[name] = method
-            advance(1)
+            bar.update(1)
     for name, reason in result.missing.items():
-        monitor.note(f"{name} is left out: {reason}")
+        log.info(f"{name} is left out: {reason}")
     return result
 
 

@@ -23,7 +23,6 @@ from cpunet.jobs.common.inputs import (
     require_same_sampling,
 )
 from cpunet.jobs.common.matrices import one_thread_for_matrices
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
 from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
 from cpunet.jobs.validation.energy_ranges import (
@@ -37,6 +36,7 @@ from cpunet.jobs.validation.peak_sets import PeakSets, current_amplitudes, peak_
 from cpunet.jobs.validation.pulse_tests import survivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
+from cpunet.progress import stage
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
@@ -112,9 +112,7 @@ class ValidateOptions:
 
 
 @one_thread_for_matrices()
-def evaluate(
-    run: Path, sim: InputFile, data: InputFile, how: ValidateOptions, monitor: Monitor
-) -> Evaluation:
+def evaluate(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -> Evaluation:
     """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
     Raises
@@ -126,7 +124,7 @@ def evaluate(
     ren, iren = REN.load(run, device), IREN.load(run, device)
     recipe, trained_on = ren.recipe, str(info["peak"])
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
-    sim_set, data_set = _load_both(ren, sim, data, names, how, monitor)
+    sim_set, data_set = _load_both(ren, sim, data, names, how)
     responses = None if how.truth is None else Responses(how.truth, sim_set)
     others = fit_baseline_methods(
         sim_set,
@@ -136,19 +134,18 @@ def evaluate(
         recipe,
         remains=ren.remains,
         fitted=how.baselines,
-        monitor=monitor,
     )
-    made = translate_all(ren, others, sim_set, responses, how.seed, monitor)
+    made = translate_all(ren, others, sim_set, responses, how.seed)
     amplitudes = current_amplitudes(sim_set, data_set, made)
     sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
-    values, peaks = _scores(sets, recipe, how.seed, monitor)
+    values, peaks = _scores(sets, recipe, how.seed)
     scored = [peak for peak in sets if values[peak.name]]
     if not scored:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides; "
             "check the calibration (--kev-per-adc, --data-energy)"
         )
-    details = _details(scored, values, recipe, how.seed, monitor)
+    details = _details(scored, values, recipe, how.seed)
     kept = survivals(values, how.seed)
     metrics = {
         "compared": _compared(run, info, sim_set, data_set),
@@ -194,13 +191,12 @@ def _load_both(
     data: InputFile,
     names: list[str],
     how: ValidateOptions,
-    monitor: Monitor,
 ) -> tuple[InputSet, InputSet]:
     most = how.most
     more_kev = () if how.ae_range_kev is None else (how.ae_range_kev,)
     selection = validation_selection(names, ren.recipe, more_kev)
-    sim_set = load_simulated(sim, ren.recipe, selection, monitor, most=most)
-    data_set = load_measured(data, ren.recipe, selection, monitor, most=most)
+    sim_set = load_simulated(sim, ren.recipe, selection, most=most)
+    data_set = load_measured(data, ren.recipe, selection, most=most)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(
@@ -211,15 +207,15 @@ def _load_both(
 
 
 def _scores(
-    sets: Sequence[PeakSets], recipe: Recipe, seed: int, monitor: Monitor
+    sets: Sequence[PeakSets], recipe: Recipe, seed: int
 ) -> tuple[dict[str, ByMethod], dict[str, Any]]:
     """Parameters by peak and method, and the scores of each peak."""
     values: dict[str, ByMethod] = {}
     scores: dict[str, Any] = {}
-    with monitor.stage("Scoring", len(sets)) as advance:
+    with stage("Scoring", len(sets)) as bar:
         for peak in sets:
             values[peak.name], scores[peak.name] = score_peak(peak, recipe, seed)
-            advance(1)
+            bar.update(1)
     return values, scores
 
 
@@ -228,14 +224,13 @@ def _details(
     values: Mapping[str, ByMethod],
     recipe: Recipe,
     seed: int,
-    monitor: Monitor,
 ) -> dict[str, PeakDetails]:
     """Further comparisons of each scored peak."""
     details, bootstraps = {}, recipe.scores.bootstraps
-    with monitor.stage("Comparing in detail", len(scored)) as advance:
+    with stage("Comparing in detail", len(scored)) as bar:
         for peak in scored:
             details[peak.name] = peak_details(peak, values[peak.name], bootstraps, seed)
-            advance(1)
+            bar.update(1)
     return details
 
 

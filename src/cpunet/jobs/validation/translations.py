@@ -18,9 +18,9 @@ from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.drawn_remains import SameNoise
 from cpunet.electronics.finishing import blocks, finish, finish_both
 from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.common.truth import Responses
 from cpunet.jobs.validation.baseline_methods import FittedBaselineMethods
+from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
@@ -91,7 +91,6 @@ def translate_all(
     sim: InputSet,
     responses: Responses | None,
     seed: int,
-    monitor: Monitor,
 ) -> Translations:
     """Translate the simulated pulses by every method, with noise and without.
 
@@ -105,8 +104,6 @@ def translate_all(
         True noise-free records of these pulses, if known.
     seed
         Seed of the noise, common to all methods.
-    monitor
-        Receiver of the progress.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
     others = [*rivals.methods, *(["truth"] if responses is not None else [])]
@@ -125,7 +122,7 @@ def translate_all(
     noise = None if rivals.noise is None else SameNoise(rivals.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
-    with monitor.stage("Translating", len(pulses)) as advance:
+    with stage("Translating", len(pulses)) as bar:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
             clean = {"raw": block.waveforms}
@@ -149,7 +146,7 @@ def translate_all(
                 truth[rows] = clean["truth"]
             for name, numbers in _numbers(clean, recipe, sim.dt_ns).items():
                 parts.setdefault(name, []).append(numbers)
-            advance(len(block))
+            bar.update(len(block))
     whole = {name: _whole(windows) for name, windows in noisy.items()}
     joined = {name: _joined(found) for name, found in parts.items()}
     return Translations(ren, rivals, pulses, noisy, whole, joined, truth)

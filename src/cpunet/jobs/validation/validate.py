@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +11,10 @@ import numpy as np
 
 from cpunet.analysis.report_folder import REPORT, VALUES
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.outputs import folder_written_aside
+from cpunet.progress import Stage, stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.training.run_folder import read_info
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from cpunet.jobs.validation.drawings import Drawing
 
-QUIET, AS_USUAL = Monitor(), ValidateOptions()
+AS_USUAL = ValidateOptions()
 
 
 def validate_run(
@@ -34,7 +34,6 @@ def validate_run(
     how: ValidateOptions = AS_USUAL,
     *,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> dict[str, Any]:
     """Score a run on simulated and measured pulses and write the report folder.
 
@@ -61,7 +60,7 @@ def validate_run(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    return validated(run, sim, data, out, how, force=force, monitor=monitor)[0].metrics
+    return validated(run, sim, data, out, how, force=force)[0].metrics
 
 
 def validated(
@@ -72,17 +71,16 @@ def validated(
     how: ValidateOptions = AS_USUAL,
     *,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> tuple[Evaluation, dict[str, Drawing]]:
     """Like `validate_run`, also without `out`; return results, and functions that draw."""
     info = read_info(run)
     sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
     if out is None:
-        found = evaluate(run, sim, data, how, monitor)
+        found = evaluate(run, sim, data, how)
         return found, drawings(found)
     read = (run, *sim.files, *data.files, how.truth)
     with folder_written_aside(out, REPORT, *read, force=force) as folder:
-        found = evaluate(run, sim, data, how, monitor)
+        found = evaluate(run, sim, data, how)
         to_draw = drawings(found)
         found.forget_noisy()
         from cpunet.analysis.report import write_report
@@ -95,9 +93,9 @@ def validated(
             if name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
-        with monitor.stage("Drawing", len(to_draw)) as advance:
+        with stage("Drawing", len(to_draw)) as bar:
             notes = _notes(found.info, how.truth)
-            figures = {name: partial(_drawn, one, advance) for name, one in to_draw.items()}
+            figures = {name: partial(_drawn, one, bar) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes)
     return found, to_draw
 
@@ -127,10 +125,10 @@ def _of_remains(info: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _drawn(drawing: Drawing, advance: Callable[[int], None]) -> Figure:
+def _drawn(drawing: Drawing, bar: Stage) -> Figure:
     """Draw a figure and report progress."""
     figure = drawing()
-    advance(1)
+    bar.update(1)
     return figure
 
 

@@ -7,13 +7,12 @@ from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
-from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.compare import compare_reports
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.training.run_folder import INFO
 
-QUIET, AS_USUAL = Monitor(), ValidateOptions()
+AS_USUAL = ValidateOptions()
 INDEX = "index.html"
 
 
@@ -25,7 +24,6 @@ def validate_channels(
     how: ValidateOptions = AS_USUAL,
     *,
     force: bool = False,
-    monitor: Monitor = QUIET,
 ) -> Outcome[dict[str, Any]]:
     """Validate ``RUNS/CHANNEL`` for each channel of the data, in the folder ``OUT/CHANNEL``.
 
@@ -53,10 +51,10 @@ def validate_channels(
 
     def validate(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
         run = own_folder(runs, name, INFO)
-        return validate_run(run, *pair, folder, how, force=force, monitor=monitor)
+        return validate_run(run, *pair, folder, how, force=force)
 
     channels = paired(sim, data)
-    outcome = one_by_one(channels, out, validate, monitor.note)
+    outcome = one_by_one(channels, out, validate)
     if outcome.done:
         folders = [out / name for name in channels]
         # without force, a channel with a report fails and keeps it

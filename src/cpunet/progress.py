@@ -1,0 +1,94 @@
+"""How far long work is: a bar where someone looks on, else a line of the log now and then."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from tqdm.auto import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+log = logging.getLogger(__name__)
+
+LOG_EVERY_S = 30.0  # between lines of a log
+
+
+class Stage(tqdm):  # type: ignore[misc]
+    """A bar whose rate leaves out the first update, in which loops are compiled."""
+
+    monitor_interval = 0  # no thread that draws
+    _first: tuple[float, float] | None = None
+
+    def update(self, n: float = 1) -> None:
+        """Count `n` further items."""
+        self._first = self._first or (self.n + n, time.monotonic())
+        super().update(n)
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """What is shown; a rate of 0 is one that is not known yet."""
+        done, since = self._first or (self.n, 0.0)
+        rate = (self.n - done) / max(time.monotonic() - since, 1e-9)
+        form = None if self.total or self.n else "{desc}: {elapsed}"
+        return {**super().format_dict, "rate": rate, "bar_format": form}
+
+
+class _Logged(Stage):
+    """The same as a line."""
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        left = "/{total}, {rate_noinv_fmt}, {remaining} left"
+        known = self.total and self.n < self.total
+        form = "{desc}: {n}" + (left if known else ", {rate_noinv_fmt}") + "{postfix}"
+        return {**super().format_dict, "bar_format": form}
+
+
+class _Lines:
+    """A file whose lines go to the log."""
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            log.info(line)
+
+    def flush(self) -> None:
+        pass
+
+
+@contextmanager
+def stage(title: str, total: int | None = None) -> Iterator[Stage]:
+    """Show how far the work within is: by a bar on a terminal or in a notebook.
+
+    Elsewhere it is told at level INFO, every `LOG_EVERY_S` seconds and at the end.  A level of
+    the logger ``cpunet`` above WARNING silences bars, too.
+
+    Parameters
+    ----------
+    title
+        What is done.
+    total
+        Number of items; None if it is unknown.
+
+    Yields
+    ------
+    Stage
+        To be updated with the number of items done since the last update.
+    """
+    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+        own = logging.getLogger("cpunet")
+        speaking = [own] if own.handlers else None  # else the root, which writes above the bar
+        silent = not log.isEnabledFor(logging.WARNING)
+        how = {"leave": None, "miniters": 1, "unit": "", "dynamic_ncols": True}
+        bar = Stage(None, title, total, disable=silent, **how)
+        with bar, logging_redirect_tqdm(speaking):
+            yield bar
+        return
+    often = {"miniters": 1, "mininterval": LOG_EVERY_S, "delay": LOG_EVERY_S}
+    with _Logged(None, title, total, leave=False, file=_Lines(), unit="", **often) as bar:
+        start = time.monotonic()
+        yield bar
+    log.info("%s: done in %.1f s", title, time.monotonic() - start)

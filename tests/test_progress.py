@@ -1,0 +1,89 @@
+"""How far long work is: a bar on a terminal, lines of a log elsewhere, and nothing torn."""
+
+from __future__ import annotations
+
+import io
+import logging
+import time
+from contextlib import redirect_stderr
+
+import pytest
+
+from cpunet import progress
+from cpunet.progress import stage
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def log(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    """Lines of a log that is told of every update."""
+    monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
+    caplog.set_level("INFO", "cpunet")
+    return caplog
+
+
+def test_a_bar_of_a_terminal() -> None:
+    with redirect_stderr(Terminal()) as terminal, stage("Reading [a]", 2) as bar:
+        bar.update(2)
+    assert "Reading [a]: 100%" in terminal.getvalue()
+    assert "2/2" in terminal.getvalue()
+
+
+def test_messages_do_not_tear_a_bar() -> None:
+    with redirect_stderr(Terminal()) as terminal, stage("Reading", 2) as bar:
+        bar.update()
+        logging.getLogger("cpunet.somewhere").warning("few pulses")
+    assert "\rfew pulses\n\rReading" in terminal.getvalue()
+
+
+def test_no_bar_if_the_logger_is_silenced(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("ERROR", "cpunet")
+    with redirect_stderr(Terminal()) as terminal, stage("Reading", 2) as bar:
+        bar.update()
+    assert terminal.getvalue() == ""
+
+
+def test_the_first_step_is_not_in_the_remaining_time() -> None:
+    with redirect_stderr(Terminal()), stage("Matching", 1001) as bar:
+        time.sleep(0.5)  # as if loops were compiled
+        bar.update()
+        first = str(bar)
+        for _ in range(100):
+            time.sleep(0.001)
+            bar.update()
+        later = str(bar)
+    assert "<?, ?/s]" in first
+    assert "<00:0" in later
+
+
+def test_a_log_has_lines_with_the_time_left(log: pytest.LogCaptureFixture) -> None:
+    with stage("Matching", 2) as bar:
+        for _ in range(3):
+            time.sleep(0.01)
+            bar.set_postfix_str("chi-square 7", refresh=False)
+            bar.update()
+    begun, first, second, third, done = log.messages
+    assert begun.startswith("Matching: 0/2")
+    assert "? left" in first
+    # one that takes longer than its total has no time left, and no total
+    assert "left" not in second + third + done
+    assert third.startswith("Matching: 3, ")
+    assert third.endswith("/s, chi-square 7")
+    assert done.startswith("Matching: done in ")
+
+
+def test_a_log_is_told_of_failures_by_others(log: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ValueError, match="no"), stage("Reading"):
+        raise ValueError("no")
+    assert not any("done" in message for message in log.messages)
+
+
+def test_a_short_stage_is_a_line(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "cpunet")
+    with stage("Reading", 9) as bar:
+        bar.update(9)
+    assert len(caplog.messages) == 1
