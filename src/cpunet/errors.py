@@ -7,4 +7,18 @@ class CpunetError(Exception):
     """Bad input, described in one line: which file, which event, what to do.
 
     The command line prints the message and exits with status 2.
+
+    Parameters
+    ----------
+    text
+        What is wrong.
+    remedy
+        What to do, which ends the message; empty if the text says it.
     """
+
+    def __init__(self, text: str, remedy: str = "") -> None:
+        super().__init__(text, remedy)
+        self.text, self.remedy = text, remedy
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.remedy}" if self.remedy else self.text

@@ -155,7 +155,8 @@ def tune_recipe(
 
     done = len(study.get_trials(states=states))
     with stage("Trials", trials) as bar:
-        bar.update(done)
+        if done:
+            bar.update(done)
         if done < trials:
             study.optimize(
                 objective,

@@ -108,7 +108,7 @@ def load_prepared(
                 n_kept = _thin(sets, drawn, most)
             bar.update(len(block))
     if not n_kept:
-        raise CpunetError(_nothing_left(source, sets))
+        raise _nothing_left(source, sets)
     if most is not None and n_kept > most:
         n_kept = _thin(sets, drawn, most)
     return _joined(sets, n_kept)
@@ -171,13 +171,13 @@ def _prepare_selected(
     )
 
 
-def _nothing_left(source: Source, sets: list[Prepared]) -> str:
+def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
     codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
     if not len(codes):
-        return f"{source.path}: holds no pulses; choose another file or table"
+        return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")
     counts = np.bincount(codes)
     reasons = ", ".join(
         f"{counts[c]} {Rejection(int(c)).label}" for c in np.flatnonzero(counts)
     )
-    remedy = _REMEDIES[Rejection(int(counts.argmax()))]
-    return f"{source.path}: none of {len(codes)} pulses can be used ({reasons}); {remedy}"
+    text = f"{source.path}: none of {len(codes)} pulses can be used ({reasons})"
+    return CpunetError(text, _REMEDIES[Rejection(int(counts.argmax()))])

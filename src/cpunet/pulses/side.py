@@ -74,7 +74,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         begin = " If" if remedy.endswith("?") else "; if"
         sure = "" if found.certain else f"{begin} they are {wanted}, say so with --insist"
         raise CpunetError(
-            f"{source.path}: given as {wanted} pulses, but these {found.why}; {remedy}{sure}"
+            f"{source.path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
         )
 
 

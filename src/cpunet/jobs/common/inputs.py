@@ -168,14 +168,15 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         ]
         if max(counts) == 0:
             raise CpunetError(
-                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be "
-                "used; leave it out of --peak"
+                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
+                "leave it out of --peak",
             )
         if min(counts) == 0:
             missing, there = (sim, data) if counts[0] == 0 else (data, sim)
             raise CpunetError(
                 f"{missing.path}: no pulse of {part.name} can be used, {there.path.name} has "
-                f"{max(counts)}; leave it out of --peak, or give a file that has them"
+                f"{max(counts)}",
+                "leave it out of --peak, or give a file that has them",
             )
     lines = selection.lines_in_ranges
     if not lines:
@@ -189,7 +190,8 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
     if not np.isclose(sim.dt_ns, data.dt_ns):
         raise CpunetError(
             f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
-            f"{data.dt_ns:g} ns; resample one of them"
+            f"{data.dt_ns:g} ns",
+            "resample one of them",
         )
 
 
@@ -221,6 +223,8 @@ def _load(
         )
     except CpunetError as error:
         hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
+        if not hint:
+            raise
         raise CpunetError(f"{error}{hint}") from error
     cuts = None
     if side == "measured":
@@ -228,7 +232,7 @@ def _load(
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
             raise CpunetError(
-                f"{file.path}: the quality cuts leave no pulse; widen cuts.*_sigmas"
+                f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
     elif tell and _decays(prepared, recipe):
         log.warning(

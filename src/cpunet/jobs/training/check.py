@@ -171,9 +171,7 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
 
 
 def _refusal(what: str, error: CpunetError) -> Finding:
-    message = str(error)
-    text, _, remedy = message.rpartition("; ")
-    return Finding(what, Level.ERROR, text or message, remedy if text else "")
+    return Finding(what, Level.ERROR, error.text, error.remedy)
 
 
 def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
