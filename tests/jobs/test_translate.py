@@ -411,6 +411,18 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
+def test_what_processes_say_is_heard(run, tmp_path, caplog):
+    sources = [InputFile(tmp_path / f"sim_{i}.hdf5") for i in range(2)]
+    for source in sources:
+        with h5py.File(source.path, "w") as file:
+            file["waveform"], file["dt_ns"] = charge(), DT_NS
+            file["energy_kev"], file["short"] = np.full(N, 1000.0), np.arange(3)
+    translate_files(run, sources, tmp_path / "out", jobs=2, device="cpu")
+    told = sorted((record.levelname, record.message[:10]) for record in caplog.records)
+    assert told == [("WARNING", "sim_0.hdf5"), ("WARNING", "sim_1.hdf5")]
+
+
 def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
     out = tmp_path / "out"
     translate_files(run, many[:2], out, device="cpu")
