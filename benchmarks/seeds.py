@@ -38,7 +38,7 @@ def one_seed(
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         before = time.process_time()
-        info = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
+        made = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
         cpu = time.process_time() - before
         metrics = evaluate(
             run,
@@ -51,7 +51,7 @@ def one_seed(
             ),
             Monitor(),
         ).metrics
-    found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
+    found: dict[str, Any] = {"seed": seed, "seconds": made.seconds, "cpu": cpu}
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():

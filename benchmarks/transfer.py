@@ -67,7 +67,7 @@ def main() -> None:
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
             recipe = load_recipe("fast")
-            info = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
+            made = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
             scored = evaluate(
                 run,
                 sim,
@@ -77,7 +77,7 @@ def main() -> None:
                 ),
                 Monitor(),
             )
-            rows[title] = (info["seconds"], scored.metrics)
+            rows[title] = (made.seconds, scored.metrics)
     show(rows)
 
 

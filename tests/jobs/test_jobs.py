@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +30,16 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.run_folder import write_run
-from synthetic import KEV, SMALL_NETWORK, Files, Listening, prepared_truth, write_files
+from cpunet.training.run import Run
+from synthetic import (
+    KEV,
+    SMALL_NETWORK,
+    Files,
+    Listening,
+    prepared_truth,
+    write_files,
+    write_run,
+)
 
 RECIPE = load_recipe(
     "paper",
@@ -71,20 +78,18 @@ def sim_set(files) -> InputSet:
 
 def test_provenance_counts_and_fingerprints(files, sim_set):
     told = sim_set.provenance()
-    assert (told["file"], told["dt_ns"]) == (str(files[0].path), 16)
-    assert (told["read"], told["used"]) == (N, 2 * N // 3)
-    assert told["rejections"] == {"energy_outside_selection": N // 3}
-    assert told["cuts"] is None
+    assert (told.file, told.dt_ns) == (str(files[0].path), 16)
+    assert (told.read, told.used) == (N, 2 * N // 3)
+    assert told.rejections == {"energy_outside_selection": N // 3}
+    assert told.cuts is None
     content = sim_set.prepared.pulses.waveforms.tobytes()
-    assert told["sha256"] == hashlib.sha256(content).hexdigest()
-    json.dumps(told)
+    assert told.sha256 == hashlib.sha256(content).hexdigest()
 
 
 def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
     selection = parse_selection("FEP", RECIPE.peaks)
     told = load_measured(files[1], RECIPE, selection, Monitor()).provenance()
-    assert {window["name"] for window in told["cuts"]["windows"]} >= {"tail_slope", "baseline"}
-    json.dumps(told)
+    assert {window.name for window in told.cuts.windows} >= {"tail_slope", "baseline"}
 
 
 def test_measured_pulses_given_as_simulated_ones_are_doubted(files):
@@ -151,7 +156,7 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
 
 def test_a_training_tells_what_it_does(files, tmp_path):
     monitor = Listening()
-    info = train_run(
+    made = train_run(
         *files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"), monitor=monitor
     )
     assert monitor.stages == {
@@ -160,18 +165,20 @@ def test_a_training_tells_what_it_does(files, tmp_path):
         "Training": [2, 2],
     }
     assert monitor.notes[0].startswith("sim.lh5: 10 of 30 pulses used (left out: 20 energy_")
-    assert json.loads((tmp_path / "run" / "run.json").read_text()) == info
-    assert (info["seed"], info["device"]) == (7, "cpu")
+    assert Run.load(made.folder).model_dump(exclude={"weights"}) == made.model_dump(
+        exclude={"weights"}
+    )
+    assert (made.seed, made.device) == (7, "cpu")
 
 
 def test_a_range_of_energies(files, tmp_path):
     monitor = Listening()
     how = TrainOptions(peak="1500-2200", device="cpu")
-    info = train_run(*files, tmp_path / "run", RECIPE, how, monitor=monitor)
+    made = train_run(*files, tmp_path / "run", RECIPE, how, monitor=monitor)
     told = "warning: SEP, DEP are in the range trained on, and no test of it any more"
     assert [note for note in monitor.notes if "trained on" in note] == [told]
-    assert info["peak"] == "1500-2200"
-    assert info["sim"]["used"] == 20
+    assert made.peak == "1500-2200"
+    assert made.sim.used == 20
 
 
 @pytest.mark.parametrize("inverse", [False, True])

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from cpunet.analysis.calibration_figures import calibration_figures
 from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.calls.progress import shown
-from cpunet.calls.runs import Run
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
@@ -26,10 +26,9 @@ from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.run_folder import read_info
+from cpunet.training.run import Run
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class CalibratedRun(Run):
     """A run whose simulation was fitted together with the readout.
 
@@ -39,10 +38,10 @@ class CalibratedRun(Run):
         Content of ``calibration.json``.
     """
 
-    content: Mapping[str, Any] = field(default_factory=dict)
+    content: dict[str, Any] = Field({}, exclude=True, repr=False)
 
     @classmethod
-    def load(cls, folder: str | Path) -> CalibratedRun:
+    def load(cls, folder: str | Path) -> Self:
         """Open the folder of a calibration.
 
         Raises
@@ -50,15 +49,15 @@ class CalibratedRun(Run):
         CpunetError
             If the folder is not a calibrated run.
         """
-        folder = Path(folder)
-        info = read_info(folder)
-        if not (folder / CALIBRATION).is_file():
+        run, path = super().load(folder), Path(folder) / CALIBRATION
+        if not path.is_file():
             raise CpunetError(
                 f"{folder}: no calibrated run (no {CALIBRATION}); open it with "
                 "cpunet.Run.load, or calibrate"
             )
-        content = read_json(folder / CALIBRATION, "calibrate again")
-        return cls(folder, info, tuple(content.get("notes", ())), content)
+        content = read_json(path, "calibrate again")
+        notes = tuple(content.get("notes", ()))
+        return run.model_copy(update={"content": content, "notes": notes})
 
     @property
     def physics(self) -> dict[str, dict[str, Any]]:
@@ -66,19 +65,24 @@ class CalibratedRun(Run):
         return dict(self.content["parameters"])
 
     @property
-    def sim(self) -> Path:
+    def simulation(self) -> Path:
         """File of all events, simulated again with the calibrated physics."""
-        return self.folder / SIM
+        return self._folder / SIM
 
     @cached_property
     def detector(self) -> Detector:
         """The calibrated detector."""
-        return read_detector(str(self.folder / DETECTOR))
+        return read_detector(str(self._folder / DETECTOR))
 
     @cached_property
     def settings(self) -> SimulationSettings:
         """The calibrated settings of the simulation."""
-        return read_settings(SimulationSettings, self.folder / SETTINGS)
+        return read_settings(SimulationSettings, self._folder / SETTINGS)
+
+    @property
+    def _folder(self) -> Path:
+        assert self.folder is not None  # a calibration always has one
+        return self.folder
 
     @property
     def figures(self) -> dict[str, Figure]:
@@ -179,5 +183,6 @@ def calibrate(
         events=events,
         seed=seed,
     )
-    content = job.run(Path(out), force=force, monitor=monitor)
-    return CalibratedRun(Path(out), read_info(Path(out)), tuple(monitor.notes), content)
+    job.run(Path(out), force=force, monitor=monitor)
+    run = CalibratedRun.load(out)
+    return run.model_copy(update={"notes": tuple(monitor.notes)})

@@ -49,7 +49,7 @@ def weights(
     """
     from cpunet.jobs.training.import_published import import_weights
 
-    info = import_weights(
+    run = import_weights(
         out_folder,
         ren=ren,
         iren=iren,
@@ -60,7 +60,7 @@ def weights(
         force=force,
         monitor=monitor(),
     )
-    tell(f"{out_folder}: a run of {', '.join(info['imported'])}")
+    tell(f"{out_folder}: a run of {', '.join(run.imported)}")
 
 
 @import_.command()

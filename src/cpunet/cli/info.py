@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cpunet.cli import options
-from cpunet.cli.messages import tell, warn
+from cpunet.cli.messages import tell
 from cpunet.cli.simulate import EnergyUnit, LengthUnit
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.info_words import Lines, in_words
@@ -70,7 +70,6 @@ def info(
     from cpunet.jobs.inspection.info import describe
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
-    from cpunet.training.run_schema import problem
 
     for target in (out, without_remains):
         if target is not None:
@@ -88,8 +87,6 @@ def info(
         out=out,
         force=force,
     )
-    if told["kind"] == "run" and (wrong := problem(told)):
-        warn(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
         tell(_tables(told))
         tell("one of them: --table NAME; each in full: --table all")

@@ -6,7 +6,7 @@ import shlex
 import signal
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
@@ -15,6 +15,9 @@ from cpunet.cli.channels import tell_channels
 from cpunet.cli.messages import fail, monitor, tell
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.outputs import refuse_inputs
+
+if TYPE_CHECKING:
+    from cpunet.training.run import Run
 
 Out = Annotated[Path, typer.Option("--out", help="Run folder to make.")]
 Resume = Annotated[
@@ -88,8 +91,8 @@ def train(
     shown.note(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
 
 
-def _in_words(info: dict[str, Any]) -> str:
-    return f"trained in {info['seconds']:.0f} s on {info['device']}"
+def _in_words(run: Run) -> str:
+    return f"trained in {run.seconds:.0f} s on {run.device}"
 
 
 class _StopRequest:

@@ -41,7 +41,7 @@ from cpunet.outputs import (
     require_replaceable,
 )
 from cpunet.training.loop import Record, State
-from cpunet.training.run_folder import LOSSES, RUN
+from cpunet.training.run import LOSSES, RUN
 
 FORMAT = 3
 MARKER, CHECKPOINT, ASIDE = "unfinished.json", "checkpoint.pt", ".checkpoint.partial"

@@ -46,7 +46,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.run_folder import RUN, write_run
+from cpunet.training.run import RUN
 
 QUIET = Monitor()
 CALIBRATION, SIM = "calibration.json", "sim.lh5"
@@ -153,16 +153,23 @@ class Calibration:
             training = self.recipe.training.model_copy(update={"drift_terms": 0})
             recipe = self.recipe.model_copy(update={"training": training})
             how = TrainOptions(self.peak, self.seed, "cpu")
-            job = TrainingJob(recipe, how, again, sides.data, self.data, folder, monitor)
-            model, info, recipe = ResponseTrainer(recipe).train(job, known=calibrated.response)
-            info["sim"]["file"] = str(out / SIM)
-            info["started"] = started.isoformat(timespec="seconds")
-            info["seconds"] = content["seconds"] = round(time.perf_counter() - clock, 1)
-            content["fit"] = {k: info["fit"][k] for k in ("chi_square", "moments", "verdict")}
+            job = TrainingJob(recipe, how, again, sides.data, self.data, None, folder, monitor)
+            run = ResponseTrainer(recipe).train(job, known=calibrated.response)
+            content["seconds"] = round(time.perf_counter() - clock, 1)
+            assert run.fit is not None  # of a chain
+            content["fit"] = run.fit.model_dump(include={"chi_square", "moments", "verdict"})
+            run = run.model_copy(
+                update={
+                    "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
+                    "started": started.isoformat(timespec="seconds"),
+                    "seconds": content["seconds"],
+                    "calibration": CALIBRATION,
+                }
+            )
             (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
             for name, figure in calibration_figures(content).items():
                 figure.savefig(folder / f"{name}.png", dpi=DPI)
-            write_run(folder, model, recipe, info | {"calibration": CALIBRATION})
+            run.write(folder)
         return content
 
     @one_thread_for_matrices()

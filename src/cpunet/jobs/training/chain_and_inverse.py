@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from torch import nn
@@ -26,7 +25,7 @@ from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
-from cpunet.training.run_folder import load_network, read_recipe
+from cpunet.training.run import FitInfo, Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Sides:
     data_set: InputSet | None = None
 
 
-def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
+def known_response(run: Run, like: Recipe) -> Readout:
     """The response of a run, as a starting point for a recipe.
 
     Raises
@@ -50,16 +49,13 @@ def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
     CpunetError
         If the run has no response of the recipe's kind.
     """
-    recipe = read_recipe(run)
-    generator = recipe.generator
+    generator = run.recipe.generator
     if generator.name != like.generator.name or isinstance(generator, PunetConfig):
         raise CpunetError(
-            f"{run}: of recipe {recipe.name}, from which {like.name} cannot start; give a run "
-            f"of {like.name}"
+            f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
+            f"give a run of {like.name}"
         )
-    network = ResponseGenerator(generator, dt_ns)
-    load_network(run, "ren", network)
-    known: Readout = network.response
+    known: Readout = run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
     return known
 
 
@@ -70,7 +66,7 @@ def match(
     listen: Listener,
     monitor: Monitor,
     known: Readout | None = None,
-) -> tuple[nn.Module, dict[str, Any], Recipe]:
+) -> tuple[nn.Module, FitInfo, Recipe]:
     """Measure the noise, fit the response, and invert it.
 
     Parameters
@@ -91,8 +87,7 @@ def match(
     Returns
     -------
     tuple
-        Module with ``ren`` and ``iren``, the entry on the fit for ``run.json``, and the recipe
-        of the response as fitted.
+        Module with ``ren`` and ``iren``, the fit, and the recipe of the response as fitted.
 
     Raises
     ------
@@ -121,6 +116,7 @@ def match(
     _note(fit, told, monitor)
     if told_of_remains is not None:
         told["remains"] = told_of_remains
+    fit_info = FitInfo.model_validate(told)
     # as fitted: a ringing or a stretch may have been added
     recipe = recipe.model_copy(update={"generator": response.config})
     chain = ResponseGenerator(response.config, sides.sim.dt_ns)
@@ -128,13 +124,13 @@ def match(
     chain.set_noise(noise)
     chain.remains = drawn
     iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
-    return nn.ModuleDict({"ren": chain, "iren": iren}), {"fit": told}, recipe
+    return nn.ModuleDict({"ren": chain, "iren": iren}), fit_info, recipe
 
 
 def _described(
     fit: Fit, response: Readout, noise: BaselineNoise, sides: Sides
 ) -> dict[str, Any]:
-    """Entry on the fit for ``run.json``."""
+    """Content of `FitInfo`, without remains."""
     parameters = response.describe()
     return {
         "parameters": parameters,

@@ -10,16 +10,16 @@ from pathlib import Path
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.chain_and_inverse import known_response, match
-from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
+from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.networks.response_layer import Readout
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import Record
-from cpunet.training.run_folder import RUN, append_losses
+from cpunet.training.run import RUN, Run, append_losses
 
 
 class ResponseTrainer:
-    """Fits a readout chain; see `cpunet.jobs.training.trainers.Trainer`."""
+    """Fits a readout chain; see `cpunet.jobs.training.train.TRAINERS`."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
@@ -42,11 +42,11 @@ class ResponseTrainer:
         self,
         job: TrainingJob,
         known: Readout | None = None,
-    ) -> Trained:
+    ) -> Run:
         """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
         started, clock = datetime.now(UTC), time.perf_counter()
-        if job.options.init is not None:
-            known = known_response(job.options.init, job.data.dt_ns, self.recipe)
+        if job.init is not None:
+            known = known_response(job.init, self.recipe)
         # upper limit for one start; most fits need fewer steps
         steps = self.recipe.matching.training.steps
         with job.monitor.stage("Matching", steps) as advance:
@@ -58,9 +58,9 @@ class ResponseTrainer:
                 advance(1)
                 job.monitor.state(f"chi-square {chi_square:.4g}")
 
-            model, told, recipe = match(
+            model, fit, recipe = match(
                 job.sides, self.recipe, job.options.seed, listen, job.monitor, known
             )
         seconds = time.perf_counter() - clock
-        info = job.info(started.isoformat(timespec="seconds"), seconds)
-        return Trained(model, info | told, recipe)
+        began = started.isoformat(timespec="seconds")
+        return job.run(model, recipe, began, seconds, fit=fit)

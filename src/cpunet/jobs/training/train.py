@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,13 +22,19 @@ from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.trainers import trainer_for
+from cpunet.jobs.training.cyclegan_trainer import CycleGanTrainer
+from cpunet.jobs.training.response_trainer import ResponseTrainer
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import read_info, write_run
+from cpunet.training.run import Run, as_run
 
 QUIET, AS_USUAL = Monitor(), TrainOptions()
+TRAINERS: dict[str, type[ResponseTrainer | CycleGanTrainer]] = {
+    "matching": ResponseTrainer,
+    "cyclegan": CycleGanTrainer,
+}
+"""By method: ``workplace`` is a context of the folder to write to, ``train`` fits."""
 
 
 @one_thread_for_matrices()
@@ -42,7 +47,7 @@ def train_run(
     *,
     stop: Callable[[], bool] = lambda: False,
     monitor: Monitor = QUIET,
-) -> dict[str, Any]:
+) -> Run:
     """Train REN and IREN on the pulses of a peak and write the run folder.
 
     Parameters
@@ -59,8 +64,8 @@ def train_run(
 
     Returns
     -------
-    dict
-        Content of ``run.json``.
+    Run
+        The trained run.
 
     Raises
     ------
@@ -71,17 +76,19 @@ def train_run(
         If `stop` returned true.
     """
     keep_freed_memory()
-    trainer = trainer_for(recipe)
+    trainer = TRAINERS[recipe.training.method](recipe)
+    init = None if options.init is None else as_run(options.init)
     options = replace(options, device=resolve_device(options.device))
     selection = parse_selection(options.peak, recipe.peaks)
-    read = (*sim.files, *data.files, options.init)
+    read = (*sim.files, *data.files, None if init is None else init.folder)
     with trainer.workplace(out, read, options) as folder:
         sim_set, data_set = _read(sim, data, recipe, selection, monitor)
-        if options.init is not None:
-            _require_sampling(options.init, data_set)
-        job = TrainingJob(recipe, options, sim_set, data_set, data, folder, monitor, stop)
-        done = trainer.train(job)
-        return write_run(folder, done.model, done.recipe, done.info)
+        if init is not None:
+            _require_sampling(init, data_set)
+        job = TrainingJob(recipe, options, sim_set, data_set, data, init, folder, monitor, stop)
+        run = trainer.train(job)
+        run.write(folder)
+    return run.model_copy(update={"folder": out})
 
 
 def _read(
@@ -102,9 +109,8 @@ def _read(
     return sim_set, data_set
 
 
-def _require_sampling(init: Path, data: InputSet) -> None:
+def _require_sampling(init: Run, data: InputSet) -> None:
     """Raise a `CpunetError` if the run to start from has another sampling period."""
-    known_ns = float(read_info(init)["dt_ns"])
-    if not np.isclose(known_ns, data.dt_ns):
-        kinds = f"trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-        raise CpunetError(f"{init}: {kinds}; resample them")
+    if not np.isclose(init.dt_ns, data.dt_ns):
+        kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
+        raise CpunetError(f"{init.name}: {kinds}; resample them")

@@ -10,7 +10,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
-from cpunet.training.run_folder import INFO
+from cpunet.training.run import INFO
 
 QUIET, DEFAULTS = Monitor(), TranslateOptions()
 

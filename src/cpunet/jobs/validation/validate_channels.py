@@ -11,7 +11,7 @@ from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.validation.compare import compare_reports
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
-from cpunet.training.run_folder import INFO
+from cpunet.training.run import INFO
 
 QUIET, AS_USUAL = Monitor(), ValidateOptions()
 INDEX = "index.html"
