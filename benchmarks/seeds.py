@@ -36,9 +36,9 @@ def one_seed(
     files = InputFile(sim / "sim.lh5"), InputFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
         before = time.process_time()
-        made = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
+        how = load_recipe(recipe, overrides), TrainOptions(seed=seed)
+        run = train_run(*files, Path(folder) / "run", *how)
         cpu = time.process_time() - before
         metrics = evaluate(
             run,
@@ -51,7 +51,7 @@ def one_seed(
             ),
             Monitor(),
         ).metrics
-    found: dict[str, Any] = {"seed": seed, "seconds": made.seconds, "cpu": cpu}
+    found: dict[str, Any] = {"seed": seed, "seconds": run.seconds, "cpu": cpu}
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():

@@ -69,7 +69,7 @@ def main() -> None:
             recipe = load_recipe("fast")
             made = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
             scored = evaluate(
-                run,
+                made,
                 sim,
                 data,
                 ValidateOptions(

@@ -388,7 +388,7 @@ class Run(_Part):
 
         there = self.recipe.generator.name == "response" or self.records
         picture = notebook_picture(self.plot()) if there else ""
-        return part("object", "cpunet run", dict(self.summary()), picture=picture)
+        return part("object", "cpunet run", rows=self.summary(), picture=picture)
 
 
 RunLike: TypeAlias = Run | str | Path

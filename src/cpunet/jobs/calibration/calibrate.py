@@ -39,7 +39,7 @@ from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.training.response_trainer import ResponseTrainer
+from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.recipes.schema import Recipe
@@ -154,7 +154,7 @@ class Calibration:
             recipe = self.recipe.model_copy(update={"training": training})
             how = TrainOptions(self.peak, self.seed, "cpu")
             job = TrainingJob(recipe, how, again, sides.data, self.data, None, folder, monitor)
-            run = ResponseTrainer(recipe).train(job, known=calibrated.response)
+            run = train_chain(job, calibrated.response)
             content["seconds"] = round(time.perf_counter() - clock, 1)
             assert run.fit is not None  # of a chain
             content["fit"] = run.fit.model_dump(include={"chi_square", "moments", "verdict"})

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +13,9 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
-from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
+from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.recipes.schema import Recipe
-from cpunet.training.checkpoints import UnfinishedRun, unfinished_folder
+from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
@@ -27,52 +25,36 @@ from cpunet.training.run import FitInfo, Run, read_losses
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 
 
-class CycleGanTrainer:
-    """Trains a CycleGAN; see `cpunet.jobs.training.train.TRAINERS`."""
+def train_networks(job: TrainingJob) -> Run:
+    """Train the networks of a CycleGAN, or resume their training."""
+    recipe, how = job.recipe, job.options
+    run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job), job.monitor.note)
+    state = run.begin(resume=how.resume)
+    outside, fit = outside_noise(job.sides, recipe, job.monitor)
+    left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
+    with job.monitor.stage("Training", left) as advance:
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe = recipe
+        def listen(records: list[Record]) -> None:
+            run.log(records)
+            advance(len(records))
 
-    def workplace(
-        self,
-        out: Path,
-        read: Sequence[Path | str | None],
-        options: TrainOptions,
-    ) -> AbstractContextManager[Path]:
-        """Context of ``OUT.unfinished``, which becomes `out` when the training is complete."""
-        resume, force = options.resume, options.force
-        return unfinished_folder(out, *read, resume=resume, force=force)
-
-    def train(self, job: TrainingJob) -> Run:
-        """Train or resume."""
-        recipe, how = self.recipe, job.options
-        run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job), job.monitor.note)
-        state = run.begin(resume=how.resume)
-        outside, fit = outside_noise(job.sides, recipe, job.monitor)
-        left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
-        with job.monitor.stage("Training", left) as advance:
-
-            def listen(records: list[Record]) -> None:
-                run.log(records)
-                advance(len(records))
-
-            model = train(
-                job.sim.prepared.pulses.waveforms,
-                job.data.prepared.pulses.waveforms,
-                recipe,
-                seed=how.seed,
-                device=how.device,
-                init=None if job.init is None else weights_of(job.init, recipe),
-                outside=outside,
-                listener=listen,
-                hooks=CheckpointHooks(run.save, state, job.stop),
-            )
-        run.finish()
-        for line in judges_noted(read_losses(job.folder)):
-            job.monitor.note(f"warning: {line}")
-        resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-        more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
-        return job.run(model, recipe, run.started, run.seconds, **more)
+        model = train(
+            job.sim.prepared.pulses.waveforms,
+            job.data.prepared.pulses.waveforms,
+            recipe,
+            seed=how.seed,
+            device=how.device,
+            init=None if job.init is None else weights_of(job.init, recipe),
+            outside=outside,
+            listener=listen,
+            hooks=CheckpointHooks(run.save, state, job.stop),
+        )
+    run.finish()
+    for line in judges_noted(read_losses(job.folder)):
+        job.monitor.note(f"warning: {line}")
+    resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
+    more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
+    return job.run(model, recipe, run.started, run.seconds, **more)
 
 
 def outside_noise(

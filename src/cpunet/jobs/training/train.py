@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,19 +23,20 @@ from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.common.monitor import Monitor
 from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.cyclegan_trainer import CycleGanTrainer
-from cpunet.jobs.training.response_trainer import ResponseTrainer
+from cpunet.jobs.training.cyclegan_trainer import train_networks
+from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
+from cpunet.outputs import folder_written_aside
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run import Run, as_run
+from cpunet.training.checkpoints import unfinished_folder
+from cpunet.training.run import RUN, Run, as_run
 
 QUIET, AS_USUAL = Monitor(), TrainOptions()
-TRAINERS: dict[str, type[ResponseTrainer | CycleGanTrainer]] = {
-    "matching": ResponseTrainer,
-    "cyclegan": CycleGanTrainer,
+FITS: dict[str, Callable[[TrainingJob], Run]] = {
+    "matching": train_chain,
+    "cyclegan": train_networks,
 }
-"""By method: ``workplace`` is a context of the folder to write to, ``train`` fits."""
 
 
 @one_thread_for_matrices()
@@ -76,19 +78,33 @@ def train_run(
         If `stop` returned true.
     """
     keep_freed_memory()
-    trainer = TRAINERS[recipe.training.method](recipe)
     init = None if options.init is None else as_run(options.init)
     options = replace(options, device=resolve_device(options.device))
     selection = parse_selection(options.peak, recipe.peaks)
     read = (*sim.files, *data.files, None if init is None else init.folder)
-    with trainer.workplace(out, read, options) as folder:
+    with _workplace(out, read, recipe, options) as folder:
         sim_set, data_set = _read(sim, data, recipe, selection, monitor)
         if init is not None:
             _require_sampling(init, data_set)
         job = TrainingJob(recipe, options, sim_set, data_set, data, init, folder, monitor, stop)
-        run = trainer.train(job)
+        run = FITS[recipe.training.method](job)
         run.write(folder)
     return run.model_copy(update={"folder": out})
+
+
+def _workplace(
+    out: Path, read: Sequence[Path | str | None], recipe: Recipe, options: TrainOptions
+) -> AbstractContextManager[Path]:
+    """Context of the folder to write to, which becomes `out` when the training is complete."""
+    resume, force = options.resume, options.force
+    if recipe.training.method == "cyclegan":
+        return unfinished_folder(out, *read, resume=resume, force=force)
+    if resume:
+        raise CpunetError(
+            f"recipe {recipe.name}: takes a minute and keeps no checkpoints; give the "
+            "recipe that the training was begun with, or leave out --resume"
+        )
+    return folder_written_aside(out, RUN, *read, force=force)
 
 
 def _read(
