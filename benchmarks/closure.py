@@ -33,8 +33,8 @@ def scores_of(
     sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        train_run(sim, data, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
+        how = load_recipe(recipe, overrides), TrainOptions(seed=seed)
+        run = train_run(sim, data, Path(folder) / "run", *how)
         return evaluate(
             run,
             sim,

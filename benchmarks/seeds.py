@@ -35,9 +35,9 @@ def one_seed(
     files = InputFile(sim / "sim.lh5"), InputFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
         before = time.process_time()
-        info = train_run(*files, run, load_recipe(recipe, overrides), TrainOptions(seed=seed))
+        how = load_recipe(recipe, overrides), TrainOptions(seed=seed)
+        run = train_run(*files, Path(folder) / "run", *how)
         cpu = time.process_time() - before
         metrics = evaluate(
             run,
@@ -49,7 +49,7 @@ def one_seed(
                 device="auto",
             ),
         ).metrics
-    found: dict[str, Any] = {"seed": seed, "seconds": info["seconds"], "cpu": cpu}
+    found: dict[str, Any] = {"seed": seed, "seconds": run.seconds, "cpu": cpu}
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():

@@ -28,7 +28,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import write_run
+from cpunet.training.run import Run
 
 DT_NS, LENGTH, BLOCK = 16.0, 225, 4096
 PAGE_MB = resource.getpagesize() / 2**20
@@ -58,9 +58,8 @@ def write_fast_run(folder: Path) -> None:
     recipe = load_recipe("fast")
     chain = ResponseGenerator(recipe.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.full(4097, 4.0), 8192, DT_NS, 100))
-    info = {"recipe": "fast", "dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "seed": 0}
-    folder.mkdir()
-    write_run(folder, nn.ModuleDict({"ren": chain}), recipe, info | {"device": "cpu"})
+    facts = {"dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "seed": 0, "device": "cpu"}
+    Run.of(nn.ModuleDict({"ren": chain}), recipe, **facts).save(folder)
 
 
 @contextmanager

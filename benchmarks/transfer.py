@@ -66,16 +66,16 @@ def main() -> None:
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
             recipe = load_recipe("fast")
-            info = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
+            made = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
             scored = evaluate(
-                run,
+                made,
                 sim,
                 data,
                 ValidateOptions(
                     truth=arguments.stand / "truth.npz", baselines=False, seed=0, device="cpu"
                 ),
             )
-            rows[title] = (info["seconds"], scored.metrics)
+            rows[title] = (made.seconds, scored.metrics)
     show(rows)
 
 

@@ -11,7 +11,7 @@ import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,8 @@ from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.common.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.writing import write_pulses
-from cpunet.recipes.schema import PreparationConfig
+from cpunet.recipes.schema import PreparationConfig, Recipe
+from cpunet.training.run import Run
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0
@@ -217,3 +218,11 @@ def same_random_numbers() -> Iterator[None]:
 def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) -> PairedScores:
     """Differences from the truth as a validation computes them."""
     return scores_of_squares(pair_squares({"ren": translated}, truth, edge_samples)["ren"])
+
+
+def write_run(
+    folder: Path, model: torch.nn.Module, recipe: Recipe, info: dict[str, Any]
+) -> None:
+    """Write a run of networks as they are; `info` may be the content of a ``run.json``."""
+    facts = {key: value for key, value in info.items() if key not in ("recipe", "format")}
+    Run.of(model, recipe, **facts).write(folder)

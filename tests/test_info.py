@@ -11,10 +11,11 @@ import h5py
 import lh5
 import numpy as np
 import pytest
+from torch import nn
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection import chain_description
+from cpunet.jobs.inspection import run_words
 from cpunet.jobs.inspection.info import describe
 from cpunet.jobs.inspection.info_words import in_words
 from cpunet.jobs.inspection.trace_properties import _last_below, trace_properties
@@ -22,8 +23,10 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
+from synthetic import write_run
 
 RECIPE = load_recipe("fast")
+INFO = {"peak": "FEP", "seed": 7, "seconds": 12.5, "device": "cpu", "dt_ns": 16.0}
 
 
 def test_a_file_of_pulses(tmp_path):
@@ -100,29 +103,21 @@ def test_remains_that_cannot_be_told(tmp_path):
 
 
 def test_a_run_folder(tmp_path):
-    content = {"recipe": {"name": "paper"}, "seed": 7, "seconds": 12.5, "device": "cpu"}
-    (tmp_path / "run.json").write_text(json.dumps(content))
-    assert describe(tmp_path) == {"kind": "run", "path": str(tmp_path), **content}
-
-
-def test_a_run_with_a_damaged_fit_is_described_as_far_as_it_goes(tmp_path):
-    remains = {"rate_khz": 1.0, "percent_above": {}}
-    content = {
-        "kind": "pulses",
-        "recipe": "fast",
-        "fit": {"verdict": "good", "remains": remains},
-    }
-    (tmp_path / "run.json").write_text(json.dumps(content))
+    recipe = load_recipe("paper", ["generator.width=2"])
+    remains = {"rate_khz": 0.0}
+    fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "remains": remains}
+    write_run(tmp_path, nn.ModuleDict(), recipe, INFO | {"fit": fit})
     lines = dict(in_words(describe(tmp_path)))
-    assert lines["fit"] == "good"
-    assert "remains" not in lines
+    assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
+    assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
+    assert lines["remains"] == "of earlier pulses: none that are certain"
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (None, "a folder without run.json; give the folder of a run, or a file"),
-        ("{", r"run.json: damaged \([^\n]*\); train it again"),
+        ("{", r"run.json: damaged \([^\n]*\); train again"),
         ("[1]", r"run.json: .*no mapping"),
     ],
 )
@@ -328,9 +323,10 @@ def test_traces_that_are_no_numbers(tmp_path):
         describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "e.png")
 
 
-def test_shares_are_percent_whatever_their_time():
+def test_shares_are_percent_whatever_their_time(tmp_path):
     fit = {"parameters": {"slow_12.5_ns": 0.02, "decay_2.9_us": 0.05, "decay_us": 50.0}}
-    lines = dict(in_words({"kind": "run", "path": "run", "fit": fit}))
+    write_run(tmp_path, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
+    lines = dict(in_words(describe(tmp_path)))
     assert lines["response"] == "slow 12.5 ns 2 %, decay 2.9 µs 5 %, decay 50 µs"
 
 
@@ -357,7 +353,7 @@ def test_a_figure_replaces_nothing_unasked(tmp_path):
 
 def test_a_run_has_no_spectrum(tmp_path):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "run.json").write_text("{}")
+    write_run(tmp_path / "run", nn.ModuleDict(), RECIPE, INFO)
     with pytest.raises(CpunetError, match="no spectrum to draw"):
         describe(tmp_path / "run", out=tmp_path / "run.png")
 
@@ -366,7 +362,8 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     """In keV of a full charge, not of the level that prepared tails have."""
     run = tmp_path / "run"
     run.mkdir()
-    (run / "run.json").write_text(json.dumps({"fit": {"noise": {"rms": 1.6, "baselines": 9}}}))
+    fit = {"noise": {"rms": 1.6, "baselines": 9}}
+    write_run(run, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
     assert dict(in_words(describe(run)))["noise"] == "of 9 baselines"
-    monkeypatch.setattr(chain_description, "noise_kev", lambda _: (1.95, 0.05))
+    monkeypatch.setattr(run_words, "noise_kev", lambda _: (1.95, 0.05))
     assert dict(in_words(describe(run)))["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"

@@ -36,26 +36,28 @@ __all__ = [
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
     from cpunet.calls.reports import Report, validate
-    from cpunet.calls.runs import Run, train
+    from cpunet.calls.runs import train
     from cpunet.calls.translations import Translation, translate
     from cpunet.errors import CpunetError
     from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
+    from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
     "calls.reports": ("Report", "validate"),
-    "calls.runs": ("Run", "train"),
+    "calls.runs": ("train",),
     "calls.translations": ("Translation", "translate"),
     "errors": ("CpunetError",),
     "jobs.simulation.hit_sources": ("HitFile",),
     "jobs.common.inputs": ("InputFile",),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "training.run": ("Run",),
     "translation.translator": ("IREN", "REN"),
 }
 

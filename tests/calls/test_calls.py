@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -71,24 +72,24 @@ def test_importing_is_light_and_all_is_there():
 
 def test_a_run(home, run):
     assert run.folder == home / "run"
-    assert (run.info["seed"], run.dt_ns) == (2, 16)
-    assert run.chi_square_per_moment > 0
-    assert run.losses["chi_square"].shape == run.losses["iteration"].shape
+    assert (run.seed, run.dt_ns) == (2, 16)
+    assert run.fit.chi_square_per_moment > 0
+    assert list(run.losses) == ["iteration", "rate", "chi_square"]
     assert run.parameters["decay_us"] > 0
     again = cpunet.Run.load(str(run.folder))
-    assert again.info == run.info
+    assert again.model_dump() == run.model_dump()
+    assert str(again).startswith("run")
     assert repr(run).startswith(f"<Run {run.folder}: fast, FEP, chi-square per moment ")
     html = run._repr_html_()
     assert "data:image/png;base64," in html
-    assert "chi-square per moment" in html
-    assert run.loss_figure().axes
-    assert run.response_figure().axes
+    assert run.fit.verdict in html
+    assert run.plot().axes
     assert run.ren.translate(np.zeros((0, 1200)), noise=False).shape == (0, 800)
 
 
 def test_a_run_of_a_network(tmp_path):
     from cpunet.training.cyclegan import CycleGan
-    from cpunet.training.run_folder import write_run
+    from synthetic import write_run
 
     tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
     recipe = load_recipe("paper", tiny)
@@ -98,9 +99,32 @@ def test_a_run_of_a_network(tmp_path):
     assert repr(run) == f"<Run {tmp_path}: paper, FEP>"
     assert "<img" not in run._repr_html_()
     with pytest.raises(cpunet.CpunetError, match="which has no response in closed form"):
-        run.response_figure()
-    with pytest.raises(cpunet.CpunetError, match="has kept no losses; train it again"):
-        run.loss_figure()
+        _ = run.parameters
+    with pytest.raises(cpunet.CpunetError, match="there are no losses to draw"):
+        run.plot()
+
+
+def test_a_run_is_read_once(home, run, tmp_path):
+    opened: list[str] = []
+    listening = [True]
+
+    def listen(event: str, arguments: tuple[object, ...]) -> None:
+        if event == "open" and listening:
+            path = Path(str(arguments[0]))
+            opened.extend([path.name] if path.parent == run.folder else [])
+
+    sys.addaudithook(listen)  # stays until the process ends
+    sides = home / "sim.lh5", home / "raw.lh5"
+    for act in (
+        lambda: cpunet.translate(run.folder, sides[0], tmp_path / "t.lh5", adc=True),
+        lambda: cpunet.validate(run.folder, *sides, tmp_path / "report", rivals=False),
+    ):
+        opened.clear()
+        act()
+        once = ["run.json", "recipe.yaml", "weights.safetensors"]
+        assert sorted(set(opened) - {"losses.jsonl"}) == sorted(once)
+        assert len(opened) == len(set(opened))
+    listening.clear()
 
 
 def test_memory_and_file_have_the_same_pulses(home, run, tmp_path):
@@ -199,10 +223,11 @@ def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):
 
     def calibrated(self, out, **how):
         given["job"], given["how"] = self, how
-        return {"parameters": {}, "notes": [], "profiles": {}, "directions": []}
+        run.save(out)
+        content = {"parameters": {}, "notes": [], "profiles": {}, "directions": []}
+        (out / "calibration.json").write_text(json.dumps(content))
 
     monkeypatch.setattr("cpunet.calls.calibrations.Calibration.run", calibrated)
-    monkeypatch.setattr("cpunet.calls.calibrations.read_info", lambda _: run.info)
     made = cpunet.calibrate(
         cpunet.HitFile(str(home / "hits.lh5")),
         home / "raw.lh5",
@@ -221,7 +246,7 @@ def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):
     assert job.freedom.priors == {"depletion_voltage": (2100.0, 5e-05)}
     assert (job.events, given["how"]["force"]) == (500, True)
     assert made.physics == {}
-    assert made.sim == tmp_path / "cal" / "sim.lh5"
+    assert made.simulation == tmp_path / "cal" / "sim.lh5"
 
 
 def damaged(home, run=None) -> Path:
@@ -229,7 +254,7 @@ def damaged(home, run=None) -> Path:
     folder = home / "damaged"
     folder.mkdir(exist_ok=True)
     if run is not None:
-        shutil.copy(run.folder / "run.json", folder)
+        shutil.copytree(run.folder, folder, dirs_exist_ok=True)
     (folder / "calibration.json").write_text("[1]")
     (folder / "metrics.json").write_text('{"peaks": []}')
     return folder

@@ -211,7 +211,7 @@ def test_it_can_be_looked_at_in_python(calibrated):
     run = cpunet.CalibratedRun.load(calibrated)
     assert run.physics["temperature_K"]["value"] == run.detector.temperature_K
     assert run.settings.dt_ns == run.dt_ns
-    assert run.sim.is_file()
+    assert run.simulation.is_file()
     assert {"pulls", "profiles", "directions"} == set(run.figures)
     html = run._repr_html_()
     assert "temperature [K]" in html

@@ -20,7 +20,7 @@ from cpunet.jobs.validation import validate
 from cpunet.jobs.validation.drawings import drawings
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import mark
-from cpunet.training.run_folder import RUN
+from cpunet.training.run import RUN
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 

@@ -24,7 +24,8 @@ from cpunet.cli.main import main
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import RUN, write_run
+from cpunet.training.run import RUN
+from synthetic import write_run
 
 TRAIN = "train --recipe fast --sim sim.lh5 --data data.lh5 --out out"
 SIMULATE = "simulate --detector ppc.yaml --hits hits.npz --out out"

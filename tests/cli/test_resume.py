@@ -18,7 +18,7 @@ from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes import load_recipe
 from cpunet.training import checkpoints
 from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
-from cpunet.training.run_folder import LOSSES
+from cpunet.training.run import LOSSES
 from synthetic import digests
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]

@@ -7,7 +7,7 @@ import logging
 from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -28,6 +28,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
+from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
 from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
 
@@ -81,27 +82,30 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     )
 
 
-class Run(NamedTuple):
-    folder: Path
-    info: dict[str, Any]
+class Trained(NamedTuple):
+    run: Run
     told: list[logging.LogRecord]
+
+    @property
+    def folder(self) -> Path:
+        return self.run.folder
 
 
 @pytest.fixture(scope="module")
-def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder, told = tmp_path_factory.mktemp("runs") / "run", SimpleQueue[logging.LogRecord]()
     handler, logger = QueueHandler(told), logging.getLogger("cpunet")
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
-    info = train_run(*files, folder, RECIPE, TrainOptions(seed=3, device="cpu"))
+    made = train_run(*files, folder, RECIPE, TrainOptions(seed=3, device="cpu"))
     logger.removeHandler(handler)
     logger.setLevel(logging.NOTSET)
-    return Run(folder, info, [told.get() for _ in range(told.qsize())])
+    return Trained(made, [told.get() for _ in range(told.qsize())])
 
 
-def test_the_run_tells_of_the_fit(run: Run) -> None:
+def test_the_run_tells_of_the_fit(run: Trained) -> None:
     info = json.loads((run.folder / "run.json").read_text())
-    assert info == run.info
+    assert Run.load(run.folder).fit == run.run.fit
     assert (info["recipe"], info["seed"], info["peak"]) == ("fast", 3, "FEP")
     fit = info["fit"]
     assert set(fit) >= {"chi_square", "moments", "steps", "errors", "pulls", "noise"}
@@ -118,20 +122,20 @@ def test_the_run_tells_of_the_fit(run: Run) -> None:
     assert 0 < fit["noise"]["rms_error"] < 0.2 * fit["noise"]["rms"]
 
 
-def test_what_is_told_on_the_way(run: Run) -> None:
+def test_what_is_told_on_the_way(run: Trained) -> None:
     # few pulses are told of, and nothing else
     warnings = [r.getMessage() for r in run.told if r.levelno >= logging.WARNING]
     assert [w for w in warnings if "1000 or more are better" not in w] == []
     assert any(r.getMessage().startswith("fit: ") for r in run.told)
     records = [json.loads(x) for x in (run.folder / "losses.jsonl").read_text().splitlines()]
     assert [record["iteration"] for record in records] == list(
-        range(1, run.info["fit"]["steps"] + 1)
+        range(1, run.run.fit.steps + 1)
     )
     last = records[-1]["losses"]["chi_square"]
-    assert last == pytest.approx(run.info["fit"]["chi_square"])
+    assert last == pytest.approx(run.run.fit.chi_square)
 
 
-def test_both_directions_are_in_the_weights(run: Run) -> None:
+def test_both_directions_are_in_the_weights(run: Trained) -> None:
     weights = load_file(run.folder / "weights.safetensors")
     assert {name.split(".")[0] for name in weights} == {"ren", "iren"}
     assert all(np.isfinite(values).all() for values in weights.values())
@@ -141,7 +145,7 @@ def test_both_directions_are_in_the_weights(run: Run) -> None:
 
 @pytest.mark.parametrize("inverse", [False, True])
 def test_files_are_translated_in_both_directions(
-    run: Run, files: Files, tmp_path: Path, inverse: bool
+    run: Trained, files: Files, tmp_path: Path, inverse: bool
 ) -> None:
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
@@ -158,7 +162,7 @@ def test_files_are_translated_in_both_directions(
         assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
 
 
-def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
+def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
     sim = sampled(charge(6, seed=5), FINE)
     energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
     path = tmp_path / "sim.lh5"
@@ -180,14 +184,14 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     left = law.draw(N, rng)[:, np.newaxis]
     decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
     data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
-    info = train_run(
+    made = train_run(
         files.sim,
         data,
         tmp_path / "run",
         RECIPE,
         TrainOptions(seed=3, device="cpu"),
     )
-    fit = info["fit"]
+    fit = made.fit.model_dump()
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
@@ -211,11 +215,11 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     assert outside is not None
     assert outside.noise.remains is not None
     assert outside.noise.remains.law.rate_khz == told["rate_khz"]
-    assert entry["fit"]["remains"]["rate_khz"] == told["rate_khz"]
+    assert entry.remains.rate_khz == told["rate_khz"]
 
 
-def test_data_without_remains_are_given_none(run: Run) -> None:
-    assert run.info["fit"]["remains"]["rate_khz"] == 0
+def test_data_without_remains_are_given_none(run: Trained) -> None:
+    assert run.run.fit.remains.rate_khz == 0
     assert not any("remains" in record.getMessage() for record in run.told)
     remains = REN.load(run.folder).remains
     assert remains is not None
@@ -229,8 +233,8 @@ def test_a_simulation_of_other_physics_is_told(
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
     recipe = load_recipe("fast", [*ONE_START, *SHORT])
-    info = train_run(other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
-    fit = info["fit"]
+    made = train_run(other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
+    fit = made.fit.model_dump()
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
     said = [note for note in caplog.messages if "poor fit" in note]
     assert len(said) == 1
@@ -239,12 +243,12 @@ def test_a_simulation_of_other_physics_is_told(
 
 @pytest.mark.thorough
 def test_a_stretched_drift_is_told_and_translated(
-    run: Run, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    run: Trained, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.25), FINE))
     recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
-    info = train_run(sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
-    fit = info["fit"]
+    made = train_run(sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
+    fit = made.fit.model_dump()
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
     assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
@@ -282,14 +286,14 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
             TrainOptions(peak="FEP,300-400", device="cpu"),
         )
     # a range that both sides have, but not all of it: what cannot be compared is counted
-    info = train_run(
+    made = train_run(
         sim,
         files.data,
         tmp_path / "r",
         load_recipe("fast", [*ONE_START, *SHORT]),
         TrainOptions(peak="1000-", device="cpu"),
     )
-    assert info["fit"]["in_no_band"] == {"sim": 50, "data": 0}
+    assert made.fit.in_no_band == {"sim": 50, "data": 0}
 
 
 @pytest.mark.thorough

@@ -23,6 +23,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.run import Run
 from synthetic import after_pole, decay, phased_edges
 
 RECIPE = load_recipe(
@@ -68,13 +69,14 @@ def files(tmp_path_factory) -> dict[str, InputFile]:
 
 
 @pytest.fixture(scope="module")
-def run(files, tmp_path_factory) -> Path:
+def run(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("run") / "run"
-    train_run(files["sim"], files["data"], out, RECIPE, TrainOptions(seed=0, device="cpu"))
-    return out
+    return train_run(
+        files["sim"], files["data"], out, RECIPE, TrainOptions(seed=0, device="cpu")
+    )
 
 
-def evaluated(run: Path, sim: InputFile, data: InputFile) -> Evaluation:
+def evaluated(run: Run, sim: InputFile, data: InputFile) -> Evaluation:
     return evaluate(
         run,
         sim,
@@ -149,10 +151,11 @@ def test_every_figure_can_be_drawn(whole) -> None:
         assert drawing().axes
 
 
-def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole) -> None:
-    info = {"recipe": "paper", "peak": "FEP", "seed": None, "sim": UNKNOWN, "data": UNKNOWN}
-    assert _compared(Path("run"), info, whole.sim, whole.data)["trained"] == (
-        "recipe paper on FEP, an unknown number of simulated and an unknown number of measured "
+def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole, run) -> None:
+    unknown = {"seed": None, "sim": UNKNOWN, "data": UNKNOWN, "started": ""}
+    told = _compared(run.model_copy(update=unknown), whole.sim, whole.data)
+    assert told["trained"] == (
+        "recipe fast on FEP, an unknown number of simulated and an unknown number of measured "
         "pulses"
     )
 

@@ -18,7 +18,7 @@ from cpunet.jobs.translation.export_legend import export_legend_pars
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.training.run_folder import write_run
+from synthetic import write_run
 
 MEAN = {"a": -1.5e-6, "b": 1.0024, "per_mev_percent": -0.15, "per_mev_error_percent": 0.02}
 LAW = {"a": 2e-5, "b": 6.0, "c": 2.0}

@@ -19,9 +19,8 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
-from cpunet.training.run_folder import write_run
 from cpunet.translation.translator import REN
-from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges
+from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges, write_run
 
 SHORT = (
     "training.components=4",
@@ -100,8 +99,8 @@ def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> N
         FAST,
         TrainOptions(init=chain, device="cpu"),
     )
-    assert warm["init"] == str(chain)
-    assert warm["fit"]["steps"] < cold["fit"]["steps"]
+    assert warm.init == str(chain)
+    assert warm.fit.steps < cold.fit.steps
     # it ends where the other does, not where it began
     near = np.sqrt(np.sum(np.square(poles(tmp_path / "warm"))))
     assert near == pytest.approx(np.sqrt(np.sum(np.square(poles(tmp_path / "cold")))), rel=0.03)
@@ -124,11 +123,11 @@ def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
     start = TrainOptions(init=tmp_path / "near", device="cpu")
     fixed = load_recipe("fast", [*SHORT, "training.drift_terms=0"])
     alone = train_run(files["sim"], files["one"], tmp_path / "alone", fixed, start)
-    assert "drift_stretch" not in alone["fit"]["parameters"]
+    assert "drift_stretch" not in alone.fit.parameters
     # none is true, and whether it is then taken out again is up to chance
     monkeypatch.setattr(response_starts, "SURE", 0.0)
     goes_on = train_run(files["sim"], files["one"], tmp_path / "free", FAST, start)
-    assert abs(goes_on["fit"]["parameters"]["drift_stretch"]) < 0.05
+    assert abs(goes_on.fit.parameters["drift_stretch"]) < 0.05
     assert REN.load(tmp_path / "free").backend.chain.response.drift is not None
 
 

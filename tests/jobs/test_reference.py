@@ -61,13 +61,13 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     data = InputFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
     recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
-    info = train_run(
+    made = train_run(
         sim, data, tmp_path / "run", recipe, TrainOptions(peak="300-", device="cpu")
     )
-    assert 200 < info["data"]["used"] < 1000
+    assert 200 < made.data.used < 1000
     metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")
     scores = metrics["peaks"]["300-"]
-    assert scores["n_data"] == info["data"]["used"]
+    assert scores["n_data"] == made.data.used
     assert set(scores["parameters"]) == {"current_amplitude", "drift_time", "tail_slope"}
     for name in ("metrics.json", "report.html", "losses.png"):
         assert (tmp_path / "report" / name).is_file()

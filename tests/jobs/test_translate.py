@@ -39,10 +39,9 @@ from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import write_run
 from cpunet.translation.to_adc import to_adc
 from cpunet.translation.translator import REN
-from synthetic import decay, edges, in_traces, nearly_full_disk
+from synthetic import decay, edges, in_traces, nearly_full_disk, write_run
 
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0

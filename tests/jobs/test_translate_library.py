@@ -17,7 +17,7 @@ from cpunet.jobs.translation.simflow_library import translate_for_simflow
 from cpunet.jobs.translation.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import write_run
+from synthetic import write_run
 
 R, Z = np.arange(3.0), np.arange(4.0)
 

@@ -211,10 +211,10 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     write_pulses(sim, pulses)
     data = cpunet.InputFile(raw, table="5", dt_ns=10)
     run = cpunet.train(sim, data, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.info["data"]["read"] == 2 * N * 2 // 3
-    assert run.info["data"]["read_as"] == {"table": "5", "dt_ns": 10}
+    assert run.data.read == 2 * N * 2 // 3
+    assert run.data.read_as == {"table": "5", "dt_ns": 10}
     report = cpunet.validate(run, sim, raw, rivals=False, device="cpu")  # read as before
-    assert report.metrics["peaks"]["FEP"]["n_data"] == run.info["data"]["used"]
+    assert report.metrics["peaks"]["FEP"]["n_data"] == run.data.used
     back = cpunet.translate(run, data, tmp_path / "back.lh5", inverse=True)
     assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns
 
@@ -227,9 +227,9 @@ def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
     assert "pickled pulses" in told(capsys, monkeypatch, "info", raw, "--dt-ns", 16)
     sides = cpunet.InputFile(sim, dt_ns=16), cpunet.InputFile(raw, dt_ns=16)
     run = cpunet.train(*sides, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.info["sim"]["read"] == run.info["data"]["read"] == N
+    assert run.sim.read == run.data.read == N
     report = cpunet.validate(run, *sides, rivals=False, device="cpu")
-    assert report.metrics["peaks"]["FEP"]["n_sim"] == run.info["sim"]["used"]
+    assert report.metrics["peaks"]["FEP"]["n_sim"] == run.sim.used
     made = cpunet.translate(run, sides[0], tmp_path / "translated.lh5")
     np.testing.assert_array_equal(
         cpunet.open_pulses(made.path).columns["tp0"].read(0, 3), [400, 401, 402]

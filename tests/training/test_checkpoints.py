@@ -23,7 +23,7 @@ from cpunet.training.checkpoints import (
     unfinished_folder,
 )
 from cpunet.training.loop import CheckpointHooks, StoppedError, train
-from cpunet.training.run_folder import LOSSES, WEIGHTS
+from cpunet.training.run import LOSSES, WEIGHTS
 from synthetic import nearly_full_disk
 
 N = 5

@@ -13,8 +13,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
-from cpunet.training.run_folder import write_run
-from synthetic import SMALL_NETWORK, decaying_traces, edges
+from synthetic import SMALL_NETWORK, decaying_traces, edges, write_run
 
 DT_NS = 16.0
 

@@ -17,10 +17,9 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.run_folder import write_run
 from cpunet.translation import translator
 from cpunet.translation.translator import IREN, REN, RejectionWarning
-from synthetic import after_pole_and_decay, in_traces, sampled, two_sites
+from synthetic import after_pole_and_decay, in_traces, sampled, two_sites, write_run
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0

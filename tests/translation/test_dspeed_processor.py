@@ -20,9 +20,9 @@ from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import write_run
 from cpunet.translation.dspeed_processor import ren
 from cpunet.translation.translator import IREN, REN
+from synthetic import write_run
 
 MODULE = "cpunet.translation.dspeed_processor"
 

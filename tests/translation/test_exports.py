@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,9 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training.run_folder import write_run
-from cpunet.translation.exports import FORMATS, export, graph_of
+from cpunet.translation.exports import FORMATS, export
 from cpunet.translation.translator import IREN, REN
+from synthetic import write_run
 
 
 def write_chain(folder: Path, *overrides: str) -> Path:
@@ -121,7 +122,7 @@ def test_torchscript_and_torch_export(run, chain, tmp_path):
     # as where the physics are off
     stretched = write_chain(tmp_path / "stretched", "generator.drift_terms=2")
     for folder, kind in ((run, IREN), (chain, REN), (chain, IREN), (stretched, REN)):
-        graph = graph_of(kind.load(folder))
+        graph = kind.load(folder).backend.graph(800)
         for form in ("torchscript", "torch-export"):
             if (folder, form) == (run, "torch-export"):
                 continue  # seconds, and what ONNX is made of
@@ -165,16 +166,14 @@ def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_run(chain, tmp_path / "ren.onnx", "onnx")
-    graph = graph_of(REN.load(chain))
+    graph = REN.load(chain).backend.graph(800)
     with pytest.raises(CpunetError, match="not known"):
         export(graph, tmp_path / "x", "tflite")
     # a graph that is not the run's is not left behind
     other = REN.load(chain)
     with torch.no_grad():
         other.backend.chain.response.log_decay_us.add_(1)
-    wrong = type(graph)(
-        graph.module, graph.inputs, graph.output, graph.example, graph_of(other).expected
-    )
+    wrong = replace(graph, expected=other.backend.graph(800).expected)
     with pytest.raises(CpunetError, match="differs from the run"):
         export(wrong, tmp_path / "x", "torchscript")
     assert set(FORMATS) == {"onnx", "torchscript", "torch-export"}

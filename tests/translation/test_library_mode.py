@@ -18,10 +18,9 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.run_folder import write_run
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.translator import REN
-from synthetic import after_pole_and_decay, sampled
+from synthetic import after_pole_and_decay, sampled, write_run
 
 TAU_NS, DECAY_NS = 50.0, 60_000.0
 R, Z = np.arange(3.0), np.arange(4.0)

@@ -20,9 +20,9 @@ from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.outside import Outside
-from cpunet.training.run_folder import write_run
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
+from synthetic import write_run
 
 RECIPE = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
 DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)

@@ -127,8 +127,8 @@ def test_the_table_has_the_published_number_of_parameters():
 
 def test_imported_generators_give_the_published_outputs(files, tmp_path):
     ren, iren = files
-    info = import_weights(tmp_path / "run", ren=ren, iren=iren)
-    assert set(info["imported"]) == {"ren", "iren"}
+    run = import_weights(tmp_path / "run", ren=ren, iren=iren)
+    assert set(run.imported) == {"ren", "iren"}
     pulses = torch.from_numpy(windows())[:, None]
     for kind, seed in ((REN, 1), (IREN, 2)):
         translator = kind.load(tmp_path / "run")
@@ -181,10 +181,10 @@ def test_discriminators_are_kept(files, tmp_path):
     count = sum(v.numel() for n, v in weights.items() if "running" not in n and "num" not in n)
     assert count == 130_817
     torch.save(weights, tmp_path / "fep_netD_A.pth")
-    info = import_weights(
+    run = import_weights(
         tmp_path / "run", ren=files[0], discriminator_data=tmp_path / "fep_netD_A.pth"
     )
-    assert set(info["imported"]) == {"ren", "discriminator_data"}
+    assert set(run.imported) == {"ren", "discriminator_data"}
     del weights["norm.bias"]
     torch.save(weights, tmp_path / "fep_netD_A.pth")
     with pytest.raises(CpunetError, match=r"1 missing \(norm.bias\)"):

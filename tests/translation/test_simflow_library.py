@@ -29,7 +29,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.run_folder import write_run
+from cpunet.training.run import Run, SideInfo
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.peak_currents import (
     PEAK,
@@ -39,6 +39,7 @@ from cpunet.translation.peak_currents import (
 )
 from cpunet.translation.ring_padding import continued, with_rings
 from cpunet.translation.translator import REN
+from synthetic import write_run
 
 R, Z = np.arange(6.0), np.arange(8.0)
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
@@ -293,20 +294,19 @@ def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path)
             chosen_libraries(file, ideal, ("V03",), None)
 
 
-def test_what_a_run_tells_of_its_detector(tmp_path: Path) -> None:
-    run, sim = tmp_path / "run", tmp_path / "sim.lh5"
-    run.mkdir()
-    info = {"sim": {"file": str(sim)}}
-    assert known_detector(run, info) is None
+def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
+    sim, known = tmp_path / "sim.lh5", Run.load(chain)
+    assert known_detector(known) is None
+    run = known.model_copy(update={"sim": SideInfo(file=str(sim)), "folder": tmp_path})
+    assert known_detector(run) is None
     with h5py.File(sim, "w") as file:
         file.create_group("geds/sim").attrs["simulation"] = "no JSON"
-    assert known_detector(run, info) is None
+    assert known_detector(run) is None
     with h5py.File(sim, "a") as file:
         file["geds/sim"].attrs["simulation"] = json.dumps({"detector": {"name": "V01"}})
-    assert known_detector(run, info) == "V01"
-    (run / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
-    assert known_detector(run, info) == "V02"
-    assert known_detector(tmp_path, {}) is None
+    assert known_detector(run) == "V01"
+    (tmp_path / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
+    assert known_detector(run) == "V02"
 
 
 def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:

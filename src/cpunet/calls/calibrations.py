@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from cpunet.analysis.calibration_figures import calibration_figures
 from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
 from cpunet.calls.given import File, as_input, as_recipe
-from cpunet.calls.runs import Run
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
@@ -24,10 +24,9 @@ from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.run_folder import read_info
+from cpunet.training.run import Run
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class CalibratedRun(Run):
     """A run whose simulation was fitted together with the readout.
 
@@ -37,10 +36,10 @@ class CalibratedRun(Run):
         Content of ``calibration.json``.
     """
 
-    content: Mapping[str, Any] = field(default_factory=dict)
+    content: dict[str, Any] = Field({}, exclude=True, repr=False)
 
     @classmethod
-    def load(cls, folder: str | Path) -> CalibratedRun:
+    def load(cls, folder: str | Path) -> Self:
         """Open the folder of a calibration.
 
         Raises
@@ -48,15 +47,14 @@ class CalibratedRun(Run):
         CpunetError
             If the folder is not a calibrated run.
         """
-        folder = Path(folder)
-        info = read_info(folder)
-        if not (folder / CALIBRATION).is_file():
+        run, path = super().load(folder), Path(folder) / CALIBRATION
+        if not path.is_file():
             raise CpunetError(
                 f"{folder}: no calibrated run (no {CALIBRATION}); open it with "
                 "cpunet.Run.load, or calibrate"
             )
-        content = read_json(folder / CALIBRATION, "calibrate again")
-        return cls(folder, info, content)
+        content = read_json(path, "calibrate again")
+        return run.model_copy(update={"content": content})
 
     @property
     def physics(self) -> dict[str, dict[str, Any]]:
@@ -64,19 +62,24 @@ class CalibratedRun(Run):
         return dict(self.content["parameters"])
 
     @property
-    def sim(self) -> Path:
+    def simulation(self) -> Path:
         """File of all events, simulated again with the calibrated physics."""
-        return self.folder / SIM
+        return self._folder / SIM
 
     @cached_property
     def detector(self) -> Detector:
         """The calibrated detector."""
-        return read_detector(str(self.folder / DETECTOR))
+        return read_detector(str(self._folder / DETECTOR))
 
     @cached_property
     def settings(self) -> SimulationSettings:
         """The calibrated settings of the simulation."""
-        return read_settings(SimulationSettings, self.folder / SETTINGS)
+        return read_settings(SimulationSettings, self._folder / SETTINGS)
+
+    @property
+    def _folder(self) -> Path:
+        assert self.folder is not None  # a calibration always has one
+        return self.folder
 
     @property
     def figures(self) -> dict[str, Figure]:
@@ -173,5 +176,5 @@ def calibrate(
         events=events,
         seed=seed,
     )
-    content = job.run(Path(out), force=force)
-    return CalibratedRun(Path(out), read_info(Path(out)), content)
+    job.run(Path(out), force=force)
+    return CalibratedRun.load(out)

@@ -16,7 +16,6 @@ from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS, VALUES
 from cpunet.calls.given import File, as_input
-from cpunet.calls.runs import Run, folder_of
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.compare import read_metrics
@@ -25,6 +24,7 @@ from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.training.run import RunLike
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
 
@@ -165,7 +165,7 @@ class Report:
 
 
 def validate(
-    run: Run | str | Path,
+    run: RunLike,
     sim: File,
     data: File,
     out: str | Path | None = None,
@@ -211,7 +211,7 @@ def validate(
         If an argument cannot be used, or no peak can be scored.
     """
     found, drawn = validated(
-        folder_of(run),
+        run,
         as_input(sim, "sim"),
         as_input(data, "data"),
         None if out is None else Path(out),

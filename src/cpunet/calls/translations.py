@@ -19,7 +19,6 @@ from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.style import COLOURS, styled
 from cpunet.calls.given import File, as_input
-from cpunet.calls.runs import Run, folder_of
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import FileTranslation
@@ -30,6 +29,7 @@ from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, all_parameters
 from cpunet.recipes.schema import Recipe
+from cpunet.training.run import RunLike
 from cpunet.translation.learned_remains import NONE
 from cpunet.translation.output_form import Formed
 
@@ -46,7 +46,7 @@ class Translation:
     Parameters
     ----------
     run
-        Folder of the run that translated them.
+        The run that translated them, its folder.
     counts
         Row counts: ``read``, ``translated``, ``rejections`` by reason; ``saturated`` in ADC.
     recipe
@@ -59,7 +59,7 @@ class Translation:
         The pulses and the codes of their rejections if they are in memory.
     """
 
-    run: Path
+    run: str
     counts: Mapping[str, Any]
     recipe: Recipe
     adc: bool = False
@@ -162,7 +162,7 @@ class Translation:
 
 
 def translate(
-    run: Run | str | Path,
+    run: RunLike,
     pulses: File | Pulses,
     out: str | Path | None = None,
     *,
@@ -227,10 +227,10 @@ def translate(
         remains=remains,
         pile_up_khz=pile_up_khz,
     )
-    job = FileTranslation(folder_of(run), options, device)
+    job = FileTranslation(run, options, device)
     for doubt in job.doubts:
         log.warning(doubt)
-    made = Translation(job.run, {}, job.translator.recipe, adc=wanted is not None)
+    made = Translation(job.run.name, {}, job.run.recipe, adc=wanted is not None)
     if isinstance(pulses, Pulses):
         if out is not None:
             raise CpunetError(

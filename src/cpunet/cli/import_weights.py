@@ -52,7 +52,7 @@ def weights(
     """
     from cpunet.jobs.training.import_published import import_weights
 
-    info = import_weights(
+    run = import_weights(
         out_folder,
         ren=ren,
         iren=iren,
@@ -62,7 +62,7 @@ def weights(
         peak=peak,
         force=force,
     )
-    tell(f"{out_folder}: a run of {', '.join(info['imported'])}")
+    tell(f"{out_folder}: a run of {', '.join(run.imported)}")
 
 
 @import_.command()

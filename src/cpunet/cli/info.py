@@ -73,7 +73,6 @@ def info(
     from cpunet.jobs.inspection.info import describe
     from cpunet.recipes import load_recipe
     from cpunet.simulation.geometry_readers import read_detector
-    from cpunet.training.run_schema import problem
 
     for target in (out, without_remains):
         if target is not None:
@@ -91,8 +90,6 @@ def info(
         out=out,
         force=force,
     )
-    if told["kind"] == "run" and (wrong := problem(told)):
-        log.warning(f"{source}: its run.json is {wrong}")
     if told["kind"] == "tables":
         tell(_tables(told))
         tell("one of them: --table NAME; each in full: --table all")

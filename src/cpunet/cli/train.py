@@ -7,7 +7,7 @@ import shlex
 import signal
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
@@ -15,6 +15,9 @@ from cpunet.cli import options
 from cpunet.cli.channels import tell_channels
 from cpunet.cli.messages import fail, tell
 from cpunet.outputs import refuse_inputs
+
+if TYPE_CHECKING:
+    from cpunet.training.run import Run
 
 log = logging.getLogger(__name__)
 
@@ -88,8 +91,8 @@ def train(
     log.info(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
 
 
-def _in_words(info: dict[str, Any]) -> str:
-    return f"trained in {info['seconds']:.0f} s on {info['device']}"
+def _in_words(run: Run) -> str:
+    return f"trained in {run.seconds:.0f} s on {run.device}"
 
 
 class _StopRequest:

@@ -18,7 +18,6 @@ from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import TrainingConfig
 from cpunet.simulation.geometry import Detector
 
 _PEAK = "FEP"  # peak of the training
@@ -92,7 +91,7 @@ def demonstrate(
                 seed,
                 device,
                 # an unfinished training is resumed, except with --force
-                resume=isinstance(recipe.training, TrainingConfig) and not force,
+                resume=recipe.training.method == "cyclegan" and not force,
                 force=force,
             ),
         )

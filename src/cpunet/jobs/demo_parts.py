@@ -15,7 +15,7 @@ from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json
-from cpunet.training.run_folder import INFO, RUN, read_info, read_recipe
+from cpunet.training.run import INFO, RUN, Run
 
 # parts in the order of creation, each with a file that exists when it is complete
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}
@@ -45,15 +45,15 @@ def require_same_parts(out: Path, plan: StandPlan, recipe: Recipe, peak: str) ->
     stand, run, _ = (out / part for part in PARTS)
     if is_there(out, "stand"):
         wanted = plan.provenance()
-        made = _read_stand(stand)
-        _require_same(stand, {key: made.get(key) for key in wanted}, wanted)
+        stored = _read_stand(stand)
+        _require_same(stand, {key: stored.get(key) for key in wanted}, wanted)
     elif is_there(out, "run"):
         raise CpunetError(f"{run}: its stand is gone; {_WAY_OUT}")
     if is_there(out, "run"):
-        info = read_info(run)
+        made = Run.load(run)
         _require_same(
             run,
-            {"peak": info["peak"], "seed": info["seed"], "recipe": _content(read_recipe(run))},
+            {"peak": made.peak, "seed": made.seed, "recipe": _content(made.recipe)},
             {"peak": peak, "seed": plan.seed, "recipe": _content(recipe)},
         )
 

@@ -11,7 +11,6 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -38,11 +37,10 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe, SearchConfig
-from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.settings import checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.loop import train
-from cpunet.training.run_folder import write_run
+from cpunet.training.run import Run
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
@@ -357,17 +355,15 @@ class HeldOut:
             If the training fails.
         """
         model: nn.Module
-        if isinstance(recipe.training, MatchingConfig):
-            model, _, recipe, *_ = match(self.fit, recipe, seed, lambda *_step: None)
+        if recipe.training.method == "matching":
+            found = match(self.fit, recipe, seed, lambda *_step: None)
+            model, recipe = found.model, found.recipe
         else:
             outside, _ = outside_noise(self.fit, recipe)
             sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
             model = train(*sides, recipe, seed=seed, device=device, outside=outside)
-        info = {"dt_ns": self.sim.dt_ns, "peak": "", "recipe": recipe.name}
-        with TemporaryDirectory(prefix="cpunet-tune-") as folder:
-            how = {"seconds": 0, "device": device, "seed": seed}
-            write_run(Path(folder), model, recipe, info | how)
-            return REN.load(folder, device)
+        facts = {"dt_ns": self.sim.dt_ns, "peak": "", "seconds": 0.0}
+        return REN.of(Run.of(model, recipe, seed=seed, device=device, **facts), device)
 
 
 def _split(side: InputSet, rng: np.random.Generator) -> tuple[Pulses, Pulses]:

@@ -42,7 +42,7 @@ from cpunet.outputs import (
     require_replaceable,
 )
 from cpunet.training.loop import Record, State
-from cpunet.training.run_folder import LOSSES, RUN
+from cpunet.training.run import LOSSES, RUN
 
 log = logging.getLogger(__name__)
 

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
 from cpunet.electronics.finishing import finish_with_codes
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import KeptNoise
-from cpunet.networks.linear_inverse import LinearInverse
+from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, prepare
+from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.training.run import Run
+from cpunet.translation.graphs import ChainGraph, Graph, NetworkGraph, example_windows
 
 Energies = npt.NDArray[np.float64]
+NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_OTHERS = (
     "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
@@ -79,9 +85,31 @@ class Drawn:
 
 
 class Backend(ABC):
-    """Translates a batch of prepared windows."""
+    """Translates a batch of prepared windows.
+
+    Attributes
+    ----------
+    network : torch.nn.Module
+        Module with the weights.
+    needs_energies : bool
+        Whether the noise depends on the energies.
+    chain : ResponseGenerator or None
+        Readout chain, which gives traces of any length (`levels`).
+    noise : BaselineNoise or None
+        Noise that is added to the output of the network.
+    remains : DrawnRemains or None
+        Distribution of the remains of earlier pulses under the data, if known.
+    """
 
     network: nn.Module
+    needs_energies: ClassVar[bool] = False
+    chain: ResponseGenerator | None = None
+    remains: DrawnRemains | None = None
+
+    @property
+    def noise(self) -> BaselineNoise | None:
+        """Noise that is added to the output of the network, if any."""
+        return None
 
     @property
     def device(self) -> torch.device:
@@ -93,9 +121,24 @@ class Backend(ABC):
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
+    @abstractmethod
+    def graph(self, length: int) -> Graph:
+        """The part that can be exported, for windows of a length.
+
+        Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either
+        zeros for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a
+        network, unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
+        """
+
+    def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
+        """Noise-free traces of any length, with 99.9 % at sample `n_pre`; of a chain only."""
+        raise NotImplementedError
+
 
 class NetworkBackend(Backend):
     """A network that maps windows to windows; its noise is the latent noise."""
+
+    network: PositionalUNet
 
     def __init__(self, network: PositionalUNet) -> None:
         self.network = network.eval()
@@ -112,6 +155,26 @@ class NetworkBackend(Backend):
         result: FloatArray = out[:, 0].cpu().numpy()
         return result, np.zeros(len(windows), np.uint8)
 
+    def graph(self, length: int) -> Graph:
+        """The network, with its latent draw as a second input."""
+        windows, network = example_windows(length), self.network
+        shape = (network.latent_mean.out_channels, length // 16)
+
+        def with_epsilon(n: int) -> tuple[Tensor, ...]:
+            draw = torch.Generator().manual_seed(n)
+            return windows(n), torch.randn(n, *shape, generator=draw)
+
+        # the draw of a batch is that of its generator
+        return Graph(
+            NetworkGraph(network).cpu().eval(),
+            ("windows", "epsilon"),
+            "translated",
+            with_epsilon,
+            lambda given: network.cpu()(
+                given[0][:, None], generator=torch.Generator().manual_seed(len(given[0]))
+            )[:, 0],
+        )
+
 
 class NoisyNetworkBackend(NetworkBackend):
     """A network that maps windows to windows, with baseline noise added to its output.
@@ -120,7 +183,7 @@ class NoisyNetworkBackend(NetworkBackend):
     ----------
     network
         Network whose output has no electronic noise.
-    noise
+    kept
         Noise of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
@@ -128,15 +191,22 @@ class NoisyNetworkBackend(NetworkBackend):
         Distribution of the remains of earlier pulses under the data, if known.
     """
 
+    needs_energies = True
+
     def __init__(
         self,
         network: PositionalUNet,
-        noise: KeptNoise,
+        kept: KeptNoise,
         config: PreparationConfig,
         remains: DrawnRemains | None = None,
     ) -> None:
         super().__init__(network)
-        self.noise, self.config, self.remains = noise, config, remains
+        self.kept, self.config, self.remains = kept, config, remains
+
+    @property
+    def noise(self) -> BaselineNoise:
+        """Noise of the data's baselines."""
+        return self.kept.noise
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network, add noise in proportion to 1/energy, and prepare like data.
@@ -157,7 +227,7 @@ class NoisyNetworkBackend(NetworkBackend):
         if energy_kev is None or not drawn.noise:
             return clean, codes
         seed = drawn.seed(self.device)
-        dt_ns = self.noise.noise_dt_ns
+        dt_ns = self.kept.noise_dt_ns
         records = with_room(clean, self.config, dt_ns)
         added = None
         if drawn.others:
@@ -171,7 +241,7 @@ class NoisyNetworkBackend(NetworkBackend):
             records,
             self.config,
             dt_ns=dt_ns,
-            noise=self.noise.noise,
+            noise=self.noise,
             energy_kev=energy_kev,
             seed=seed,
             added=added,
@@ -181,9 +251,18 @@ class NoisyNetworkBackend(NetworkBackend):
 class ResponseBackend(Backend):
     """A readout chain with electronic noise and the preparation of measured traces."""
 
+    needs_energies = True
+    chain: ResponseGenerator
+
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
         self.network = self.chain = generator.eval()
+        self.remains = generator.remains
         self.config = config
+
+    @property
+    def noise(self) -> BaselineNoise:
+        """Noise of the data's baselines."""
+        return self.chain.noise
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data.
@@ -202,18 +281,49 @@ class ResponseBackend(Backend):
         if drawn.others:
             if energy_kev is None or not drawn.noise:
                 raise CpunetError(NO_OTHERS)
-            added = _left(self.chain.remains, records, energy_kev, drawn.remains_kev)
+            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
             if second is not None and len(second.row):
                 added += self._second(windows, energy_kev, second, records.shape[1])
         return finish_with_codes(
             records,
             self.config,
             dt_ns=float(self.chain.response.dt_ns),
-            noise=self.chain.noise if drawn.noise else None,
+            noise=self.noise if drawn.noise else None,
             energy_kev=energy_kev if drawn.noise else None,
             seed=seed,
             added=added,
         )
+
+    def graph(self, length: int) -> Graph:
+        """The chain as a matrix."""
+        windows, chain = example_windows(length), self.chain.cpu()
+        return Graph(
+            ChainGraph(chain, length).eval(),
+            ("windows",),
+            "records",
+            lambda n: (windows(n),),
+            lambda given: chain(given[0]),
+        )
+
+    def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
+        """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
+        before = max(0, n_pre - self.config.samples_before)
+        after = max(0, length - n_pre - self.config.samples_after)
+        # before the window no charge has moved, after it all charge has been collected
+        long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
+        with torch.inference_mode():
+            records = self.network(torch.from_numpy(long).to(self.device)).cpu().numpy()
+        config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
+        dt_ns = float(self.chain.response.dt_ns)
+        clean = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
+        source = clean.align_sample[:, np.newaxis] - n_pre + np.arange(length)
+        source = source.clip(0, records.shape[1] - 1)
+        level = np.take_along_axis(records[clean.index], source, axis=1)
+        levels = np.full((len(windows), length), np.nan, np.float32)
+        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / clean.scale[
+            :, np.newaxis
+        ]
+        return levels, clean.codes
 
     def _second(
         self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
@@ -234,6 +344,8 @@ class ResponseBackend(Backend):
 
 class InverseBackend(Backend):
     """A linear inverse, followed by the preparation of simulated pulses."""
+
+    network: LinearInverse
 
     def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
         self.network = inverse.eval()
@@ -259,6 +371,37 @@ class InverseBackend(Backend):
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms
         return result, prepared.codes
+
+    def graph(self, length: int) -> Graph:
+        """The inverse."""
+        windows, inverse = example_windows(length), self.network.cpu()
+        return Graph(
+            inverse, ("windows",), "pulses", lambda n: (windows(n),), lambda g: inverse(*g)
+        )
+
+
+def backend_of(run: Run, part: str, device: str) -> Backend:
+    """The backend of a part of a run, ``"ren"`` or ``"iren"``.
+
+    Raises
+    ------
+    CpunetError
+        If the weights of the run do not match its recipe.
+    """
+    recipe, forward = run.recipe, part == "ren"
+    generator, preparation = recipe.generator, recipe.preparation
+    if isinstance(generator, PunetConfig):
+        network = run.fill(part, PositionalUNet(generator, preparation.length), device)
+        if not forward or recipe.cyclegan.training.noise == "none":
+            return NetworkBackend(network)
+        kept = run.fill(NOISE, KeptNoise(run.dt_ns), device)
+        return NoisyNetworkBackend(network, kept, preparation, run.remains)
+    if forward:
+        response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
+        response.remains = run.remains
+        return ResponseBackend(response, preparation)
+    inverse = LinearInverse(Sizes.of(preparation.length, recipe.matching.training))
+    return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
 
 
 def _left(

@@ -7,28 +7,20 @@ the graph either.
 
 from __future__ import annotations
 
-import copy
 import importlib
 import io
 import logging
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.drift_clock import DriftClock
-from cpunet.networks.linear_inverse import LinearInverse
-from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.translation.backends import NetworkBackend, ResponseBackend
-from cpunet.translation.translator import Translator
+from cpunet.translation.graphs import Graph
 
 Format = Literal["onnx", "torchscript", "torch-export"]
 FORMATS: tuple[Format, ...] = ("onnx", "torchscript", "torch-export")
@@ -40,117 +32,13 @@ TRACED = 2
 Arrays = list[npt.NDArray[np.float32]]
 
 
-class NetworkGraph(PositionalUNet):
-    """A Positional U-Net whose latent draw is an input."""
-
-    def __init__(self, network: PositionalUNet) -> None:
-        nn.Module.__init__(self)  # all attributes of the base are taken over
-        self.__dict__.update(copy.deepcopy(network).__dict__)
-
-    def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:  # type: ignore[override]
-        """Windows (batch, samples) and epsilon (batch, channels, samples / 16) → windows."""
-        # the base passes its generator on to `_latent`; here this argument is the draw itself
-        drawn = cast(torch.Generator, epsilon)
-        return super().forward(windows[:, None], generator=drawn)[:, 0]
-
-    def _latent(self, x: Tensor, generator: Any, mean: bool) -> Tensor:
-        del mean
-        centre: Tensor = self.latent_mean(x)
-        return centre + torch.exp(0.5 * self.latent_log_variance(x)) * cast(Tensor, generator)
-
-
-class ChainGraph(nn.Module):
-    """A readout chain as a matrix, with a stretch of the drift if there is one.
-
-    The chain is linear.  A product with its responses to single samples gives the same
-    records as its Fourier transforms, which few formats support.
-    """
-
-    matrix: Tensor
-
-    def __init__(self, chain: ResponseGenerator, length: int) -> None:
-        super().__init__()
-        linear = copy.deepcopy(chain.response)
-        self.drift, linear.drift = linear.drift, None
-        self.dt_ns = float(linear.dt_ns)
-        with torch.inference_mode():
-            matrix = linear(torch.eye(length, device=linear.dt_ns.device))
-        self.register_buffer("matrix", matrix.clone().cpu())
-
-    def forward(self, windows: Tensor) -> Tensor:
-        """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
-        if isinstance(self.drift, DriftClock):
-            windows = self.drift(windows, dt_ns=self.dt_ns)
-        elif self.drift is not None:
-            windows = self.drift(windows)
-        return windows @ self.matrix
-
-
-@dataclass(frozen=True)
-class Graph:
-    """A module to export, with the names of its inputs and output, and inputs for a check."""
-
-    module: nn.Module
-    inputs: tuple[str, ...]
-    output: str
-    example: Callable[[int], tuple[Tensor, ...]]
-    expected: Callable[[tuple[Tensor, ...]], Tensor]
-
-
-def graph_of(translator: Translator) -> Graph:
-    """The part of a translator that can be exported.
-
-    Returns
-    -------
-    Graph
-        Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either
-        zeros for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a
-        network, unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
-    """
-    length = translator.recipe.preparation.length
-    windows = _windows(length)
-    backend = translator.backend
-    if isinstance(backend, NetworkBackend):
-        network = cast(PositionalUNet, backend.network)
-        shape = (network.latent_mean.out_channels, length // 16)
-
-        def with_epsilon(n: int) -> tuple[Tensor, ...]:
-            draw = torch.Generator().manual_seed(n)
-            return windows(n), torch.randn(n, *shape, generator=draw)
-
-        module = NetworkGraph(network).cpu().eval()
-        # the draw of a batch is that of its generator
-        return Graph(
-            module,
-            ("windows", "epsilon"),
-            "translated",
-            with_epsilon,
-            lambda given: network.cpu()(
-                given[0][:, None], generator=torch.Generator().manual_seed(len(given[0]))
-            )[:, 0],
-        )
-    if isinstance(backend, ResponseBackend):
-        chain = backend.chain.cpu()
-        return Graph(
-            ChainGraph(chain, length).eval(),
-            ("windows",),
-            "records",
-            lambda n: (windows(n),),
-            lambda given: chain(given[0]),
-        )
-    inverse = cast(LinearInverse, backend.network).cpu()
-    return Graph(
-        inverse, ("windows",), "pulses", lambda n: (windows(n),), lambda g: inverse(*g)
-    )
-
-
 def export(graph: Graph, path: Path, form: Format) -> float:
     """Write a graph and compare the output of the file with that of the run.
 
     Parameters
     ----------
     graph
-        Result of `graph_of`.
+        Result of `cpunet.translation.backends.Backend.graph`.
     path
         File to write.
     form
@@ -190,18 +78,6 @@ def export(graph: Graph, path: Path, form: Format) -> float:
             "format"
         )
     return worst
-
-
-def _windows(length: int) -> Callable[[int], Tensor]:
-    """Prepared pulses with edges of several widths and positions."""
-
-    def windows(n: int) -> Tensor:
-        rng = np.random.default_rng(n)
-        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
-        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
-        return torch.from_numpy(charge.astype(np.float32))
-
-    return windows
 
 
 def _program(graph: Graph) -> torch.export.ExportedProgram:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,16 +14,6 @@ if TYPE_CHECKING:
     from cpunet.translation.translator import Translator
 
 NONE, LEARNED = "none", "learned"
-
-
-def remains_of(info: Mapping[str, Any]) -> DrawnRemains | None:
-    """Remains recorded in ``run.json``; with rate 0 if the data are known to have none."""
-    told = (info.get("fit") or {}).get("remains") or {}
-    if "drawn" not in told:
-        return None
-    drawn = DrawnRemains.of(told["drawn"])
-    sure = float(told["rate_khz"]) > 0
-    return drawn if sure else replace(drawn, law=replace(drawn.law, rate_khz=0.0))
 
 
 def wanted_remains(

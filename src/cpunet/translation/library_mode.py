@@ -20,8 +20,6 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, Rejection, prepare
-from cpunet.recipes.network_settings import LearnedConfig
-from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import BATCH, REN
 
 EVENTS = 200  # sums in the test of linearity
@@ -79,10 +77,9 @@ class TemplateTranslator:
         self.ren = ren
         self.dt_ns = dt_ns
         self.chain: ResponseGenerator | None = None
-        backend = ren.backend
-        learned = isinstance(ren.recipe.generator, LearnedConfig)
-        if isinstance(backend, ResponseBackend):
-            self.chain = copy.deepcopy(backend.chain)
+        learned = ren.recipe.generator.name == "learned"
+        if ren.backend.chain is not None:
+            self.chain = copy.deepcopy(ren.backend.chain)
             if learned and self.chain.response.drift is not None:
                 raise CpunetError(
                     "the run's U-Net changes whole pulses, not the templates that they are "

@@ -10,7 +10,6 @@ decay fitted to their end after them, both without noise.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +21,8 @@ from cpunet.electronics.second_pulses import DrawnPileUp, SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
-from cpunet.training.run_folder import read_info
-from cpunet.translation.backends import ResponseBackend
+from cpunet.training.run import Run
+from cpunet.translation.backends import Backend
 from cpunet.translation.output_form import Formed, drawn_kev, rng_of, truth_of
 from cpunet.translation.translator import BATCH, REN
 
@@ -84,16 +83,14 @@ def to_adc(
 
 
 def adc_scale(
-    run: Path, ren: REN, *, adc_per_kev: float | None, baseline: float | None
+    run: Run, ren: REN, *, adc_per_kev: float | None, baseline: float | None
 ) -> AdcScale:
     """Gain and baseline: as given, or else those of the run's training data.
 
     Parameters
     ----------
-    run
-        Folder of the run, whose ``run.json`` describes the data.
-    ren
-        The loaded run.
+    run, ren
+        The run, and its translator.
     adc_per_kev
         Height of a fast pulse above the baseline in ADC counts per keV, the inverse of
         ``--kev-per-adc`` of the data.
@@ -110,15 +107,15 @@ def adc_scale(
         raise CpunetError(f"--adc-per-kev is {adc_per_kev}; expected a number above 0")
     if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
         raise CpunetError(f"--baseline is {baseline}; expected a number that is not negative")
-    known_gain, known_baseline = _of_the_data(run, ren)
+    known_gain, known_baseline = _of_the_data(run)
     per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
     level = known_baseline if baseline is None else baseline
     if per_kev is None:
         raise CpunetError(
-            f"{run}: does not say how many ADC counts a keV is; give --adc-per-kev"
+            f"{run.name}: does not say how many ADC counts a keV is; give --adc-per-kev"
         )
     if level is None:
-        raise CpunetError(f"{run}: does not say where the baseline is; give --baseline")
+        raise CpunetError(f"{run.name}: does not say where the baseline is; give --baseline")
     return AdcScale(per_kev, level)
 
 
@@ -160,7 +157,7 @@ class AdcForm:
     ) -> None:
         self.ren, self.scale, self.remains, self.pile_up = ren, scale, remains, pile_up
         self.config = ren.recipe.preparation
-        if pile_up is not None and not isinstance(ren.backend, ResponseBackend):
+        if pile_up is not None and ren.backend.chain is None:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
                 "second pulses; leave out --pile-up-khz, or --output adc"
@@ -179,7 +176,7 @@ class AdcForm:
         """Whether traces are padded with baseline and decay without noise."""
         before = self.n_pre - self.config.samples_before
         after = self.length - self.n_pre - self.config.samples_after
-        return not isinstance(self.ren.backend, ResponseBackend) and max(before, after) > 0
+        return self.ren.backend.chain is None and max(before, after) > 0
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
@@ -189,7 +186,7 @@ class AdcForm:
         second = None
         if self.pile_up is not None:
             second = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
-        if isinstance(backend, ResponseBackend):
+        if backend.chain is not None:
             windows, codes = self._of_chain(backend, pulses, noise, generator, second)
         else:
             done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
@@ -213,7 +210,7 @@ class AdcForm:
 
     def _of_chain(
         self,
-        backend: ResponseBackend,
+        backend: Backend,
         pulses: Pulses,
         noise: bool,
         generator: torch.Generator | None,
@@ -227,14 +224,14 @@ class AdcForm:
         kept = usable[prepared.index]
         index = prepared.index[kept]
         windows = prepared.pulses.waveforms[kept]
-        rng = rng_of(generator)
+        rng, electronic = rng_of(generator), backend.noise
         for first in range(0, len(windows), BATCH):
             rows = index[first : first + BATCH]
             batch = windows[first : first + BATCH]
-            levels, codes[rows] = self._levels(backend, batch, self.length)
+            levels, codes[rows] = backend.levels(batch, self.n_pre, self.length)
             energies = pulses.energy_kev[rows]
-            if noise:
-                levels += backend.chain.noise.draw(energies, self.length, rng)
+            if noise and electronic is not None:
+                levels += electronic.draw(energies, self.length, rng)
             if second is not None:
                 levels += self._second(backend, batch, energies, second.of_rows(rows))
             traces[rows] = levels
@@ -242,7 +239,7 @@ class AdcForm:
 
     def _second(
         self,
-        backend: ResponseBackend,
+        backend: Backend,
         windows: FloatArray,
         energy_kev: Floats,
         second: SecondPulses,
@@ -252,42 +249,17 @@ class AdcForm:
             return np.zeros((len(windows), self.length))
         # early second pulses need longer traces
         reached = self.length + second.reach(self.ren.dt_ns)
-        shapes, _ = self._levels(backend, windows[second.partner], reached)
+        shapes, _ = backend.levels(windows[second.partner], self.n_pre, reached)
         return second.added(np.nan_to_num(shapes), energy_kev, self.ren.dt_ns, self.length)
 
-    def _levels(
-        self, backend: ResponseBackend, windows: FloatArray, length: int
-    ) -> tuple[FloatArray, Codes]:
-        """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
-        config, dt_ns = self.config, self.ren.dt_ns
-        before = max(0, self.n_pre - config.samples_before)
-        after = max(0, length - self.n_pre - config.samples_after)
-        # before the window no charge has moved, after it all charge has been collected
-        long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
-        with torch.inference_mode():
-            records = backend.network(torch.from_numpy(long).to(backend.device)).cpu().numpy()
-        config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
-        clean = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
-        source = clean.align_sample[:, np.newaxis] - self.n_pre + np.arange(length)
-        source = source.clip(0, records.shape[1] - 1)
-        level = np.take_along_axis(records[clean.index], source, axis=1)
-        levels = np.full((len(windows), length), np.nan, np.float32)
-        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / clean.scale[
-            :, np.newaxis
-        ]
-        return levels, clean.codes
 
-
-def _of_the_data(run: Path, ren: REN) -> tuple[float | None, float | None]:
+def _of_the_data(run: Run) -> tuple[float | None, float | None]:
     """Gain (ADC counts per prepared unit and keV) and baseline of the data, if recorded."""
-    info = read_info(run)
-    cuts = (info.get("data") or {}).get("cuts") or {}
-    amplitude = float(cuts.get("amplitude") or 0.0)
-    if amplitude < MIN_ADC:
+    cuts, peak = run.data.cuts, run.recipe.peaks.get(run.peak)
+    if cuts is None or cuts.amplitude < MIN_ADC:
         return None, None
-    centres = {window["name"]: float(window["centre"]) for window in cuts.get("windows", ())}
-    peak = ren.recipe.peaks.get(info["peak"])
-    return (None if peak is None else amplitude / peak.energy_kev), centres.get("baseline")
+    centres = {window.name: window.centre for window in cuts.windows}
+    return (None if peak is None else cuts.amplitude / peak.energy_kev), centres.get("baseline")
 
 
 def _height(ren: REN) -> float:

@@ -20,30 +20,14 @@ import torch
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import KeptNoise
-from cpunet.networks.linear_inverse import LinearInverse, Sizes
-from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
-from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import load_network, read_info, read_recipe
-from cpunet.translation.backends import (
-    NO_ENERGY,
-    Backend,
-    Drawn,
-    Energies,
-    InverseBackend,
-    NetworkBackend,
-    NoisyNetworkBackend,
-    ResponseBackend,
-)
-from cpunet.translation.learned_remains import remains_of
+from cpunet.training.run import Run
+from cpunet.translation.backends import NO_ENERGY, Backend, Drawn, Energies, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
-NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
 
@@ -81,7 +65,7 @@ class Translated:
 class Translator:
     """A trained generator with the preparation that it was trained on.
 
-    Use `REN.load` or `IREN.load`.
+    Use `REN.of` with a run, or `REN.load` with its folder.
     """
 
     part: ClassVar[str]
@@ -93,6 +77,17 @@ class Translator:
         self.dt_ns = dt_ns
 
     @classmethod
+    def of(cls, run: Run, device: str = "cpu") -> Self:
+        """Make a translator of a run.
+
+        Raises
+        ------
+        CpunetError
+            If the weights of the run do not match its recipe.
+        """
+        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns)
+
+    @classmethod
     def load(cls, run: str | Path, device: str = "cpu") -> Self:
         """Load a translator from the folder of a training run.
 
@@ -101,31 +96,7 @@ class Translator:
         CpunetError
             If the folder is not a finished run, or its weights do not match its recipe.
         """
-        run = Path(run)
-        info, recipe = read_info(run), read_recipe(run)
-        dt_ns = float(info["dt_ns"])
-        return cls(cls._backend(run, recipe, dt_ns, device), recipe, dt_ns)
-
-    @classmethod
-    def _backend(cls, run: Path, recipe: Recipe, dt_ns: float, device: str) -> Backend:
-        generator, length = recipe.generator, recipe.preparation.length
-        if isinstance(generator, PunetConfig):
-            network = PositionalUNet(generator, length)
-            load_network(run, cls.part, network, device)
-            if cls.part == IREN.part or recipe.cyclegan.training.noise == "none":
-                return NetworkBackend(network)
-            noise = KeptNoise(dt_ns)
-            load_network(run, NOISE, noise, device)
-            remains = remains_of(read_info(run))
-            return NoisyNetworkBackend(network, noise, recipe.preparation, remains)
-        if cls.part == REN.part:
-            response = ResponseGenerator(generator, dt_ns)
-            load_network(run, cls.part, response, device)
-            response.remains = remains_of(read_info(run))
-            return ResponseBackend(response, recipe.preparation)
-        inverse = LinearInverse(Sizes.of(length, recipe.matching.training))
-        load_network(run, cls.part, inverse, device)
-        return InverseBackend(inverse, recipe.preparation, dt_ns)
+        return cls.of(Run.load(run), device)
 
     def translate(
         self,
@@ -231,15 +202,12 @@ class Translator:
     @property
     def remains(self) -> DrawnRemains | None:
         """Remains of earlier pulses as learned by the run; None if it has no information."""
-        backend = self.backend
-        if isinstance(backend, NoisyNetworkBackend):
-            return backend.remains
-        return backend.chain.remains if isinstance(backend, ResponseBackend) else None
+        return self.backend.remains
 
     @property
     def needs_energies(self) -> bool:
         """Whether the noise depends on the energies."""
-        return isinstance(self.backend, ResponseBackend | NoisyNetworkBackend)
+        return self.backend.needs_energies
 
     def apply(
         self,

@@ -39,7 +39,7 @@ from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.training.response_trainer import ResponseTrainer
+from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.progress import stage
@@ -47,7 +47,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.run_folder import RUN, write_run
+from cpunet.training.run import RUN
 
 log = logging.getLogger(__name__)
 
@@ -151,16 +151,23 @@ class Calibration:
             training = self.recipe.training.model_copy(update={"drift_terms": 0})
             recipe = self.recipe.model_copy(update={"training": training})
             how = TrainOptions(self.peak, self.seed, "cpu")
-            job = TrainingJob(recipe, how, again, sides.data, self.data, folder)
-            model, info, recipe = ResponseTrainer(recipe).train(job, known=calibrated.response)
-            info["sim"]["file"] = str(out / SIM)
-            info["started"] = started.isoformat(timespec="seconds")
-            info["seconds"] = content["seconds"] = round(time.perf_counter() - clock, 1)
-            content["fit"] = {k: info["fit"][k] for k in ("chi_square", "moments", "verdict")}
+            job = TrainingJob(recipe, how, again, sides.data, self.data, None, folder)
+            run = train_chain(job, calibrated.response)
+            content["seconds"] = round(time.perf_counter() - clock, 1)
+            assert run.fit is not None  # of a chain
+            content["fit"] = run.fit.model_dump(include={"chi_square", "moments", "verdict"})
+            run = run.model_copy(
+                update={
+                    "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
+                    "started": started.isoformat(timespec="seconds"),
+                    "seconds": content["seconds"],
+                    "calibration": CALIBRATION,
+                }
+            )
             (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
             for name, figure in calibration_figures(content).items():
                 figure.savefig(folder / f"{name}.png", dpi=DPI)
-            write_run(folder, model, recipe, info | {"calibration": CALIBRATION})
+            run.write(folder)
         return content
 
     @one_thread_for_matrices()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
+from cpunet.training.run import SideInfo
 
 log = logging.getLogger(__name__)
 
@@ -59,22 +59,10 @@ class InputFile:
         given = {name: getattr(self, name) for name in _READ_AS}
         return {name: value for name, value in given.items() if value is not None}
 
-    def as_before(self, run_info: Mapping[str, Any], side: str) -> InputFile:
-        """The same file, with the reading options of a run as defaults.
-
-        Parameters
-        ----------
-        run_info
-            Content of ``run.json``.
-        side
-            Side of the file, ``"sim"`` or ``"data"``.
-        """
-        told = run_info.get(side)
-        if not isinstance(told, dict):
-            return self
-        before, read_as = told.get("file"), told.get("read_as")
-        same = isinstance(before, str) and Path(before).resolve() == self.path.resolve()
-        if not same or not isinstance(read_as, dict):
+    def as_before(self, side: SideInfo) -> InputFile:
+        """The same file, with the reading options that a run used for it as defaults."""
+        read_as = side.read_as
+        if side.file is None or Path(side.file).resolve() != self.path.resolve():
             return self
         if any(read_as.get(name) != value for name, value in self.options.items()):
             return self
@@ -102,24 +90,23 @@ class InputSet:
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
 
-    def provenance(self) -> dict[str, Any]:
-        """For ``run.json``: file, counts, and a fingerprint of the pulses used."""
+    def provenance(self) -> SideInfo:
+        """File, counts, and a fingerprint of the pulses used."""
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
-        return {
-            "file": str(self.path),
-            "read_as": self.read_as,
-            "dt_ns": self.dt_ns,
-            "read": self.prepared.n_read,
-            "used": len(self.prepared),
-            "rejections": self.prepared.rejections,
-            "cuts": None if self.cuts is None else self.cuts.model_dump(mode="json"),
-            "sha256": hashlib.sha256(waveforms.data).hexdigest(),
-        }
+        return SideInfo(
+            file=str(self.path),
+            read_as=self.read_as,
+            dt_ns=self.dt_ns,
+            read=self.prepared.n_read,
+            used=len(self.prepared),
+            rejections=self.prepared.rejections,
+            cuts=self.cuts,
+            sha256=hashlib.sha256(waveforms.data).hexdigest(),
+        )
 
     def fingerprint(self) -> dict[str, Any]:
         """Entries of the provenance that identify the pulses used, wherever their file is."""
-        told = self.provenance()
-        return {key: told[key] for key in ("dt_ns", "used", "sha256")}
+        return self.provenance().model_dump(include={"dt_ns", "used", "sha256"})
 
 
 def load_simulated(

@@ -37,7 +37,7 @@ from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import checked, read_json
 from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.run_folder import load_network, read_info, read_recipe
+from cpunet.training.run import FitInfo, Run, RunLike, as_run
 
 MARKER = "response.json"
 RESPONSE = FolderKind(
@@ -52,24 +52,17 @@ _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one col
 
 
 @dataclass(frozen=True, eq=False)
-class _Learned:
-    """A run: its chain, its parameters with their errors, and its origin."""
+class _Response:
+    """The chain of a run, and its parameters with their errors."""
 
-    path: Path
-    info: Mapping[str, Any]
-    fit: Mapping[str, Any]
-    preparation: PreparationConfig
+    run: Run
     chain: Chain
     parameters: Numbers
     errors: Numbers
 
-    @property
-    def dt_ns(self) -> float:
-        return float(self.info["dt_ns"])
-
 
 def describe_responses(
-    runs: Sequence[Path],
+    given: Sequence[RunLike],
     *,
     truth: Electronics | None = None,
     out: Path | None = None,
@@ -79,8 +72,8 @@ def describe_responses(
 
     Parameters
     ----------
-    runs
-        Folders of trainings of a readout chain, all with the same sampling and preparation.
+    given
+        Trainings of a readout chain, all with the same sampling and preparation.
     truth
         True chain of the data, if known (`stand_electronics`).
     out
@@ -106,37 +99,37 @@ def describe_responses(
     CpunetError
         If a run has no readout chain, or runs or truth are incompatible.
     """
+    runs = [as_run(run) for run in given]
+    folders = [run.folder for run in runs]
     if out is not None:
-        refuse_existing(out, *runs, force=force)
-    learned = [_read_run(Path(run)) for run in runs]
+        refuse_existing(out, *folders, force=force)
+    learned = [_response(run) for run in runs]
     if not learned:
         raise CpunetError("no run was given; give the folder of one")
-    first = learned[0]
-    require_alike([(run.path, run.dt_ns, run.preparation) for run in learned])
+    first, preparation = runs[0], runs[0].recipe.preparation
+    require_alike([(run.name, run.dt_ns, run.recipe.preparation) for run in runs])
     _require_sampling(first, truth)
     told: dict[str, Any] = {
         "cpunet": cpunet.__version__,
         "dt_ns": first.dt_ns,
-        "runs": [_told(run) for run in learned],
+        "runs": [_told(one) for one in learned],
     }
     true_chain = None if truth is None else true_chain_of(truth)
     told |= _summary(told["runs"])
     if truth is not None and true_chain is not None:
-        values = true_parameters(truth) | chain_numbers(
-            true_chain, first.preparation, first.dt_ns
-        )
+        values = true_parameters(truth) | chain_numbers(true_chain, preparation, first.dt_ns)
         told["truth"] = {"name": truth.name} | _compared(told, values)
     if out is not None:
-        window = first.preparation.samples_after * first.dt_ns
+        window = preparation.samples_after * first.dt_ns
         figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
-        with folder_written_aside(out, RESPONSE, *runs, force=force) as folder:
+        with folder_written_aside(out, RESPONSE, *folders, force=force) as folder:
             text = json.dumps(told, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
             figure.savefig(folder / "response.png", dpi=_DPI)
     return told
 
 
-def chain_of(run: Path) -> Chain:
+def chain_of(run: Run) -> Chain:
     """The readout chain fitted by a training, with its noise.
 
     Raises
@@ -144,10 +137,10 @@ def chain_of(run: Path) -> Chain:
     CpunetError
         If the run has no response in closed form.
     """
-    return _read_run(run).chain
+    return _response(run).chain
 
 
-def noise_kev(run: Path) -> tuple[float, float | None]:
+def noise_kev(run: Run) -> tuple[float, float | None]:
     """RMS of the noise that a training measured, and its error if known, in keV.
 
     Raises
@@ -155,9 +148,9 @@ def noise_kev(run: Path) -> tuple[float, float | None]:
     CpunetError
         If the run has no response in closed form, or no noise.
     """
-    told = _told(_read_run(run))
+    told = _told(_response(run))
     if "noise_rms_kev" not in told["values"]:
-        raise CpunetError(f"{run}: holds no noise; train on raw traces")
+        raise CpunetError(f"{run.name}: holds no noise; train on raw traces")
     return told["values"]["noise_rms_kev"], told["errors"].get("noise_rms_kev")
 
 
@@ -174,51 +167,42 @@ def stand_electronics(stand: Path) -> Electronics:
     return checked(Electronics, content.get("electronics"), f"{path}: electronics")
 
 
-def _read_run(path: Path) -> _Learned:
-    info, recipe = read_info(path), read_recipe(path)
+def _response(run: Run) -> _Response:
+    recipe = run.recipe
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
-            f"{path}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
+            f"{run.name}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
             "response in closed form; give a run of the recipe fast, or score this one with "
             "`cpunet validate`"
         )
-    network = ResponseGenerator(recipe.generator, float(info["dt_ns"]))
-    load_network(path, "ren", network)
+    network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
     try:
-        learned = _described(path, info, recipe.preparation, network)
+        found = _described(run, network)
     except (ArithmeticError, ValueError, LookupError, RuntimeError) as error:
         raise CpunetError(
-            f"{path}: its weights make no response of electronics ({error}); train again"
+            f"{run.name}: its weights make no response of electronics ({error}); train again"
         ) from error
-    wrong = [name for name, value in learned.parameters.items() if not math.isfinite(value)]
+    wrong = [name for name, value in found.parameters.items() if not math.isfinite(value)]
     if wrong:
-        raise CpunetError(f"{path}: {wrong[0]} of its response is no number; train again")
-    return learned
+        raise CpunetError(f"{run.name}: {wrong[0]} of its response is no number; train again")
+    return found
 
 
-def _described(
-    path: Path,
-    info: Mapping[str, Any],
-    preparation: PreparationConfig,
-    network: ResponseGenerator,
-) -> _Learned:
-    response = network.response
-    chain = learned_chain(response, path.name)
+def _described(run: Run, network: ResponseGenerator) -> _Response:
+    response, preparation, fit = network.response, run.recipe.preparation, run.fit or FitInfo()
+    chain = learned_chain(response, Path(run.name).name)
     if int(network.n_baselines):
         chain = with_noise(chain, network, preparation)
     parameters = response.describe()
     if len(response.ringing):
         parameters["ringing"] = response.ringing.norm().item()
-    fit = info.get("fit")
-    fit = fit if isinstance(fit, Mapping) else {}
-    errors = fitted_errors(response, fit.get("errors") or {})
-    dt_ns = float(info["dt_ns"])
+    errors = fitted_errors(response, fit.errors)
     errors |= propagated(
         response,
-        fit.get("covariance") or [],
-        lambda moved: _shape_numbers(moved, preparation, dt_ns),
+        fit.covariance,
+        lambda moved: _shape_numbers(moved, preparation, run.dt_ns),
     )
-    return _Learned(path, info, fit, preparation, chain, parameters, errors)
+    return _Response(run, chain, parameters, errors)
 
 
 def _shape_numbers(
@@ -230,52 +214,49 @@ def _shape_numbers(
     return slow_numbers(slow) | numbers
 
 
-def _told(run: _Learned) -> dict[str, Any]:
-    slow = {n: w for n, w in run.parameters.items() if n.startswith("slow_")}
-    values = {n: v for n, v in run.parameters.items() if n not in slow}
+def _told(found: _Response) -> dict[str, Any]:
+    run, parameters = found.run, found.parameters
+    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
+    values = {n: v for n, v in parameters.items() if n not in slow}
     values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
-    values |= chain_numbers(run.chain, run.preparation, run.dt_ns)
-    try:
-        if run.fit.get("moments"):
-            values["chi_square_per_moment"] = run.fit["chi_square"] / run.fit["moments"]
-        noise_error = _noise_error(run)
-    except (LookupError, TypeError, AttributeError) as error:
-        raise CpunetError(
-            f"{run.path}: the fit in its run.json is damaged ({error}); train again"
-        ) from error
+    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
+    if run.fit is not None and run.fit.chi_square_per_moment is not None:
+        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
     return {
-        "path": str(run.path),
-        "recipe": run.info["recipe"],
-        "peak": run.info["peak"],
-        "seed": run.info["seed"],
+        "path": run.name,
+        "recipe": run.recipe.name,
+        "peak": run.peak,
+        "seed": run.seed,
         "values": values,
-        "errors": {n: e for n, e in run.errors.items() if n in values} | noise_error,
-        "parameters": run.parameters,
-        "parameter_errors": run.errors,
-        "doubts": _doubts(run),
+        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
+        "parameters": parameters,
+        "parameter_errors": found.errors,
+        "doubts": _doubts(found),
     }
 
 
-def _doubts(run: _Learned) -> list[str]:
+def _doubts(found: _Response) -> list[str]:
     """Reasons why the numbers of a run do not describe a readout alone."""
-    causes = run.fit.get("causes")
-    found = beyond(run.parameters) + stretched(run.parameters)
-    if isinstance(causes, list) and causes:
-        found.insert(
+    fit = found.run.fit
+    doubts = beyond(found.parameters) + stretched(found.parameters)
+    if fit is not None and fit.causes:
+        doubts.insert(
             0,
-            f"poor fit: {run.fit.get('verdict')}; these numbers stand in for what is wrong "
-            f"with the simulation, too: {causes[0]}",
+            f"poor fit: {fit.verdict}; these numbers stand in for what is wrong "
+            f"with the simulation, too: {fit.causes[0]}",
         )
-    return found
+    return doubts
 
 
-def _noise_error(run: _Learned) -> Numbers:
+def _noise_error(found: _Response) -> Numbers:
     """Error of the noise in keV, from the baselines and the height of a full charge."""
-    measured, chain = run.fit.get("noise") or {}, run.chain
+    run, chain = found.run, found.chain
+    measured = {} if run.fit is None else run.fit.noise
     error, rms = measured.get("rms_error"), measured.get("rms")
     if not error or not rms or chain.noise_kev2_per_mhz is None:
         return {}
-    end_ns = align_ns(chain, run.preparation) + run.preparation.samples_after * run.dt_ns
+    preparation = run.recipe.preparation
+    end_ns = align_ns(chain, preparation) + preparation.samples_after * run.dt_ns
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
@@ -307,7 +288,7 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
-def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]]) -> None:
+def require_alike(runs: Sequence[tuple[str, float, PreparationConfig]]) -> None:
     """Raise a `CpunetError` unless all runs have the first's period (ns) and preparation."""
     (first, first_ns, preparation), *others = runs
     for run, dt_ns, other in others:
@@ -323,9 +304,9 @@ def require_alike(runs: Sequence[tuple[Path, float, PreparationConfig]]) -> None
             )
 
 
-def _require_sampling(first: _Learned, truth: Electronics | None) -> None:
+def _require_sampling(first: Run, truth: Electronics | None) -> None:
     if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
         raise CpunetError(
-            f"{first.path}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
+            f"{first.name}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
             f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
         )

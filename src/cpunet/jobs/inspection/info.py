@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,6 @@ from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
 from cpunet.pulses.spectrum import Values, suggested_calibration
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.settings import read_json
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
 
@@ -86,8 +84,7 @@ def describe(
     Returns
     -------
     dict
-        For a run, ``kind`` (``"run"``), ``path`` and the content of ``run.json``; with a
-        readout chain also ``noise_kev``, the RMS of its noise, and ``noise_kev_error``.
+        For a run, ``kind`` (``"run"``), ``path`` and ``run``.
         For a file of hits, the result of `describe_hits`.
         For a file with several tables, none of them chosen, ``kind`` (``"tables"``),
         ``path`` and ``tables``: the result of `PulseSource.describe` by name, or the reason
@@ -137,7 +134,7 @@ def describe(
     if path.is_dir():
         if without_remains is not None:
             raise CpunetError(f"{path}: a run has no traces; leave out --without-remains")
-        told = _run(path) | {"kind": "run", "path": str(path)}
+        told = _run(path)
     elif holds_hits(path) and without_remains is None:
         chosen = None if table == ALL else table
         peaks = recipe.peaks if recipe else {}
@@ -328,16 +325,11 @@ def _range(values: list[float]) -> list[float]:
 
 
 def _run(folder: Path) -> dict[str, Any]:
-    file = folder / _RUN_FILE
-    if not file.is_file():
+    if not (folder / _RUN_FILE).is_file():
         hint = next((hint for name, hint in _NO_RUNS.items() if (folder / name).is_file()), "")
         raise CpunetError(
             f"{folder}: {hint}a folder without {_RUN_FILE}; give the folder of a run, or a file"
         )
-    content = read_json(file, "train it again")
-    # loads torch, which files do not need
-    from cpunet.jobs.inspection.chain_description import noise_kev
+    from cpunet.training.run import Run  # loads torch, which files do not need
 
-    with suppress(CpunetError, LookupError, TypeError, ValueError):  # no chain, or damaged
-        content["noise_kev"], content["noise_kev_error"] = noise_kev(folder)
-    return content
+    return {"kind": "run", "path": str(folder), "run": Run.load(folder)}

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cpunet.training.run import Run
 
 Lines = list[tuple[str, str]]
 NOTHING = "–"
-PARTS = 8  # maximum number of deviating parts of a fit
-UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
-_OFF = 3.0  # standard deviations
 
 
 def in_words(told: Mapping[str, Any]) -> Lines:
     """Return names and texts for the result of `describe` of pulses, hits or a run."""
     if told["kind"] == "run":
-        return _run(told)
+        run: Run = told["run"]
+        return run.summary()
     return _hits(told) if told["kind"] == "hits" else _pulses(told)
 
 
@@ -33,13 +32,13 @@ def _pulses(told: Mapping[str, Any]) -> Lines:
         ("columns", ", ".join(told["columns"])),
         *((name, text) for name, text in told.get("provenance", {}).items()),
         ("energy", _energy(told)),
-        ("lines", _counts(told["peaks"])),
+        ("lines", counted(told["peaks"])),
         ("source", told.get("found", "")),
         ("amplitudes", told.get("amplitudes", "")),
         ("samples", f"values {_span(told['samples'])}{_odd(told)}"),
     ]
     lines += [("", traces)] if isinstance(traces, str) else _traces(traces)
-    return [(n, t) for n, t in lines + _remains(told.get("remains")) if t]
+    return [(n, t) for n, t in lines + remains_lines(told.get("remains")) if t]
 
 
 def _energy(told: Mapping[str, Any]) -> str:
@@ -70,13 +69,13 @@ def _traces(told: Mapping[str, Any]) -> Lines:
         ("baseline", f"{told['baseline_samples']} samples before nearly all pulses"),
         ("decay", f"{decay:.3g} µs" if decay else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),
-        ("saturated", _percent(told["saturated_percent"])),
-        ("pile-up", f"{_percent(told['pile_up_percent'])} (tails that are no single decay)"),
-        ("left out", f"{_counts(told['rejected']) or 'none'} of {told['looked_at']} traces"),
+        ("saturated", percent(told["saturated_percent"])),
+        ("pile-up", f"{percent(told['pile_up_percent'])} (tails that are no single decay)"),
+        ("left out", f"{counted(told['rejected']) or 'none'} of {told['looked_at']} traces"),
     ]
 
 
-def _remains(told: Mapping[str, Any] | str | None) -> Lines:
+def remains_lines(told: Mapping[str, Any] | str | None) -> Lines:
     if told is None or isinstance(told, str):
         return [("remains", told or "")]
     if not told["rate_khz"]:
@@ -107,7 +106,7 @@ def _hits_of(told: Mapping[str, Any]) -> Lines:
     lines = [
         ("hits", f"{told['hits']} of {told['events']} events"),
         ("energy", f"{_span(told['energy_kev'])} keV an event"),
-        ("lines", _counts(told["peaks"])),
+        ("lines", counted(told["peaks"])),
         ("extents", f"{extents} mm"),
     ]
     crystal = told.get("crystal")
@@ -134,93 +133,7 @@ def _frame(crystal: Mapping[str, Any]) -> str:
     return "no other fits; these hits are of another detector, or of other dimensions"
 
 
-def _run(told: Mapping[str, Any]) -> Lines:
-    fit = _mapping(told, "fit")
-    parameters = _mapping(fit, "parameters")
-    chain = any(name.startswith("pole_") for name in parameters)
-    response = f"cpunet response {told['path']}; " if chain else ""
-    when = str(told.get("started", ""))[:16].replace("T", " ")
-    lines = [
-        ("run", str(told["path"])),
-        (
-            "trained",
-            f"recipe {told.get('recipe')} on {told.get('peak')}, seed {told.get('seed')}; "
-            f"{when}, {_text(told.get('seconds'))} s on {told.get('device')}",
-        ),
-        ("from", str(told.get("init") or "")),
-        ("simulated", _side(told, "sim")),
-        ("measured", _side(told, "data")),
-        ("fit", str(fit.get("verdict") or "")),
-        ("off", _deviations(_mapping(fit, "pulls"))),
-        *(("cause", str(cause)) for cause in _texts(fit.get("causes"))),
-        ("response", _parameters(parameters)),
-        ("drift", str(_mapping(fit, "drift").get("verdict") or "")),
-    ]
-    if "baselines" in (noise := _mapping(fit, "noise")):
-        lines.append(("noise", f"{_noise(told)}of {noise['baselines']} baselines"))
-    if "rate_khz" in (remains := _mapping(fit, "remains")):
-        with suppress(LookupError, TypeError, ValueError):  # run.json is damaged
-            lines += _remains(remains)
-    versions = _mapping(told, "versions")
-    lines += [
-        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
-        ("next", f"{response}cpunet validate {told['path']} …"),
-    ]
-    return [(n, t) for n, t in lines if t]
-
-
-def _noise(told: Mapping[str, Any]) -> str:
-    if "noise_kev" not in told:
-        return ""
-    # loads matplotlib, which the help of a command does not need
-    from cpunet.analysis.nested_tables import with_std
-
-    return f"{with_std(told['noise_kev'], told.get('noise_kev_error'))} keV (RMS), "
-
-
-def _mapping(told: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    found = told.get(name)
-    return found if isinstance(found, Mapping) else {}
-
-
-def _texts(value: Any) -> list[str]:
-    return [str(one) for one in value] if isinstance(value, list) else []
-
-
-def _side(told: Mapping[str, Any], side: str) -> str:
-    one = _mapping(told, side)
-    if not one:
-        return ""
-    read_as = ", ".join(f"{n} {v}" for n, v in _mapping(one, "read_as").items())
-    text = f"{one.get('file')}" + (f" ({read_as})" if read_as else "")
-    text += f": {one.get('used')} of {one.get('read')} pulses used"
-    lost = _counts(_mapping(one, "rejections"))
-    return f"{text}, left out {lost}" if lost else text
-
-
-def _deviations(pulls: Mapping[str, Any]) -> str:
-    """Parts of the pulses that deviate, worst first."""
-    known = {name: value for name, value in pulls.items() if isinstance(value, int | float)}
-    worst = sorted(known, key=lambda name: -abs(known[name]))[:PARTS]
-    return ", ".join(f"{n} {known[n]:+.1f} σ" for n in worst if abs(known[n]) > _OFF)
-
-
-def _parameters(values: Mapping[str, Any]) -> str:
-    """Parameters of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
-    words = []
-    for name, value in values.items():
-        stem, _, unit = name.rpartition("_")
-        shown = f" {UNITS[unit]}" if unit in UNITS else ""
-        called = (stem if shown else name).replace("_", " ")
-        share = re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name)
-        if share and isinstance(value, int | float):
-            words.append(f"{called}{shown} {_percent(100 * value)}")
-        else:
-            words.append(f"{called} {_text(value)}{shown}")
-    return ", ".join(words)
-
-
-def _counts(counts: Mapping[str, Any]) -> str:
+def counted(counts: Mapping[str, Any]) -> str:
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)
 
 
@@ -229,10 +142,10 @@ def _span(values: Any, digits: int = 9) -> str:
     return " … ".join(f"{round(v, digits):.6g}" for v in values) if values else NOTHING
 
 
-def _percent(value: float) -> str:
+def percent(value: float) -> str:
     """Two digits, and whole numbers from 99.5 on."""
     return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"
 
 
-def _text(value: Any) -> str:
+def short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)

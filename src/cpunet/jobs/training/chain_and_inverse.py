@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import nn
@@ -25,7 +24,7 @@ from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import with_drift_terms
-from cpunet.training.run_folder import load_network, read_recipe
+from cpunet.training.run import FitInfo, Run
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +42,7 @@ class Sides:
     data_set: InputSet | None = None
 
 
-def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
+def known_response(run: Run, like: Recipe) -> Readout:
     """The response of a run, as a starting point for a recipe.
 
     Raises
@@ -51,16 +50,13 @@ def known_response(run: Path, dt_ns: float, like: Recipe) -> Readout:
     CpunetError
         If the run has no response of the recipe's kind.
     """
-    recipe = read_recipe(run)
-    generator = recipe.generator
+    generator = run.recipe.generator
     if generator.name != like.generator.name or isinstance(generator, PunetConfig):
         raise CpunetError(
-            f"{run}: of recipe {recipe.name}, from which {like.name} cannot start; give a run "
-            f"of {like.name}"
+            f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
+            f"give a run of {like.name}"
         )
-    network = ResponseGenerator(generator, dt_ns)
-    load_network(run, "ren", network)
-    known: Readout = network.response
+    known: Readout = run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
     return known
 
 
@@ -71,8 +67,10 @@ class Matched(NamedTuple):
     ----------
     model
         Module with ``ren`` and ``iren``.
-    told
+    info
         The entry on the fit for ``run.json``.
+    in_no_band
+        Number of pulses of each side that were not compared.
     recipe
         Recipe of the response as fitted: a ringing or a stretch may have been added.
     fit
@@ -82,19 +80,20 @@ class Matched(NamedTuple):
     """
 
     model: nn.Module
-    told: dict[str, Any]
+    info: FitInfo
+    in_no_band: dict[str, int]
     recipe: Recipe
     fit: Fit
     remark: str | None
 
     def log(self) -> None:
         """Tell which pulses were compared, how well the fit describes them, and why not."""
-        fit, told = self.fit, self.told
+        fit, info = self.fit, self.info
         if self.remark is not None:
             log.warning(self.remark)
         compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
         log.info(f"compared (simulated/measured pulses): {compared}")
-        beside = told["in_no_band"]
+        beside = self.in_no_band
         if any(beside.values()):
             log.info(
                 f"in no band, since one side has too few of their energies: {beside['sim']} "
@@ -106,9 +105,9 @@ class Matched(NamedTuple):
             log.info(f"fit: {fit.verdict}")
         if fit.drift is not None:
             log.info(str(fit.drift))
-        for number, cause in enumerate(told["causes"], 1):
+        for number, cause in enumerate(info.causes, 1):
             log.info(f"  {number}. {cause}")
-        for found in beyond(told["parameters"]) + stretched(told["parameters"]):
+        for found in beyond(info.parameters) + stretched(info.parameters):
             log.warning(found)
 
 
@@ -164,13 +163,14 @@ def match(
     chain.remains = drawn
     iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
     model = nn.ModuleDict({"ren": chain, "iren": iren})
-    return Matched(model, told, recipe, fit, remark)
+    info = FitInfo.model_validate(told)
+    return Matched(model, info, told["in_no_band"], recipe, fit, remark)
 
 
 def _described(
     fit: Fit, response: Readout, noise: BaselineNoise, sides: Sides
 ) -> dict[str, Any]:
-    """Entry on the fit for ``run.json``."""
+    """Content of `FitInfo`, without remains."""
     parameters = response.describe()
     return {
         "parameters": parameters,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,15 +13,14 @@ from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
-from cpunet.jobs.training.training_job import Trained, TrainingJob, TrainOptions
+from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.progress import stage
-from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import Recipe
-from cpunet.training.checkpoints import UnfinishedRun, unfinished_folder
+from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
-from cpunet.training.run_folder import fill_networks, read_losses, read_recipe, weights_sha256
+from cpunet.training.run import FitInfo, Run, read_losses
 
 log = logging.getLogger(__name__)
 
@@ -31,55 +28,40 @@ log = logging.getLogger(__name__)
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 
 
-class CycleGanTrainer:
-    """Trains a CycleGAN; see `cpunet.jobs.training.trainers.Trainer`."""
+def train_networks(job: TrainingJob) -> Run:
+    """Train the networks of a CycleGAN, or resume their training."""
+    recipe, how = job.recipe, job.options
+    run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
+    state = run.begin(resume=how.resume)
+    outside, fit = outside_noise(job.sides, recipe)
+    left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
+    with stage("Training", left) as bar:
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe = recipe
+        def listen(records: list[Record]) -> None:
+            run.log(records)
+            bar.update(len(records))
 
-    def workplace(
-        self,
-        out: Path,
-        read: Sequence[Path | str | None],
-        options: TrainOptions,
-    ) -> AbstractContextManager[Path]:
-        """Context of ``OUT.unfinished``, which becomes `out` when the training is complete."""
-        resume, force = options.resume, options.force
-        return unfinished_folder(out, *read, resume=resume, force=force)
-
-    def train(self, job: TrainingJob) -> Trained:
-        """Train or resume."""
-        recipe, how = self.recipe, job.options
-        run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
-        state = run.begin(resume=how.resume)
-        outside, told = outside_noise(job.sides, recipe)
-        left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
-        with stage("Training", left) as bar:
-
-            def listen(records: list[Record]) -> None:
-                run.log(records)
-                bar.update(len(records))
-
-            model = train(
-                job.sim.prepared.pulses.waveforms,
-                job.data.prepared.pulses.waveforms,
-                recipe,
-                seed=how.seed,
-                device=how.device,
-                init=None if how.init is None else weights_of(how.init, recipe),
-                outside=outside,
-                listener=listen,
-                hooks=CheckpointHooks(run.save, state, job.stop),
-            )
-        run.finish()
-        for line in judges_noted(read_losses(job.folder)):
-            log.warning(line)
-        resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-        return Trained(model, job.info(run.started, run.seconds) | resumed | told, recipe)
+        model = train(
+            job.sim.prepared.pulses.waveforms,
+            job.data.prepared.pulses.waveforms,
+            recipe,
+            seed=how.seed,
+            device=how.device,
+            init=None if job.init is None else weights_of(job.init, recipe),
+            outside=outside,
+            listener=listen,
+            hooks=CheckpointHooks(run.save, state, job.stop),
+        )
+    run.finish()
+    for line in judges_noted(read_losses(job.folder)):
+        log.warning(line)
+    resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
+    more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
+    return job.run(model, recipe, run.started, run.seconds, **more)
 
 
-def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, dict[str, Any]]:
-    """Noise for the translations of the simulated pulses, and its entry for ``run.json``.
+def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, FitInfo | None]:
+    """Noise for the translations of the simulated pulses, and what was found of remains.
 
     Raises
     ------
@@ -87,7 +69,7 @@ def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, dict[st
         If the recipe requires noise, and there are no baselines to draw it from.
     """
     if recipe.cyclegan.training.noise == "none":
-        return None, {}
+        return None, None
     try:
         found = remains_of_sides(sides, recipe)
         noise, note = measured_noise(
@@ -102,10 +84,12 @@ def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, dict[st
         log.warning(note)
     drawn = TraceNoise(noise, found.drawn)
     outside = Outside(drawn, sides.sim.energy_kev, recipe.preparation)
-    return outside, {} if found.told is None else {"fit": {"remains": found.told}}
+    return outside, None if found.told is None else FitInfo.model_validate(
+        {"remains": found.told}
+    )
 
 
-def weights_of(init: Path, recipe: Recipe) -> Callable[[CycleGan], None]:
+def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:
     """Function that fills networks with the weights of another run.
 
     Raises
@@ -113,20 +97,30 @@ def weights_of(init: Path, recipe: Recipe) -> Callable[[CycleGan], None]:
     CpunetError
         If that run has no networks, or they were trained on other windows.
     """
-    other = read_recipe(init)
-    if not isinstance(other.generator, PunetConfig):
+    other = init.recipe
+    if other.generator.name != "punet":
         raise CpunetError(
-            f"{init}: a readout chain ({other.name}), from which no network can start; give a "
-            "run of networks"
+            f"{init.name}: a readout chain ({other.name}), from which no network can start; "
+            "give a run of networks"
         )
     theirs, own = other.preparation, recipe.preparation
     if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
         raise CpunetError(
-            f"{init}: its networks know windows of {theirs.samples_before} + "
+            f"{init.name}: its networks know windows of {theirs.samples_before} + "
             f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
             f"{own.samples_after}; start from a run of the same windows"
         )
-    return partial(fill_networks, init)
+    return partial(_fill, init)
+
+
+def _fill(run: Run, model: CycleGan) -> None:
+    """Fill the networks for which the run has weights, at least REN and IREN."""
+    there = {"ren", "iren"} | {name.partition(".")[0] for name in run.weights}
+    device = str(next(model.parameters()).device)
+    for name, network in model.named_children():
+        if name in there:
+            was_training = network.training
+            run.fill(name, network, device).train(was_training)
 
 
 def _fingerprint(job: TrainingJob) -> dict[str, Any]:
@@ -136,8 +130,8 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
     training = recipe["training"]
     recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
     settings = {"recipe": recipe, "peak": job.options.peak, "seed": job.options.seed}
-    if job.options.init is not None:
-        settings["init"] = weights_sha256(job.options.init)
+    if job.init is not None:
+        settings["init"] = job.init.weights_sha256
     return settings | {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import folder_written_aside, refuse_existing
+from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
@@ -22,13 +22,13 @@ from cpunet.pulses.reading.pickles import PickledPulse, TruncatedError, as_pulse
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import RUN, versions, write_run
+from cpunet.training.run import Run, SideInfo, versions
 from cpunet.translation.published import read_discriminator, read_generator
 
 BLOCK = 1024
 TABLE = "geds/raw"
 # Entries on the training for a report; its pulses were not published.
-UNKNOWN = {"file": "not published with the weights", "used": "an unknown number of"}
+UNKNOWN = SideInfo(file="not published with the weights", used="an unknown number of")
 
 
 def import_weights(
@@ -41,7 +41,7 @@ def import_weights(
     dt_ns: float = 16.0,
     peak: str = "FEP",
     force: bool = False,
-) -> dict[str, Any]:
+) -> Run:
     """Make a run folder for `REN.load` and `IREN.load` from published state dicts.
 
     Parameters
@@ -61,8 +61,8 @@ def import_weights(
 
     Returns
     -------
-    dict
-        Content of ``run.json``.
+    Run
+        The run, with the files in ``imported``.
 
     Raises
     ------
@@ -85,25 +85,25 @@ def import_weights(
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
     networks, recipe = _read_networks(files)
     parse_selection(peak, recipe.peaks)
-    info = {
-        "recipe": recipe.name,
-        "peak": peak,
-        "seed": None,
-        "dt_ns": dt_ns,
-        "seconds": 0.0,
-        "device": "elsewhere",
-        "sim": UNKNOWN,
-        "data": UNKNOWN,
-        "imported": {
+    run = Run.of(
+        nn.ModuleDict(networks),
+        recipe,
+        peak=peak,
+        seed=None,
+        dt_ns=dt_ns,
+        seconds=0.0,
+        device="elsewhere",
+        sim=UNKNOWN,
+        data=UNKNOWN,
+        imported={
             part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
             for part, path in files.items()
         },
-        "imported_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions(),
-    }
-    with folder_written_aside(out, RUN, force=force) as folder:
-        write_run(folder, nn.ModuleDict(networks), recipe, info)
-    return info
+        imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions=versions(),
+    )
+    run.save(out, force)
+    return run.model_copy(update={"folder": out})
 
 
 def _read_networks(files: Mapping[str, Path]) -> tuple[dict[str, nn.Module], Recipe]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,15 +23,22 @@ from cpunet.jobs.common.inputs import (
 from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.trainers import trainer_for
+from cpunet.jobs.training.cyclegan_trainer import train_networks
+from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
+from cpunet.outputs import folder_written_aside
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import read_info, write_run
+from cpunet.training.checkpoints import unfinished_folder
+from cpunet.training.run import RUN, Run, as_run
 
 log = logging.getLogger(__name__)
 
 AS_USUAL = TrainOptions()
+FITS: dict[str, Callable[[TrainingJob], Run]] = {
+    "matching": train_chain,
+    "cyclegan": train_networks,
+}
 
 
 @one_thread_for_matrices()
@@ -43,7 +50,7 @@ def train_run(
     options: TrainOptions = AS_USUAL,
     *,
     stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:
+) -> Run:
     """Train REN and IREN on the pulses of a peak and write the run folder.
 
     Parameters
@@ -58,8 +65,8 @@ def train_run(
 
     Returns
     -------
-    dict
-        Content of ``run.json``.
+    Run
+        The trained run.
 
     Raises
     ------
@@ -70,17 +77,33 @@ def train_run(
         If `stop` returned true.
     """
     keep_freed_memory()
-    trainer = trainer_for(recipe)
+    init = None if options.init is None else as_run(options.init)
     options = replace(options, device=resolve_device(options.device))
     selection = parse_selection(options.peak, recipe.peaks)
-    read = (*sim.files, *data.files, options.init)
-    with trainer.workplace(out, read, options) as folder:
+    read = (*sim.files, *data.files, None if init is None else init.folder)
+    with _workplace(out, read, recipe, options) as folder:
         sim_set, data_set = _read(sim, data, recipe, selection)
-        if options.init is not None:
-            _require_sampling(options.init, data_set)
-        job = TrainingJob(recipe, options, sim_set, data_set, data, folder, stop)
-        done = trainer.train(job)
-        return write_run(folder, done.model, done.recipe, done.info)
+        if init is not None:
+            _require_sampling(init, data_set)
+        job = TrainingJob(recipe, options, sim_set, data_set, data, init, folder, stop)
+        run = FITS[recipe.training.method](job)
+        run.write(folder)
+    return run.model_copy(update={"folder": out})
+
+
+def _workplace(
+    out: Path, read: Sequence[Path | str | None], recipe: Recipe, options: TrainOptions
+) -> AbstractContextManager[Path]:
+    """Context of the folder to write to, which becomes `out` when the training is complete."""
+    resume, force = options.resume, options.force
+    if recipe.training.method == "cyclegan":
+        return unfinished_folder(out, *read, resume=resume, force=force)
+    if resume:
+        raise CpunetError(
+            f"recipe {recipe.name}: takes a minute and keeps no checkpoints; give the "
+            "recipe that the training was begun with, or leave out --resume"
+        )
+    return folder_written_aside(out, RUN, *read, force=force)
 
 
 def _read(
@@ -100,9 +123,8 @@ def _read(
     return sim_set, data_set
 
 
-def _require_sampling(init: Path, data: InputSet) -> None:
+def _require_sampling(init: Run, data: InputSet) -> None:
     """Raise a `CpunetError` if the run to start from has another sampling period."""
-    known_ns = float(read_info(init)["dt_ns"])
-    if not np.isclose(known_ns, data.dt_ns):
-        kinds = f"trained on {known_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-        raise CpunetError(f"{init}: {kinds}; resample them")
+    if not np.isclose(init.dt_ns, data.dt_ns):
+        kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
+        raise CpunetError(f"{init.name}: {kinds}; resample them")

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.common.inputs import InputFile
@@ -15,7 +14,7 @@ from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import unfinished_name
 from cpunet.training.loop import StoppedError
-from cpunet.training.run_folder import INFO, read_info
+from cpunet.training.run import INFO, Run
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +29,7 @@ def train_channels(
     options: TrainOptions = AS_USUAL,
     *,
     stop: Callable[[], bool] = lambda: False,
-) -> Outcome[dict[str, Any]]:
+) -> Outcome[Run]:
     """Train a run for each channel of the data, in the folder ``OUT/CHANNEL``.
 
     Parameters
@@ -48,7 +47,7 @@ def train_channels(
     Returns
     -------
     Outcome
-        Content of each ``run.json``, and the reasons why channels have none.
+        Each run, and the reasons why channels have none.
 
     Raises
     ------
@@ -58,13 +57,14 @@ def train_channels(
         If `stop` returned true.
     """
 
-    def train(name: str, pair: Pair, folder: Path) -> dict[str, Any]:
+    def train(name: str, pair: Pair, folder: Path) -> Run:
         if options.resume and (folder / INFO).is_file():
             log.info(f"{name}: trained already")
-            return read_info(folder)
+            return Run.load(folder)
+        init = options.init
         own = replace(
             options,
-            init=None if options.init is None else own_folder(options.init, name, INFO),
+            init=own_folder(Path(init), name, INFO) if isinstance(init, str | Path) else init,
             resume=options.resume and unfinished_name(folder).exists(),
         )
         return train_run(*pair, folder, recipe, own, stop=stop)

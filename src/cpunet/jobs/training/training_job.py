@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import nn
@@ -14,25 +14,7 @@ from cpunet.jobs.common.devices import peak_memory_mb
 from cpunet.jobs.common.inputs import InputFile, InputSet
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run_folder import versions
-
-
-class Trained(NamedTuple):
-    """Result of a training.
-
-    Parameters
-    ----------
-    model
-        Module with ``ren`` and ``iren``.
-    info
-        Content of ``run.json``.
-    recipe
-        Recipe as trained; ringing may have been added to its chain.
-    """
-
-    model: nn.Module
-    info: dict[str, Any]
-    recipe: Recipe
+from cpunet.training.run import Run, RunLike, versions
 
 
 @dataclass(frozen=True)
@@ -48,7 +30,7 @@ class TrainOptions:
     device
         ``"cpu"``, ``"cuda"``, or ``"auto"`` for a GPU if there is one.
     init
-        Folder of a run of the same kind to start from, e.g. of another detector or period.
+        A run of the same kind to start from, e.g. of another detector or period.
     resume
         Whether to resume an unfinished training, if any; all else must be unchanged.
     force
@@ -58,7 +40,7 @@ class TrainOptions:
     peak: str = "FEP"
     seed: int = 0
     device: str = "auto"
-    init: Path | None = None
+    init: RunLike | None = None
     resume: bool = False
     force: bool = False
 
@@ -73,6 +55,8 @@ class TrainingJob:
         Options with a resolved device.
     sim, data, data_file
         Prepared pulses of both sides, and the file of the measured ones.
+    init
+        Run to start from.
     folder
         Folder to write to.
     stop
@@ -84,6 +68,7 @@ class TrainingJob:
     sim: InputSet
     data: InputSet
     data_file: InputFile
+    init: Run | None
     folder: Path
     stop: Callable[[], bool] = lambda: False
 
@@ -94,21 +79,37 @@ class TrainingJob:
             self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
         )
 
-    def info(self, started: str, seconds: float) -> dict[str, Any]:
-        """Provenance of a run, for ``run.json``; `seconds` is the time that it took."""
+    def run(
+        self, model: nn.Module, recipe: Recipe, started: str, seconds: float, **more: Any
+    ) -> Run:
+        """The run of trained networks.
+
+        Parameters
+        ----------
+        model
+            Module with ``ren`` and ``iren``.
+        recipe
+            Recipe as trained; ringing may have been added to its chain.
+        started, seconds
+            When the training began, and the time that it took.
+        more
+            Further facts of the run.
+        """
         how = self.options
-        return {
-            "recipe": self.recipe.name,
-            "peak": how.peak,
-            "seed": how.seed,
-            "init": None if how.init is None else str(how.init),
-            "device": how.device,
-            "threads": torch.get_num_threads(),
-            "started": started,
-            "seconds": round(seconds, 1),
-            "peak_memory_mb": peak_memory_mb(how.device),
-            "dt_ns": self.data.dt_ns,
-            "versions": versions(),
-            "sim": self.sim.provenance(),
-            "data": self.data.provenance(),
-        }
+        return Run.of(
+            model,
+            recipe,
+            peak=how.peak,
+            seed=how.seed,
+            init=None if self.init is None else self.init.name,
+            device=how.device,
+            threads=torch.get_num_threads(),
+            started=started,
+            seconds=round(seconds, 1),
+            peak_memory_mb=peak_memory_mb(how.device),
+            dt_ns=self.data.dt_ns,
+            versions=versions(),
+            sim=self.sim.provenance(),
+            data=self.data.provenance(),
+            **more,
+        )

@@ -16,16 +16,10 @@ from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
-from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.settings import read_json
-from cpunet.training.run_folder import read_info
-from cpunet.translation.backends import (
-    Backend,
-    NetworkBackend,
-    NoisyNetworkBackend,
-    ResponseBackend,
-)
-from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export, graph_of
+from cpunet.training.run import Run, RunLike, as_run
+from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export
+from cpunet.translation.graphs import Graph
 from cpunet.translation.translator import IREN, REN, Translator
 
 _LANGUAGES = {
@@ -46,7 +40,7 @@ class Exported:
 
 
 def export_run(
-    run: Path,
+    run: RunLike,
     out: Path,
     form: Format,
     *,
@@ -63,7 +57,7 @@ def export_run(
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     out
         File to write.
     form
@@ -82,34 +76,28 @@ def export_run(
         exported graph differs from the run.
     """
     card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
+    run = as_run(run)
     for path in (out, card, noise_file):
-        refuse_existing(path, run, report, force=force)
+        refuse_existing(path, run.folder, report, force=force)
     kind: type[Translator] = IREN if inverse else REN
-    translator = kind.load(run)
-    info = read_info(run)
+    translator = kind.of(run)
     scores = None if report is None else _scores(report)
-    noise = _kept_noise(translator.backend)
+    noise = translator.backend.noise
+    graph = translator.backend.graph(run.recipe.preparation.length)
     with (
         stage("Exporting"),
-        written_aside(out) as graph,
+        written_aside(out) as aside,
         written_aside(card) as text,
     ):
-        difference = export(graph_of(translator), graph, form)
+        difference = export(graph, aside, form)
         done = Exported(out, card, None if noise is None else noise_file, difference)
-        text.write_text(_card(run, translator, info, done, form, scores), encoding="utf-8")
+        text.write_text(_card(run, translator, graph, done, form, scores), encoding="utf-8")
         if noise is not None:
-            with written_aside(noise_file) as aside:
-                _write_noise(aside, noise)
+            with written_aside(noise_file) as stored:
+                _write_noise(stored, noise)
     if noise is None:
         noise_file.unlink(missing_ok=True)  # of an export that this one replaces
     return done
-
-
-def _kept_noise(backend: Backend) -> BaselineNoise | None:
-    """Noise that a translator adds outside of its graph, if any."""
-    if isinstance(backend, ResponseBackend):
-        return backend.chain.noise
-    return backend.noise.noise if isinstance(backend, NoisyNetworkBackend) else None
 
 
 def _write_noise(path: Path, noise: BaselineNoise) -> None:
@@ -135,9 +123,9 @@ def _scores(report: Path) -> Mapping[str, Any]:
 
 
 def _card(
-    run: Path,
+    run: Run,
     translator: Translator,
-    info: Mapping[str, Any],
+    graph: Graph,
     done: Exported,
     form: Format,
     scores: Mapping[str, Any] | None,
@@ -150,14 +138,14 @@ def _card(
         f"batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of the "
         f"pulse height (refused above {TOLERANCE:g}).\n",
         "## Made from\n",
-        *_origin(run, translator, info),
+        *_origin(run, translator),
         "## In and out\n",
-        *_interface(translator),
+        *_interface(translator, graph),
         "## Noise\n",
-        *_noise(translator, done),
+        *_noise(graph, done),
         "## Valid for\n",
         f"Pulses sampled every {translator.dt_ns:g} ns, of the detector and readout of the "
-        f"data. It was trained on {info['peak']}; what it does at other energies is for a "
+        f"data. It was trained on {run.peak}; what it does at other energies is for a "
         "validation to say. Pile-up, saturated pulses and other samplings are not covered.\n",
         "## Scores\n",
         *_score_table(scores),
@@ -165,26 +153,24 @@ def _card(
     return "\n".join(parts)
 
 
-def _origin(run: Path, translator: Translator, info: Mapping[str, Any]) -> list[str]:
-    lines = [f"* recipe {info['recipe']} (seed {info['seed']}), trained on {info['peak']}"]
-    for side, what in (("sim", "simulation"), ("data", "data")):
-        told = info.get(side)
-        if isinstance(told, dict) and "sha256" in told:
-            name = Path(str(told.get("file"))).name
+def _origin(run: Run, translator: Translator) -> list[str]:
+    lines = [f"* recipe {run.recipe.name} (seed {run.seed}), trained on {run.peak}"]
+    for side, what in ((run.sim, "simulation"), (run.data, "data")):
+        if side.sha256 is not None:
             lines.append(
-                f"* {what}: {name}, {told.get('used')} of {told.get('read')} pulses used, "
-                f"sha256 {str(told.get('sha256'))[:12]}…"
+                f"* {what}: {Path(str(side.file)).name}, {side.used} of {side.read} pulses "
+                f"used, sha256 {side.sha256[:12]}…"
             )
-    if imported := info.get("imported"):
-        names = ", ".join(Path(str(part.get("file"))).name for part in imported.values())
+    if run.imported:
+        names = ", ".join(Path(part["file"]).name for part in run.imported.values())
         lines.append(f"* weights imported from {names}")
     return [*lines, *_fitted(run, translator), ""]
 
 
-def _fitted(run: Path, translator: Translator) -> list[str]:
+def _fitted(run: Run, translator: Translator) -> list[str]:
     """Fitted parameters of a readout chain, or settings of a network."""
     generator = translator.recipe.generator
-    if not isinstance(generator, ResponseConfig):
+    if generator.name != "response":
         return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
     told = describe_responses([run])["runs"][0]
     errors = told["parameter_errors"]
@@ -198,7 +184,7 @@ def _fitted(run: Path, translator: Translator) -> list[str]:
     return lines
 
 
-def _interface(translator: Translator) -> list[str]:
+def _interface(translator: Translator, graph: Graph) -> list[str]:
     config = translator.recipe.preparation
     n = config.length
     simulated = (
@@ -214,7 +200,7 @@ def _interface(translator: Translator) -> list[str]:
     )
     forward = translator.part == "ren"
     lines = [f"* in: {simulated if forward else f'`windows`, {measured}: measured pulses.'}"]
-    if isinstance(translator.backend, NetworkBackend):
+    if "epsilon" in graph.inputs:
         channels = translator.backend.network.state_dict()["latent_mean.bias"].shape[0]
         lines.append(f"* in: `epsilon`, float32 (batch, {channels}, {n // 16}), see Noise.")
         lines.append(
@@ -237,9 +223,9 @@ def _interface(translator: Translator) -> list[str]:
     return lines
 
 
-def _noise(translator: Translator, done: Exported) -> list[str]:
+def _noise(graph: Graph, done: Exported) -> list[str]:
     lines = []
-    if isinstance(translator.backend, NetworkBackend):
+    if "epsilon" in graph.inputs:
         lines = [
             "The graph draws nothing. `epsilon` of independent N(0, 1) numbers gives a draw, "
             "of zeros the latent mean. Electronic noise is not added.\n"

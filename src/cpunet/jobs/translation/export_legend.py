@@ -32,7 +32,7 @@ from cpunet.jobs.translation.simflow_checks import (
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
-from cpunet.training.run_folder import read_info, weights_sha256
+from cpunet.training.run import RunLike, as_run
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
 
 def export_legend_pars(
-    run: Path,
+    run: RunLike,
     out: Path,
     *,
     detector: str | None = None,
@@ -67,7 +67,7 @@ def export_legend_pars(
     Parameters
     ----------
     run
-        Folder of a training run with a readout chain.
+        A trained run with a readout chain, or its folder.
     out
         Folder to create.
     detector
@@ -91,15 +91,16 @@ def export_legend_pars(
     CpunetError
         If the run has no readout chain, or the report belongs to another run or has no A/E.
     """
-    given = (run, report, library)
+    run = as_run(run)
+    given = (run.folder, report, library)
     refuse_existing(out, *given, force=force)
-    info = read_info(run)
     told = describe_responses([run])["runs"][0]
     for doubt in told["doubts"]:
         log.warning(doubt)
-    known = known_detector(run, info)
+    known = known_detector(run)
+    trained = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed}
     name = detector or known or EVERY_DETECTOR
-    methods, ae_pars = ({}, {}) if report is None else _against_energy(report, info)
+    methods, ae_pars = ({}, {}) if report is None else _against_energy(report, trained)
     undecayed = chain_of(run).undecayed
     with stage("Two numbers for the chain"):
         nearest = fitted_kernel(undecayed)
@@ -110,8 +111,9 @@ def export_legend_pars(
     whole = {
         "made_of": {
             "cpunet": cpunet.__version__,
-            "weights": weights_sha256(run),
-            **{key: info[key] for key in (*SAME, "dt_ns")},
+            "weights": run.weights_sha256,
+            **trained,
+            "dt_ns": run.dt_ns,
         },
         "electronics": {
             "equivalent": equivalent,
@@ -139,14 +141,14 @@ def _write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _against_energy(
-    report: Path, info: Mapping[str, Any]
+    report: Path, trained: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """A/E against energy of a report on this run, and the entries of production for it."""
     path = report / "metrics.json"
     metrics = read_json(path, "give the folder that `cpunet validate` made")
     try:
         training, found = metrics["training"], metrics["ae_energy"]
-        other = [key for key in SAME if training[key] != info[key]]
+        other = [key for key in SAME if training[key] != trained[key]]
         missing = found.get("missing")
         methods = {} if missing else dict(found["methods"])
         pars = {} if missing else _ae_pars(methods)
@@ -157,7 +159,7 @@ def _against_energy(
     if other:
         raise CpunetError(
             f"{report}: of a run with {other[0]} {training[other[0]]}, this one has "
-            f"{info[other[0]]}; validate this run"
+            f"{trained[other[0]]}; validate this run"
         )
     if missing:
         raise CpunetError(f"{report}: no A/E against energy: {missing}")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ from cpunet.jobs.translation.library_file import (
     sampling_period_ns,
 )
 from cpunet.settings import read_values
+from cpunet.training.run import Run
 from cpunet.translation.ring_padding import padded_axis
 
 PERIOD_NS = 1.0
@@ -146,16 +148,13 @@ def chosen_libraries(
     return [known]
 
 
-def known_detector(run: Path, info: Mapping[str, Any]) -> str | None:
+def known_detector(run: Run) -> str | None:
     """Name of the detector whose simulation a run was trained with; None if unknown."""
-    try:
-        name = read_values(Path(run) / "detector.yaml").get("name")
-    except CpunetError:
-        name = None
-    if name:
-        return str(name)
-    sim = info.get("sim")
-    file = Path(str(sim.get("file"))) if isinstance(sim, Mapping) else None
+    if run.folder is not None:
+        with suppress(CpunetError):  # there for a calibrated run
+            if name := read_values(run.folder / "detector.yaml").get("name"):
+                return str(name)
+    file = None if run.sim.file is None else Path(run.sim.file)
     if file is None or not file.is_file():
         return None
     try:

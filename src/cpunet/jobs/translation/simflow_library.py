@@ -31,7 +31,7 @@ from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
-from cpunet.training.run_folder import read_info, weights_sha256
+from cpunet.training.run import RunLike, as_run
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.low_rank import MOST, Loss, components
 from cpunet.translation.peak_currents import (
@@ -50,7 +50,7 @@ Floats = npt.NDArray[np.float32]
 
 
 def translate_for_simflow(
-    run: Path,
+    run: RunLike,
     source: Path,
     out: Path,
     *,
@@ -71,7 +71,7 @@ def translate_for_simflow(
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     source
         LH5 file of one library or more, of charge sampled every nanosecond.
     out
@@ -100,18 +100,18 @@ def translate_for_simflow(
         If the file contains no such library, or it is damaged, of another detector or
         sampling period.
     """
-    refuse_existing(out, run, source, force=force)
+    run = as_run(run)
+    refuse_existing(out, run.folder, source, force=force)
     if not 0 <= rings <= 100:
         raise CpunetError(f"{rings} rings of padding; give 0 to 100")
     if rank is not None and not 1 <= rank <= 1000:
         raise CpunetError(f"--low-rank {rank}: give 1 to 1000 components")
-    info = read_info(run)
-    ren = REN.load(run, resolve_device(device))
+    ren = REN.of(run, resolve_device(device))
     told: dict[str, Any] = {}
     with opened(source) as given:
-        names = chosen_libraries(given, source, detectors, known_detector(run, info))
+        names = chosen_libraries(given, source, detectors, known_detector(run))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
-        made_from = {"run": str(run), "weights": weights_sha256(run), "ideal": str(source)}
+        made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for library in ideal:
                 looked = _look(ren, library, given[library.path], source)

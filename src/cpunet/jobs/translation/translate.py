@@ -37,6 +37,7 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.writing import PulseWriter
+from cpunet.training.run import RunLike, as_run
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
 from cpunet.translation.to_adc import AdcForm, adc_scale
@@ -59,7 +60,7 @@ class FileTranslation:
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     options
         How to translate.
     device
@@ -71,12 +72,12 @@ class FileTranslation:
         If the run cannot be used, or lacks information for output in ADC counts.
     """
 
-    def __init__(self, run: Path, options: TranslateOptions, device: str = "auto") -> None:
-        self.run, self.options = run, options
+    def __init__(self, run: RunLike, options: TranslateOptions, device: str = "auto") -> None:
+        self.run, self.options = as_run(run), options
         self.kind: type[Translator] = IREN if options.inverse else REN
-        self.translator = self.kind.load(run, resolve_device(device))
+        self.translator = self.kind.of(self.run, resolve_device(device))
         self.form = self._form()
-        self._print = run_print(run)
+        self._print = run_print(self.run)
 
     @property
     def doubts(self) -> list[str]:
@@ -105,7 +106,7 @@ class FileTranslation:
         noise_key
             See `translate_file`.
         """
-        refuse_inputs(out, self.run, *source.files)
+        refuse_inputs(out, self.run.folder, *source.files)
         before = source_print(source)
         options = asdict(self.options) | {"noise_key": noise_key}
         made = {"source": before, "run": self._print, "options": options}
@@ -119,7 +120,7 @@ class FileTranslation:
             table=self.options.table or f"geds/{self.kind.part}",
             waveform_units=self.form.units,
             t0_ns=self.form.t0_ns,
-            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": str(self.run)},
+            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
             samples=self.form.samples,
             force=force,
         )
@@ -228,7 +229,7 @@ class FileTranslation:
 
 
 def translate_file(
-    run: Path,
+    run: RunLike,
     source: InputFile,
     out: Path,
     options: TranslateOptions = DEFAULTS,
@@ -246,7 +247,7 @@ def translate_file(
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     source
         Simulated pulses, or measured ones for the inverse.
     noise_key

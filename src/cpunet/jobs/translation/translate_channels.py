@@ -9,7 +9,7 @@ from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, 
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
-from cpunet.training.run_folder import INFO
+from cpunet.training.run import INFO
 
 DEFAULTS = TranslateOptions()
 

@@ -31,6 +31,7 @@ from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import stage
+from cpunet.training.run import Run, RunLike, as_run
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +49,7 @@ class _Task:
 
 
 def translate_files(
-    run: Path,
+    run: RunLike,
     sources: Sequence[InputFile],
     out: Path,
     options: TranslateOptions = DEFAULTS,
@@ -66,7 +67,7 @@ def translate_files(
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     sources
         Files of pulses.
     out
@@ -96,7 +97,8 @@ def translate_files(
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    _refuse_inputs(tasks, run)
+    run = as_run(run)
+    _refuse_inputs(tasks, run.folder)
     _require_apart(tasks, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
     for doubt in FileTranslation(run, options, device).doubts:
@@ -147,7 +149,7 @@ def expanded(names: Sequence[Path]) -> list[Path]:
 class _Maker:
     """The work of each process: one file after the other."""
 
-    run: Path
+    run: Run
     options: TranslateOptions
     device: str
     resume: bool
@@ -272,7 +274,7 @@ def _name(path: Path) -> str:
     return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
 
 
-def _refuse_inputs(tasks: Sequence[_Task], run: Path) -> None:
+def _refuse_inputs(tasks: Sequence[_Task], run: Path | None) -> None:
     """Raise a `CpunetError` if an output is an input of any task, or lies in the run.
 
     Thousands of files are compared by their identity, and not each with each other.

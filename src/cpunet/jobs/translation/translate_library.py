@@ -28,6 +28,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.source import BLOCK_BYTES
 from cpunet.pulses.writing import FileInTheMaking
+from cpunet.training.run import RunLike, as_run
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 
@@ -79,7 +80,7 @@ class _Tally:
 
 
 def translate_library(
-    run: Path,
+    run: RunLike,
     source: Path,
     out: Path,
     *,
@@ -99,7 +100,7 @@ def translate_library(
     Parameters
     ----------
     run
-        Folder of a training run.
+        A trained run, or its folder.
     source
         LH5 file of one library or more.
     out
@@ -124,8 +125,9 @@ def translate_library(
     CpunetError
         If the file contains no library of charge templates, or the run cannot translate it.
     """
-    refuse_existing(out, run, source, force=force)
-    ren = REN.load(run, resolve_device(device))
+    run = as_run(run)
+    refuse_existing(out, run.folder, source, force=force)
+    ren = REN.of(run, resolve_device(device))
     tally = _Tally(currents)
     with opened(source) as given:
         paths = libraries(given, source)

@@ -14,7 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.jobs.common.inputs import InputFile
 from cpunet.pulses.side import TRANSLATION
-from cpunet.training.run_folder import RECIPE, WEIGHTS
+from cpunet.training.run import Run
 
 Record = dict[str, Any]
 
@@ -55,15 +55,9 @@ def require_unchanged(source: InputFile, before: Record) -> None:
         )
 
 
-def run_print(run: Path) -> str:
+def run_print(run: Run) -> str:
     """Fingerprint of a run's weights and recipe."""
-    digest = hashlib.sha256()
-    for name in (WEIGHTS, RECIPE):
-        try:
-            digest.update((run / name).read_bytes())
-        except OSError as error:
-            raise CpunetError(f"{run / name}: cannot be read ({error.strerror})") from error
-    return digest.hexdigest()
+    return hashlib.sha256(f"{run.weights_sha256}{run.recipe!r}".encode()).hexdigest()
 
 
 def finished(out: Path, wanted: Record) -> dict[str, Any]:

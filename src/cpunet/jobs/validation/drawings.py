@@ -64,8 +64,8 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
         made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
     if DEP in {peak.name for peak in scored} and len(scored) > 1:
         made[ROC] = _roc(found, [peak.name for peak in scored])
-    if found.losses:
-        made[LOSSES] = partial(loss_curves, found.losses)
+    if found.run.records:
+        made[LOSSES] = partial(loss_curves, found.run.records)
     return made
 
 

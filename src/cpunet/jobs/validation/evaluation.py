@@ -39,8 +39,7 @@ from cpunet.jobs.validation.translations import translate_all
 from cpunet.progress import stage
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.loop import Record
-from cpunet.training.run_folder import read_info, read_losses
+from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
 
 PAIRS = 200  # pairs of pulses in the test of linearity
@@ -68,8 +67,7 @@ class Evaluation:
 
     ren: REN
     iren: IREN
-    info: Mapping[str, Any]
-    losses: list[Record]
+    run: Run
     sim: InputSet
     data: InputSet
     sets: list[PeakSets]
@@ -112,7 +110,7 @@ class ValidateOptions:
 
 
 @one_thread_for_matrices()
-def evaluate(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -> Evaluation:
+def evaluate(run: Run, sim: InputFile, data: InputFile, how: ValidateOptions) -> Evaluation:
     """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
     Raises
@@ -120,9 +118,8 @@ def evaluate(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    info, device = read_info(run), resolve_device(how.device)
-    ren, iren = REN.load(run, device), IREN.load(run, device)
-    recipe, trained_on = ren.recipe, str(info["peak"])
+    device, recipe, trained_on = resolve_device(how.device), run.recipe, run.peak
+    ren, iren = REN.of(run, device), IREN.of(run, device)
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
     sim_set, data_set = _load_both(ren, sim, data, names, how)
     responses = None if how.truth is None else Responses(how.truth, sim_set)
@@ -147,8 +144,9 @@ def evaluate(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -
         )
     details = _details(scored, values, recipe, how.seed)
     kept = survivals(values, how.seed)
+    known = None if run.fit is None else run.fit.remains
     metrics = {
-        "compared": _compared(run, info, sim_set, data_set),
+        "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
@@ -172,17 +170,21 @@ def evaluate(run: Path, sim: InputFile, data: InputFile, how: ValidateOptions) -
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
         },
-        "training": {key: info[key] for key in ("recipe", "seconds", "device", "seed", "peak")},
-        "remains": (info.get("fit") or {}).get("remains"),
+        "training": {
+            "recipe": recipe.name,
+            "seconds": run.seconds,
+            "device": run.device,
+            "seed": run.seed,
+            "peak": run.peak,
+        },
+        "remains": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
         },
     }
     metrics["verdicts"] = {"summary": _summary(metrics), "table": verdict_table(metrics)}
-    return Evaluation(
-        ren, iren, info, read_losses(run), sim_set, data_set, sets, values, details, metrics
-    )
+    return Evaluation(ren, iren, run, sim_set, data_set, sets, values, details, metrics)
 
 
 def _load_both(
@@ -234,16 +236,13 @@ def _details(
     return details
 
 
-def _compared(
-    run: Path, info: Mapping[str, Any], sim: InputSet, data: InputSet
-) -> dict[str, Any]:
+def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, Any]:
     """Description of the compared inputs, shown before the scores."""
-    fit = info.get("fit") or {}
     training = (
-        f"recipe {info['recipe']} on {info['peak']}",
-        "" if info["seed"] is None else f"seed {info['seed']}",
-        f"{info['sim']['used']} simulated and {info['data']['used']} measured pulses",
-        str(info.get("started", ""))[:10],
+        f"recipe {run.recipe.name} on {run.peak}",
+        "" if run.seed is None else f"seed {run.seed}",
+        f"{run.sim.used} simulated and {run.data.used} measured pulses",
+        run.started[:10],
     )
     known = {
         "detector": sim.detector,
@@ -254,11 +253,11 @@ def _compared(
     compared |= {
         "simulation": _short(sim.path),
         "data": _short(data.path),
-        "run": run.absolute().name,
+        "run": Path(run.name).absolute().name,
         "trained": ", ".join(filter(None, training)),
     }
-    if fit.get("verdict"):
-        compared["fit"] = str(fit["verdict"])
+    if run.fit is not None and run.fit.verdict:
+        compared["fit"] = run.fit.verdict
     return compared | {"scored with": f"cpunet {cpunet.__version__}"}
 
 

@@ -16,7 +16,7 @@ from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.outputs import folder_written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.training.run_folder import read_info
+from cpunet.training.run import Run, RunLike, as_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ AS_USUAL = ValidateOptions()
 
 
 def validate_run(
-    run: Path,
+    run: RunLike,
     sim: InputFile,
     data: InputFile,
     out: Path,
@@ -43,7 +43,7 @@ def validate_run(
     Parameters
     ----------
     run
-        Folder of the training run.
+        A trained run, or its folder.
     sim, data
         Simulated and measured pulses.
     out
@@ -64,7 +64,7 @@ def validate_run(
 
 
 def validated(
-    run: Path,
+    run: RunLike,
     sim: InputFile,
     data: InputFile,
     out: Path | None,
@@ -73,12 +73,12 @@ def validated(
     force: bool = False,
 ) -> tuple[Evaluation, dict[str, Drawing]]:
     """Like `validate_run`, also without `out`; return results, and functions that draw."""
-    info = read_info(run)
-    sim, data = sim.as_before(info, "sim"), data.as_before(info, "data")
+    run = as_run(run)
+    sim, data = sim.as_before(run.sim), data.as_before(run.data)
     if out is None:
         found = evaluate(run, sim, data, how)
         return found, drawings(found)
-    read = (run, *sim.files, *data.files, how.truth)
+    read = (run.folder, *sim.files, *data.files, how.truth)
     with folder_written_aside(out, REPORT, *read, force=force) as folder:
         found = evaluate(run, sim, data, how)
         to_draw = drawings(found)
@@ -94,7 +94,7 @@ def validated(
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         with stage("Drawing", len(to_draw)) as bar:
-            notes = _notes(found.info, how.truth)
+            notes = _notes(run, found.metrics, how.truth)
             figures = {name: partial(_drawn, one, bar) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes)
     return found, to_draw
@@ -108,9 +108,9 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     return figures.drawings(found)
 
 
-def _of_remains(info: Mapping[str, Any]) -> list[str]:
+def _of_remains(metrics: Mapping[str, Any]) -> list[str]:
     """Remarks on remains of earlier pulses in the data, if they are certain."""
-    told = (info.get("fit") or {}).get("remains") or {}
+    told = metrics["remains"] or {}
     if not told.get("rate_khz"):
         return []
     shares = ", ".join(
@@ -132,14 +132,14 @@ def _drawn(drawing: Drawing, bar: Stage) -> Figure:
     return figure
 
 
-def _notes(info: Mapping[str, Any], truth: Path | None) -> list[str]:
+def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
     notes = [
-        f"Peaks other than {info['peak']} took no part in the training.",
+        f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
     ]
-    notes += _of_remains(info)
+    notes += _of_remains(metrics)
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
     return notes

@@ -10,7 +10,7 @@ from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.validation.compare import compare_reports
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
-from cpunet.training.run_folder import INFO
+from cpunet.training.run import INFO
 
 AS_USUAL = ValidateOptions()
 INDEX = "index.html"

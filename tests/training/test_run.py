@@ -1,7 +1,8 @@
-"""The run folder: read back what was written, and one line for every damage."""
+"""A run and its folder: read back what was written, and one line for every damage."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -16,17 +17,8 @@ from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.run_folder import (
-    WEIGHTS,
-    append_losses,
-    load_network,
-    read_info,
-    read_losses,
-    read_recipe,
-    versions,
-    write_run,
-)
-from cpunet.training.run_schema import FORMAT
+from cpunet.training.run import FORMAT, WEIGHTS, Run, append_losses, read_losses, versions
+from synthetic import write_run
 
 INFO = {"recipe": "paper", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
 INFO |= {"seconds": 1.5, "device": "cpu"}
@@ -53,11 +45,12 @@ def blank(recipe) -> PositionalUNet:
 
 
 def test_everything_comes_back(run, model, recipe):
-    assert read_info(run) == {"format": FORMAT} | INFO
-    assert read_recipe(run) == recipe
+    found = Run.load(run)
+    assert json.loads((run / "run.json").read_text()) == {"format": FORMAT} | INFO
+    assert (found.recipe, found.folder, found.seed, found.fit) == (recipe, run, 1, None)
     for name in ("ren", "iren", "discriminator_data", "discriminator_sim"):
         fresh = getattr(CycleGan(recipe), name)
-        loaded = load_network(run, name, fresh.train())
+        loaded = found.fill(name, fresh.train())
         assert not loaded.training
         saved = getattr(model, name).state_dict()
         assert all(torch.equal(saved[k], v) for k, v in loaded.state_dict().items())
@@ -100,20 +93,20 @@ def one_line(error: pytest.ExceptionInfo[CpunetError], *parts: str) -> None:
 
 def test_weights_of_another_architecture(run, tiny):
     with pytest.raises(CpunetError) as error:
-        load_network(run, "ren", blank(tiny("generator.width=4")))
+        Run.load(run).fill("ren", blank(tiny("generator.width=4")))
     one_line(error, "weights.safetensors: weights of another network", "tensors differ")
 
 
 def test_weights_without_the_part_wanted(run, recipe):
     with pytest.raises(CpunetError) as error:
-        load_network(run, "other", blank(recipe))
+        Run.load(run).fill("other", blank(recipe))
     one_line(error, "weights.safetensors: weights of another network")
 
 
 def test_missing_weights(run, recipe):
     (run / "weights.safetensors").unlink()
     with pytest.raises(CpunetError) as error:
-        load_network(run, "ren", blank(recipe))
+        Run.load(run).fill("ren", blank(recipe))
     one_line(error, "weights.safetensors: no readable weights; train again")
 
 
@@ -128,7 +121,7 @@ def test_truncated_weights(tmp_path_factory, part):
     content = path.read_bytes()
     path.write_bytes(content[: int(part * len(content))])
     with pytest.raises(CpunetError) as error:
-        load_network(folder, "ren", network)
+        Run.load(folder)
     one_line(error, str(path), "train again")
 
 
@@ -136,7 +129,7 @@ def test_truncated_weights(tmp_path_factory, part):
 def test_foreign_weights(run, recipe, content):
     (run / "weights.safetensors").write_bytes(content)
     with pytest.raises(CpunetError) as error:
-        load_network(run, "ren", blank(recipe))
+        Run.load(run).fill("ren", blank(recipe))
     one_line(error, "weights.safetensors: no readable weights; train again")
 
 
@@ -147,8 +140,7 @@ def test_foreign_weights(run, recipe, content):
         ("", "run.json: damaged"),
         ('{"dt_ns": 16', "run.json: damaged"),
         ("[1]", "run.json: damaged (no mapping)"),
-        ("{}", "run.json: damaged"),
-        ('{"dt_ns": 16}', "run.json: damaged"),
+        ('{"format": 2, "dt_ns": 16}', "run.json: damaged (no peak)"),
     ],
 )
 def test_damaged_info(run, text, message):
@@ -156,7 +148,7 @@ def test_damaged_info(run, text, message):
     if text is not None:
         (run / "run.json").write_text(text)
     with pytest.raises(CpunetError) as error:
-        read_info(run)
+        Run.load(run)
     one_line(error, str(run), message)
 
 
@@ -167,23 +159,24 @@ WRONG_FACTS = [
     ("seed", -1),
     ("data", {"cuts": 3}),
     ("fit", {"errors": [1]}),
-    ("format", "1"),
+    ("fit", {"chi_square": "9"}),
+    ("fit", {"noise": 3}),
 ]
 
 
 @pytest.mark.parametrize(("key", "value"), WRONG_FACTS)
 def test_facts_of_other_types(run, key, value):
-    (run / "run.json").write_text(json.dumps(INFO | {key: value}))
+    (run / "run.json").write_text(json.dumps(INFO | {"format": FORMAT, key: value}))
     with pytest.raises(CpunetError) as error:
-        read_info(run)
+        Run.load(run)
     one_line(error, str(run), "run.json: damaged (", key)
 
 
-@pytest.mark.parametrize("version", [FORMAT - 1, FORMAT + 1])
+@pytest.mark.parametrize("version", [FORMAT - 1, FORMAT + 1, "2"])
 def test_a_run_of_another_version_is_not_called_damaged(run, version):
     (run / "run.json").write_text(json.dumps(INFO | {"format": version}))
     with pytest.raises(CpunetError) as error:
-        read_info(run)
+        Run.load(run)
     assert f"{run / 'run.json'}: of another version of cpunet (format {version}" in str(
         error.value
     )
@@ -191,9 +184,9 @@ def test_a_run_of_another_version_is_not_called_damaged(run, version):
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "1" * 400, "1" * 5000, "1e400"])
 def test_facts_beyond_all_numbers(run, number):
-    (run / "run.json").write_text(json.dumps(INFO).replace("16.0", number))
+    (run / "run.json").write_text(json.dumps(INFO | {"format": FORMAT}).replace("16.0", number))
     with pytest.raises(CpunetError) as error:
-        read_info(run)
+        Run.load(run)
     one_line(error, str(run), "run.json: damaged (")
 
 
@@ -212,7 +205,7 @@ def test_weights_that_are_no_numbers(run, recipe, change, message):
             change(values)
     save_file(weights, run / WEIGHTS)
     with pytest.raises(CpunetError) as error:
-        load_network(run, "ren", blank(recipe))
+        Run.load(run).fill("ren", blank(recipe))
     one_line(error, WEIGHTS, message)
 
 
@@ -222,7 +215,7 @@ def test_damaged_recipe(run, text):
     if text is not None:
         (run / "recipe.yaml").write_text(text)
     with pytest.raises(CpunetError) as error:
-        read_recipe(run)
+        Run.load(run)
     one_line(error, str(run / "recipe.yaml"))
 
 
@@ -245,3 +238,22 @@ def test_a_damaged_log(run, text):
     with pytest.raises(CpunetError) as error:
         read_losses(run)
     one_line(error, "losses.jsonl: damaged")
+
+
+def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_factory):
+    (record,) = records = [{"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}]
+    append_losses(run, records)
+    known, copy = Run.load(run), tmp_path_factory.mktemp("saved") / "copy"
+    assert known.losses.to_dict("records") == [
+        {"iteration": 1, "rate": 0.1, **record["losses"]}
+    ]
+    known.save(copy)
+    with pytest.raises(CpunetError, match="exists"):
+        known.save(copy)
+    for name in ("run.json", "recipe.yaml", "losses.jsonl", WEIGHTS):
+        assert (copy / name).read_bytes() == (run / name).read_bytes()
+    digest = hashlib.sha256((run / WEIGHTS).read_bytes()).hexdigest()
+    assert known.weights_sha256 == digest
+    made = Run.of(model, recipe, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
+    assert (made.weights_sha256, made.records) == (digest, [])
+    assert repr(made) == "<Run run in memory: paper, FEP>"

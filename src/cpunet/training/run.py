@@ -1,0 +1,433 @@
+"""A trained run: in memory, and as a folder.
+
+``run.json``
+    Versions, seed, device, time taken, fingerprints of the files, counts, the fit.
+``recipe.yaml``
+    Every setting, resolved.
+``losses.jsonl``
+    One line per iteration.
+``weights.safetensors``
+    The networks, names prefixed ``ren.``, ``iren.``, ``discriminator_*.``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
+
+import torch
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+import cpunet
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.errors import CpunetError
+from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.pulses.cuts import CutWindows
+from cpunet.recipes.schema import Recipe
+from cpunet.settings import checked, read_json, read_values
+from cpunet.training.loop import Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+    from cpunet.calls.reports import Report
+    from cpunet.calls.translations import Translation
+    from cpunet.translation.translator import IREN, REN
+
+FORMAT = 2
+"""Format of run folders; those of other versions cannot be loaded."""
+
+INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
+RUN = FolderKind(
+    name="run",
+    command="cpunet train",
+    known_by=INFO,
+    own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
+    r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
+)
+Network = TypeVar("Network", bound=nn.Module)
+_NOT_STORED: Any = {"exclude": True, "repr": False}
+
+
+class _Part(BaseModel):
+    """Further entries are kept as they are."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+    )
+
+
+class SideInfo(_Part):
+    """The pulses of one side of a training, as far as they are known.
+
+    Parameters
+    ----------
+    file, read_as, dt_ns
+        File, its reading options, and its sampling period in ns.
+    read, used, rejections
+        Number of pulses read, of those used (text if unknown), and of others by reason.
+    cuts
+        Quality cuts of measured pulses.
+    sha256
+        Fingerprint of the pulses used.
+    """
+
+    file: str | None = None
+    read_as: dict[str, Any] = {}
+    dt_ns: float | None = None
+    read: int | None = None
+    used: int | str | None = None
+    rejections: dict[str, int] = {}
+    cuts: Annotated[CutWindows | None, Field(strict=False)] = None
+    sha256: str | None = None
+
+
+class RemainsInfo(_Part):
+    """What was measured of remains of earlier pulses, and what to draw them from."""
+
+    rate_khz: float = 0.0
+    drawn: dict[str, Any] | None = None
+
+
+class FitInfo(_Part):
+    """Fit of a readout chain: its parameters, their errors and covariance, and its quality."""
+
+    chi_square: float | None = None
+    moments: int | None = None
+    verdict: str = ""
+    causes: list[str] = []
+    parameters: dict[str, float] = {}
+    errors: dict[str, float] = {}
+    covariance: list[list[float]] = []
+    pulls: dict[str, float] = {}
+    noise: dict[str, float] = {}
+    remains: RemainsInfo | None = None
+
+    @property
+    def chi_square_per_moment(self) -> float | None:
+        """Fit quality; well above 1 if more than the readout differs."""
+        if self.chi_square is None or not self.moments:
+            return None
+        return self.chi_square / self.moments
+
+
+class Run(_Part):
+    """A training run, returned by `cpunet.train` or opened with `Run.load`.
+
+    Parameters
+    ----------
+    recipe
+        All settings of the training.
+    weights
+        Weights of the networks by name, on the CPU.
+    folder
+        Folder of the run; None if it is in memory only.
+    peak, seed, device, init
+        Energies trained on, seed, device, and the run started from.
+    dt_ns
+        Sampling period in ns.
+    started, seconds
+        When the training began, and the time taken in s; None if unknown.
+    sim, data
+        Pulses of both sides.
+    fit
+        Fit of a readout chain, or what was measured for a network; None if nothing was.
+    versions
+        Versions of the software.
+    imported
+        Files of imported weights, by part.
+    """
+
+    recipe: Recipe = Field(**_NOT_STORED)
+    weights: dict[str, Tensor] = Field(**_NOT_STORED)
+    folder: Path | None = Field(None, **_NOT_STORED)
+    peak: str
+    seed: Annotated[int, Field(ge=0)] | None
+    device: str
+    seconds: Annotated[float, Field(ge=0, le=1e15)] | None
+    dt_ns: Annotated[float, Field(gt=0, le=1e9)]
+    init: str | None = None
+    started: str = ""
+    sim: SideInfo = SideInfo()
+    data: SideInfo = SideInfo()
+    fit: FitInfo | None = None
+    versions: dict[str, str] = {}
+    imported: dict[str, dict[str, str]] = {}
+
+    __eq__ = object.__eq__  # weights are not compared
+    __hash__ = object.__hash__
+
+    @classmethod
+    def of(cls, model: nn.Module, recipe: Recipe, **facts: Any) -> Self:
+        """Make a run of trained networks, the children of a model."""
+        weights = {n: w.detach().cpu().contiguous() for n, w in model.state_dict().items()}
+        return cls.model_validate({**facts, "recipe": recipe, "weights": weights})
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """Open the folder of a finished run.
+
+        Raises
+        ------
+        CpunetError
+            If the folder is not a finished run, is of another version, or is damaged.
+        """
+        folder = Path(folder)
+        path = folder / INFO
+        if not path.is_file():
+            raise CpunetError(
+                f"{folder}: no finished run (no {INFO}); make one with `cpunet train`"
+            )
+        facts = read_json(path, "train again")
+        if (found := facts.pop("format", 0)) != FORMAT:
+            raise CpunetError(
+                f"{path}: of another version of cpunet (format {found}, not {FORMAT}); read it "
+                "with that one, or train again"
+            )
+        recipe = checked(Recipe, read_values(folder / RECIPE), str(folder / RECIPE))
+        try:
+            weights: dict[str, Tensor] = load((folder / WEIGHTS).read_bytes())
+        except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
+            raise CpunetError(
+                f"{folder / WEIGHTS}: no readable weights; train again"
+            ) from error
+        given = {"recipe": recipe, "weights": weights, "folder": folder}
+        try:
+            return cls.model_validate(facts | given)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            key = ".".join(map(str, first["loc"]))
+            wrong = f"no {key}" if first["type"] == "missing" else f"{key}: {first['msg']}"
+            raise CpunetError(f"{path}: damaged ({wrong}); train again") from error
+
+    def write(self, folder: Path) -> None:
+        """Write weights, recipe and provenance into an existing folder."""
+        (folder / WEIGHTS).write_bytes(save(self.weights))
+        settings = yaml.safe_dump(self.recipe.model_dump(mode="json"), sort_keys=False)
+        (folder / RECIPE).write_text(settings, encoding="utf-8")
+        facts = {"format": FORMAT, "recipe": self.recipe.name}
+        facts |= self.model_dump(mode="json", exclude_unset=True)
+        (folder / INFO).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+    def save(self, folder: str | Path, force: bool = False) -> None:
+        """Write the run, with its losses, to a folder.
+
+        Raises
+        ------
+        CpunetError
+            If the folder exists and `force` is off, or is not a run.
+        """
+        records = self.records
+        with folder_written_aside(Path(folder), RUN, self.folder, force=force) as aside:
+            self.write(aside)
+            if records:
+                append_losses(aside, records)
+
+    def fill(self, part: str, network: Network, device: str = "cpu") -> Network:
+        """Fill a network with the weights of a part (``"ren"``, ``"iren"``, …) to apply it.
+
+        Raises
+        ------
+        CpunetError
+            If the weights are of another architecture, not finite, or all zero.
+        """
+        where, prefix = (self.folder or Path()) / WEIGHTS, f"{part}."
+        own = {
+            key.removeprefix(prefix): values
+            for key, values in self.weights.items()
+            if key.startswith(prefix)
+        }
+        expected = network.state_dict()
+        wrong = sorted(
+            (own.keys() ^ expected.keys())
+            | {k for k in own.keys() & expected.keys() if own[k].shape != expected[k].shape}
+        )
+        if wrong:
+            raise CpunetError(
+                f"{where}: weights of another network: {len(wrong)} tensors differ, first "
+                f"{wrong[0]}"
+            )
+        floating = {key: values for key, values in own.items() if values.is_floating_point()}
+        for key, values in floating.items():
+            if not bool(torch.isfinite(values).all()):
+                raise CpunetError(f"{where}: {part}.{key} is not finite; train again")
+        if floating and not any(bool(values.any()) for values in floating.values()):
+            raise CpunetError(f"{where}: all weights of {part} are zero; train again")
+        network.load_state_dict(own)
+        return network.to(torch.device(device)).eval()
+
+    @property
+    def name(self) -> str:
+        """The folder, as text for messages and records."""
+        return "run in memory" if self.folder is None else str(self.folder)
+
+    @cached_property
+    def weights_sha256(self) -> str:
+        """Fingerprint of the weights: that of their file."""
+        return hashlib.sha256(save(self.weights)).hexdigest()
+
+    @property
+    def remains(self) -> DrawnRemains | None:
+        """Remains of earlier pulses under the data, with rate 0 if they have none for sure."""
+        told = None if self.fit is None else self.fit.remains
+        if told is None or told.drawn is None:
+            return None
+        drawn = DrawnRemains.of(told.drawn)
+        if told.rate_khz > 0:
+            return drawn
+        return replace(drawn, law=replace(drawn.law, rate_khz=0.0))
+
+    @cached_property
+    def records(self) -> list[Record]:
+        """Records of the training's log; empty if there is none."""
+        return [] if self.folder is None else read_losses(self.folder)
+
+    @cached_property
+    def losses(self) -> DataFrame:
+        """Losses of the training: a row per record, with ``iteration`` and ``rate``."""
+        from pandas import DataFrame
+
+        rows = [dict(record) for record in self.records]
+        return DataFrame([row | row.pop("losses") for row in rows])  # type: ignore[operator]
+
+    @cached_property
+    def ren(self) -> REN:
+        """Translator from simulated to measured-like pulses."""
+        from cpunet.translation.translator import REN
+
+        return REN.of(self)
+
+    @cached_property
+    def iren(self) -> IREN:
+        """Translator from measured to simulation-like pulses."""
+        from cpunet.translation.translator import IREN
+
+        return IREN.of(self)
+
+    @cached_property
+    def parameters(self) -> dict[str, float]:
+        """Physical parameters of the readout chain; each name ends with the unit.
+
+        Raises
+        ------
+        CpunetError
+            If the run is not a readout chain.
+        """
+        from cpunet.jobs.inspection.chain_description import describe_responses
+
+        return dict(describe_responses([self])["runs"][0]["values"])
+
+    def plot(self) -> Figure:
+        """Step and impulse response, tail and noise of a readout chain; losses of networks.
+
+        Raises
+        ------
+        CpunetError
+            If a run of networks contains no losses.
+        """
+        from cpunet.analysis.response_figure import response_figure
+        from cpunet.analysis.run_figures import loss_curves
+        from cpunet.jobs.inspection.chain_description import chain_of
+
+        if self.recipe.generator.name != "response":
+            return loss_curves(self.records)
+        tail_ns = self.recipe.preparation.samples_after * self.dt_ns
+        return response_figure([chain_of(self)], tail_ns=tail_ns)
+
+    def translate(self, pulses: Any, out: str | Path | None = None, **how: Any) -> Translation:
+        """Translate with this run, see `cpunet.translate`."""
+        from cpunet.calls.translations import translate
+
+        return translate(self, pulses, out, **how)
+
+    def validate(  # type: ignore[override]  # pydantic's own is deprecated
+        self, sim: Any, data: Any, out: str | Path | None = None, **how: Any
+    ) -> Report:
+        """Validate this run, see `cpunet.validate`."""
+        from cpunet.calls.reports import validate
+
+        return validate(self, sim, data, out, **how)
+
+    def summary(self) -> list[tuple[str, str]]:
+        """What was trained, on what, and how well it fits: topics and texts."""
+        from cpunet.jobs.inspection.run_words import summary
+
+        return summary(self)
+
+    def __str__(self) -> str:
+        lines = self.summary()
+        width = max(len(topic) for topic, _ in lines)
+        return "\n".join(f"{topic:<{width}}  {text}" for topic, text in lines)
+
+    def __repr__(self) -> str:
+        per = None if self.fit is None else self.fit.chi_square_per_moment
+        fit = "" if per is None else f", chi-square per moment {per:.2f}"
+        return f"<{type(self).__name__} {self.name}: {self.recipe.name}, {self.peak}{fit}>"
+
+    def _repr_html_(self) -> str:
+        from cpunet.analysis.html_pages import notebook_picture, part
+
+        there = self.recipe.generator.name == "response" or self.records
+        picture = notebook_picture(self.plot()) if there else ""
+        return part("object", "cpunet run", rows=self.summary(), picture=picture)
+
+
+RunLike: TypeAlias = Run | str | Path
+
+
+def as_run(run: RunLike) -> Run:
+    """The run itself, or that of a folder."""
+    return run if isinstance(run, Run) else Run.load(run)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the software that affects the result."""
+    packages = {name: version(name) for name in ("torch", "numpy", "numba")}
+    return {"python": platform.python_version(), "cpunet": cpunet.__version__} | packages
+
+
+def append_losses(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
+    """Add training records to the folder's log."""
+    with (folder / LOSSES).open("a") as stream:
+        stream.writelines(json.dumps(record) + "\n" for record in records)
+
+
+def read_losses(folder: Path) -> list[Record]:
+    """Return the training records; empty if the log is missing."""
+    path = folder / LOSSES
+    if not path.is_file():
+        return []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        records = [json.loads(line) for line in lines]
+        if not all(map(_is_record, records)):
+            raise ValueError("a line holds no losses")
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
+    return records
+
+
+def _is_record(record: Any) -> bool:
+    """Whether a line of the log is an iteration, its rate and its losses."""
+    if not isinstance(record, dict) or not isinstance(record.get("losses"), dict):
+        return False
+    numbers = [record.get("iteration"), record.get("rate", 0.0), *record["losses"].values()]
+    return all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers)
