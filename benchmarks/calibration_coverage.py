@@ -27,10 +27,11 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.training.pulse_sets import PulseSets
@@ -104,7 +105,7 @@ def experiments(
     """Calibrate disjoint parts of a stand."""
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
-    files = [InputFile(stand / f"{name}.lh5") for name in ("sim", "data")]
+    files = [PulseFile(stand / f"{name}.lh5") for name in ("sim", "data")]
     sim = load_simulated(files[0], recipe, selection).prepared
     data = load_measured(files[1], recipe, selection).prepared
     noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)

@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -30,7 +30,7 @@ def scores_of(
     stand: Path, recipe: str, overrides: list[str], seed: int, rivals: bool
 ) -> dict[str, Any]:
     """Metrics of one run, trained and scored in a temporary folder."""
-    sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
+    sim, data = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
         how = load_recipe(recipe, overrides), TrainOptions(seed=seed)

@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.response_fit import fit_response
 
@@ -35,7 +36,7 @@ def first(pulses: Pulses, n: int) -> Pulses:
 def one(stand: Path, n: int) -> dict[str, float]:
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
-    files = [InputFile(stand / f"{side}.lh5") for side in ("sim", "data")]
+    files = [PulseFile(stand / f"{side}.lh5") for side in ("sim", "data")]
     sim = load_simulated(files[0], recipe, selection).prepared.pulses
     data = load_measured(files[1], recipe, selection).prepared.pulses
     noise, _ = measured_noise(files[1], data, recipe.preparation)

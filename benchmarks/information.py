@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.training.chain_and_inverse import known_response
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
@@ -29,6 +29,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
@@ -185,7 +186,7 @@ def main() -> None:
         translated = REN.load(arguments.run).apply(windows, noise=False)
         print(f"{arguments.run}: {off(translated, wanted):+.3f} %")
         return
-    files = [InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
+    files = [PulseFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
     sim = load_simulated(files[0], RECIPE, selection).prepared.pulses
     data = load_measured(files[1], RECIPE, selection).prepared.pulses

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.outputs import written_aside
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 
 FAILED = 0.9
@@ -32,7 +32,7 @@ def one_seed(
     sim: Path, stand: Path, recipe: str, overrides: list[str], seed: int
 ) -> dict[str, Any]:
     """Scores, also over their ceilings, AUC and edge RMSE of one training, and its cost."""
-    files = InputFile(sim / "sim.lh5"), InputFile(stand / "data.lh5")
+    files = PulseFile(sim / "sim.lh5"), PulseFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
         before = time.process_time()

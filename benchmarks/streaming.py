@@ -21,11 +21,11 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
@@ -117,7 +117,7 @@ def main() -> None:
         with watching() as seen:
             told = translate_file(
                 folder / "run",
-                InputFile(folder / "sim.lh5"),
+                PulseFile(folder / "sim.lh5"),
                 folder / "out.lh5",
                 TranslateOptions(adc=adc),
             )

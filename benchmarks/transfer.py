@@ -16,17 +16,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
 
-def few_of(data: InputFile, pulses: int, folder: Path) -> InputFile:
+def few_of(data: PulseFile, pulses: int, folder: Path) -> PulseFile:
     """A file with that many traces of the training peak."""
     recipe = load_recipe("fast")
     select = parse_selection("FEP", recipe.peaks).select
@@ -42,7 +42,7 @@ def few_of(data: InputFile, pulses: int, folder: Path) -> InputFile:
     )
     path = folder / "few.lh5"
     write_pulses(path, few, table="geds/raw")
-    return InputFile(path)
+    return PulseFile(path)
 
 
 def main() -> None:
@@ -51,12 +51,12 @@ def main() -> None:
     parser.add_argument("stand", type=Path)
     parser.add_argument("--pulses", type=int, default=500)
     arguments = parser.parse_args()
-    sim, data = (InputFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data"))
+    sim, data = (PulseFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data"))
     rows: dict[str, tuple[float, dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         known = folder / "known"
-        sides = [InputFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
+        sides = [PulseFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
         train_run(sides[0], sides[1], known, load_recipe("fast"), TrainOptions(device="cpu"))
         few = few_of(data, arguments.pulses, folder)
         for title, start, measured in (

@@ -22,9 +22,10 @@ from matplotlib.figure import Figure
 
 from cpunet.analysis.paired import PairedScores, pair_squares, scores_of_squares
 from cpunet.electronics.finishing import finish
-from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.common.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.run import Run
@@ -168,8 +169,8 @@ def prepared_truth(path: Path, sim: InputSet, config: PreparationConfig) -> Floa
 class Files(NamedTuple):
     """Files of both sides."""
 
-    sim: InputFile
-    data: InputFile
+    sim: PulseFile
+    data: PulseFile
 
 
 def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
@@ -180,7 +181,7 @@ def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
     for name, pulses in (("sim", sim), ("data", decaying_traces(sim[::-1], rng, 10))):
         whole = Pulses.of(pulses, dt_ns=DT_NS, energy_kev=energies)
         write_pulses(folder / f"{name}.lh5", whole)
-    return Files(InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5"))
+    return Files(PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5"))
 
 
 @contextmanager

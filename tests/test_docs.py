@@ -20,10 +20,10 @@ import yaml
 import cpunet
 from cpunet.cli.main import app
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe, recipe_names
 from cpunet.translation.translator import RejectionWarning
@@ -173,7 +173,7 @@ def home(tmp_path_factory) -> Path:
     fine = Pulses.of(phased_edges(4, rng, 550, 3000), dt_ns=1, energy_kev=np.full(4, KEV))
     write_pulses(folder / "fine.lh5", fine)
     recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
-    sides = InputFile(folder / "sim.lh5"), InputFile(folder / "raw.lh5")
+    sides = PulseFile(folder / "sim.lh5"), PulseFile(folder / "raw.lh5")
     train_run(*sides, folder / "run", recipe, TrainOptions(device="cpu"))
     for seed in ("seed_000", "seed_001"):
         shutil.copytree(folder / "run", folder / "ens" / seed)

@@ -46,7 +46,7 @@ order in which data flow.
 
 ::: cpunet.CalibratedRun
 
-::: cpunet.InputFile
+::: cpunet.PulseFile
 
 ::: cpunet.HitFile
 

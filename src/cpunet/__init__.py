@@ -20,7 +20,7 @@ __all__ = [
     "CalibratedRun",
     "CpunetError",
     "HitFile",
-    "InputFile",
+    "PulseFile",
     "Pulses",
     "Report",
     "Run",
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from cpunet.calls.runs import train
     from cpunet.calls.translations import Translation, translate
     from cpunet.errors import CpunetError
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
+    from cpunet.pulses.reading.files import PulseFile
     from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
@@ -54,7 +54,7 @@ _HOMES = {
     "calls.translations": ("Translation", "translate"),
     "errors": ("CpunetError",),
     "jobs.simulation.hit_sources": ("HitFile",),
-    "jobs.common.inputs": ("InputFile",),
+    "jobs.common.inputs": ("PulseFile",),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
     "training.run": ("Run",),

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import cpunet
-from cpunet.calls.given import as_recipe
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
@@ -54,7 +53,7 @@ def run(home) -> cpunet.Run:
 
 @pytest.fixture(scope="module")
 def report(home, run, all_undrawn) -> cpunet.Report:
-    sides = home / "sim.lh5", cpunet.InputFile(str(home / "raw.lh5"))
+    sides = home / "sim.lh5", cpunet.PulseFile(str(home / "raw.lh5"))
     return run.validate(*sides, home / "report", rivals=False, device="cpu")
 
 
@@ -263,7 +262,7 @@ def damaged(home, run=None) -> Path:
 WRONG = {
     "an array": (
         lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
-        "sim is of type ndarray; give a path, or cpunet.InputFile",
+        "ndarray: are no pulses; give a path, a cpunet.PulseFile",
     ),
     "no such file": (
         lambda home, _: cpunet.train(home / "none.lh5", home / "raw.lh5", home / "new"),
@@ -349,16 +348,16 @@ def test_what_is_wrong_is_one_line(home, run, case):
 
 def test_settings_may_be_numbers_of_numpy():
     settings = {"generator.width": np.int64(16), "training.rate_generators": np.float32(0.5)}
-    recipe = as_recipe("paper", settings | {"training.betas": np.array([0.25, 0.5])})
+    recipe = load_recipe("paper", settings | {"training.betas": np.array([0.25, 0.5])})
     assert (recipe.generator.width, recipe.training.rate_generators) == (16, 0.5)
     assert tuple(recipe.training.betas) == (0.25, 0.5)
 
 
 def test_a_recipe_and_settings_are_not_both_given():
     recipe = load_recipe("fast")
-    assert as_recipe(recipe, None) is recipe
+    assert load_recipe(recipe, None) is recipe
     with pytest.raises(cpunet.CpunetError, match="leave settings out"):
-        as_recipe(recipe, {"training.steps": 1})
+        load_recipe(recipe, {"training.steps": 1})
 
 
 @pytest.mark.slow

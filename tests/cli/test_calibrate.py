@@ -51,12 +51,12 @@ def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
 def calibrate(stand: Path, run: Path, *overrides: str) -> Path:
     from cpunet.jobs.calibration.calibrate import Calibration
     from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
-    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.pulses.reading.files import PulseFile
     from cpunet.recipes import load_recipe
 
     Calibration(
-        Start(sim=InputFile(stand / "sim.lh5")),
-        InputFile(stand / "data.lh5"),
+        Start(sim=PulseFile(stand / "sim.lh5")),
+        PulseFile(stand / "data.lh5"),
         load_recipe("fast", overrides),
         Freedom.of("temperature", "", []),
     ).run(run)

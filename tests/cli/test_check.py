@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.validation.validate import validate_run
+from cpunet.pulses.reading.files import PulseFile
 
 N = 240
 FEP = 2614.511
@@ -210,19 +210,19 @@ def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch
     run = tmp_path / "run"
     shutil.copytree(trained, run)
     (run / "run.json").write_text(json.dumps(info))
-    seen: list[InputFile] = []
+    seen: list[PulseFile] = []
 
-    def evaluated(_run: Path, sim: InputFile, data: InputFile, *_: object) -> None:
+    def evaluated(_run: Path, sim: PulseFile, data: PulseFile, *_: object) -> None:
         seen.extend([sim, data])
         raise SeenError
 
     monkeypatch.setattr("cpunet.jobs.validation.validate.evaluate", evaluated)
-    sim = InputFile(stand.sim)
+    sim = PulseFile(stand.sim)
     other = Path(shutil.copy(stand.data, tmp_path / "other.lh5"))
     for data, expected in (
-        (InputFile(stand.data), InputFile(stand.data, "geds/raw", None, 0.25)),
-        (InputFile(stand.data, kev_per_adc=2.0), InputFile(stand.data, None, None, 2.0)),
-        (InputFile(other), InputFile(other)),
+        (PulseFile(stand.data), PulseFile(stand.data, "geds/raw", None, 0.25)),
+        (PulseFile(stand.data, kev_per_adc=2.0), PulseFile(stand.data, None, None, 2.0)),
+        (PulseFile(other), PulseFile(other)),
     ):
         with pytest.raises(SeenError):
             validate_run(run, sim, data, tmp_path / "report")

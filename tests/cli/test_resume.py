@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training import checkpoints
 from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
@@ -194,7 +194,7 @@ def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
     recipe = load_recipe("paper", overrides)
-    files = InputFile(stand.sim), InputFile(stand.data)
+    files = PulseFile(stand.sim), PulseFile(stand.data)
     train_run(*files, tmp_path / "whole", recipe, TrainOptions(seed=5, device="cpu"))
     for moment in MOMENTS:
         given = {"MOMENT": moment, "ARGUMENTS": (*files, tmp_path / "run", recipe)}

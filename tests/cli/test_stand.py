@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
 from synthetic import prepared_truth
@@ -30,8 +31,8 @@ def made(command, tmp_path: Path) -> Path:
 def test_the_folder_is_read_and_prepared(made: Path):
     recipe = load_recipe("fast")
     chosen = parse_selection("FEP,DEP", recipe.peaks)
-    sim = load_simulated(InputFile(made / "sim.lh5"), recipe, chosen)
-    data = load_measured(InputFile(made / "data.lh5"), recipe, chosen)
+    sim = load_simulated(PulseFile(made / "sim.lh5"), recipe, chosen)
+    data = load_measured(PulseFile(made / "data.lh5"), recipe, chosen)
     assert len(sim.prepared) > 20
     assert len(data.prepared) > 10
     truth = prepared_truth(made / "truth.npz", sim, recipe.preparation)

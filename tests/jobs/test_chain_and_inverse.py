@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, load_measured, load_simulated
+from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.jobs.training.train import train_run
@@ -25,6 +25,7 @@ from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
@@ -67,10 +68,10 @@ def digitised(n: int, seed: int, *, noise_kev: float = NOISE_KEV) -> FloatArray:
     return np.round(15_000 + 9.6 * (KEV * clean + noise)).astype(np.float32)
 
 
-def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> InputFile:
+def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> PulseFile:
     energies = np.full(len(waveforms), kev)
     write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies))
-    return InputFile(path)
+    return PulseFile(path)
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +129,7 @@ def test_what_is_told_on_the_way(run: Trained) -> None:
     assert [w for w in warnings if "1000 or more are better" not in w] == []
     assert any(r.getMessage().startswith("fit: ") for r in run.told)
     records = [json.loads(x) for x in (run.folder / "losses.jsonl").read_text().splitlines()]
-    assert [record["iteration"] for record in records] == list(
-        range(1, run.run.fit.steps + 1)
-    )
+    assert [record["iteration"] for record in records] == list(range(1, run.run.fit.steps + 1))
     last = records[-1]["losses"]["chi_square"]
     assert last == pytest.approx(run.run.fit.chi_square)
 
@@ -167,10 +166,10 @@ def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
     energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    told = translate_file(run.folder, InputFile(path), tmp_path / "a.lh5", device="cpu")
+    told = translate_file(run.folder, PulseFile(path), tmp_path / "a.lh5", device="cpu")
     assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
     quiet = TranslateOptions(noise=False)
-    told = translate_file(run.folder, InputFile(path), tmp_path / "b.lh5", quiet, device="cpu")
+    told = translate_file(run.folder, PulseFile(path), tmp_path / "b.lh5", quiet, device="cpu")
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 
@@ -266,7 +265,7 @@ def test_a_stretched_drift_is_told_and_translated(
 @pytest.mark.thorough
 def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> None:
     energies = np.where(np.arange(N) < 50, 1100.0, KEV)
-    sim = InputFile(tmp_path / "sim.lh5")
+    sim = PulseFile(tmp_path / "sim.lh5")
     more = Pulses.of(sampled(charge(N, seed=1), FINE), dt_ns=DT_NS, energy_kev=energies)
     write_pulses(tmp_path / "sim.lh5", more)
     with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of 1000-1200 can be used, sim"):

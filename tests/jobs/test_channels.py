@@ -16,7 +16,7 @@ from cpunet.jobs.common.channels import (
     own_folder,
     paired,
 )
-from cpunet.jobs.common.inputs import InputFile
+from cpunet.pulses.reading.files import PulseFile
 
 
 def made(path: Path, *tables: str) -> Path:
@@ -28,17 +28,17 @@ def made(path: Path, *tables: str) -> Path:
 
 def test_channels_have_short_names_and_their_own_energies(tmp_path):
     raw = made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw")
-    file = InputFile(raw, "all", "hit.lh5:{channel}/hit/energy")
+    file = PulseFile(raw, "all", "hit.lh5:{channel}/hit/energy")
     found = channels_of(file)
     assert [(n, f.table, f.energy) for n, f in found.items()] == [
         ("ch1", "ch1/raw", "hit.lh5:ch1/hit/energy"),
         ("ch2", "ch2/raw", "hit.lh5:ch2/hit/energy"),
     ]
     with pytest.raises(CpunetError, match="one column for 2 channels"):
-        channels_of(InputFile(raw, "all", "hit.lh5:energy"))
+        channels_of(PulseFile(raw, "all", "hit.lh5:energy"))
     np.save(tmp_path / "raw.npy", np.zeros((3, 50)))
     with pytest.raises(CpunetError, match="no tables of waveforms"):
-        channels_of(InputFile(tmp_path / "raw.npy", "all"))
+        channels_of(PulseFile(tmp_path / "raw.npy", "all"))
 
 
 def test_no_channel_is_lost_whose_name_looks_like_another():
@@ -50,10 +50,10 @@ def test_no_channel_is_lost_whose_name_looks_like_another():
 
 
 def test_a_simulation_serves_all_channels_or_its_own(tmp_path):
-    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
-    one = InputFile(made(tmp_path / "one.h5", "geds/sim"))
+    data = PulseFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
+    one = PulseFile(made(tmp_path / "one.h5", "geds/sim"))
     assert [pair[0] for pair in paired(one, data).values()] == [one, one]
-    both = InputFile(made(tmp_path / "both.h5", "ch1/sim", "ch3/sim"), "all")
+    both = PulseFile(made(tmp_path / "both.h5", "ch1/sim", "ch3/sim"), "all")
     found = paired(both, data)
     assert found["ch1"][0].table == "ch1/sim"
     assert str(found["ch2"]).endswith("both.h5: no table of ch2; there are those of ch1, ch3")
@@ -61,7 +61,7 @@ def test_a_simulation_serves_all_channels_or_its_own(tmp_path):
 
 def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog):
     caplog.set_level("INFO", "cpunet")
-    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")
+    data = PulseFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")
 
     def work(name: str, _pair: object, out: Path) -> str:
         if name == "ch2":
@@ -83,7 +83,7 @@ def test_what_ends_one_may_end_all_and_an_output_of_one_is_refused(tmp_path):
     def stop(*_given: object) -> None:
         raise StopError("asked to")
 
-    data = InputFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
+    data = PulseFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw"), "all")
     with pytest.raises(StopError):
         one_by_one(paired(data, data), tmp_path / "out", stop, StopError)
     (tmp_path / "run").mkdir()

@@ -11,7 +11,6 @@ import pytest
 from cpunet.analysis.drift_slices import slice_edges
 from cpunet.analysis.paired import pair_squares, scores_of_squares
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
@@ -21,6 +20,7 @@ from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, _comp
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
@@ -46,7 +46,7 @@ def records(n: int, rng: np.random.Generator, tau: float | None) -> np.ndarray:
     return pulses if tau is None else after_pole(pulses, 4.0, 60) * decay(450, tau, 1100)
 
 
-def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> InputFile:
+def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> PulseFile:
     rng = np.random.default_rng(seed)
     kev = np.repeat(list(counts), list(counts.values())).astype(float)
     waveforms = records(len(kev), rng, 4000.0 if measured else None)
@@ -54,11 +54,11 @@ def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) ->
         noise = rng.normal(0, 2.0, waveforms.shape)
         waveforms = np.round(1000 + 10 * kev[:, None] * waveforms + 10 * noise)
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=kev), table="geds/raw")
-    return InputFile(path)
+    return PulseFile(path)
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> dict[str, InputFile]:
+def files(tmp_path_factory) -> dict[str, PulseFile]:
     folder = tmp_path_factory.mktemp("evaluation")
     full = {KEV["FEP"]: 260, KEV["SEP"]: 60, 2030.0: 25, KEV["SEP"] + 15: 5}
     return {
@@ -76,7 +76,7 @@ def run(files, tmp_path_factory) -> Run:
     )
 
 
-def evaluated(run: Run, sim: InputFile, data: InputFile) -> Evaluation:
+def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:
     return evaluate(
         run,
         sim,

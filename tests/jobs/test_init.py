@@ -11,11 +11,11 @@ from safetensors.torch import load_file
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
@@ -46,7 +46,7 @@ TINY = load_recipe(
 
 def write(
     path: Path, seed: int, pole: float | None, dt_ns: float = 16.0, n: int = 240
-) -> InputFile:
+) -> PulseFile:
     """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
     rng = np.random.default_rng(seed)
     pulses = phased_edges(n, rng, 450, 1100)
@@ -55,11 +55,11 @@ def write(
         pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
     kev = np.full(n, 2614.5)
     write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
-    return InputFile(path)
+    return PulseFile(path)
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> dict[str, InputFile]:
+def files(tmp_path_factory) -> dict[str, PulseFile]:
     folder = tmp_path_factory.mktemp("init")
     return {
         "sim": write(folder / "sim.lh5", 1, None),

@@ -12,7 +12,6 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -26,6 +25,7 @@ from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
@@ -198,6 +198,6 @@ def test_a_failed_translation_leaves_the_old_file(files, run, tmp_path):
     constant = tmp_path / "constant.lh5"
     write_pulses(constant, Pulses.of(np.ones((3, 225)), dt_ns=16))
     with pytest.raises(CpunetError, match=r"none of 3 pulses can be translated \(3 constant\)"):
-        translate_file(run, InputFile(constant), out, force=True, device="cpu")
+        translate_file(run, PulseFile(constant), out, force=True, device="cpu")
     assert out.read_bytes() == b"old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["constant.lh5", "out.lh5"]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.measured_noise import measured_noise, noise_of_traces
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
@@ -43,7 +43,7 @@ def path(tmp_path: Path) -> Path:
 def test_noise_of_raw_traces_needs_no_word(path: Path) -> None:
     raw = traces()
     write_pulses(path, raw)
-    noise, note = measured_noise(InputFile(path), windows(raw), CONFIG)
+    noise, note = measured_noise(PulseFile(path), windows(raw), CONFIG)
     assert note is None
     assert noise.rms == pytest.approx(WANTED, rel=0.03)
     assert noise.n_baselines > 250
@@ -55,7 +55,7 @@ def test_energies_that_are_not_known_do_not_matter(path: Path) -> None:
     raw.energy_kev[1::4] = 0
     raw.waveforms[::4] += np.random.default_rng(1).normal(0, 500, raw.waveforms[::4].shape)
     write_pulses(path, raw)
-    noise = noise_of_traces(InputFile(path), CONFIG)
+    noise = noise_of_traces(PulseFile(path), CONFIG)
     assert noise.rms == pytest.approx(WANTED, rel=0.04)
     assert noise.n_baselines <= 200
 
@@ -63,7 +63,7 @@ def test_energies_that_are_not_known_do_not_matter(path: Path) -> None:
 def test_prepared_windows_fall_back_on_their_beginnings(path: Path) -> None:
     prepared = windows(traces())
     write_pulses(path, prepared)
-    noise, note = measured_noise(InputFile(path), prepared, CONFIG)
+    noise, note = measured_noise(PulseFile(path), prepared, CONFIG)
     assert note is not None
     assert note.startswith(
         f"noise is taken from {CONFIG.baseline_samples // 2} samples a pulse"
@@ -77,7 +77,7 @@ def test_prepared_windows_fall_back_on_their_beginnings(path: Path) -> None:
 def test_traces_that_begin_late_fall_back_too(path: Path) -> None:
     raw = traces(start=380)
     write_pulses(path, raw)
-    noise, note = measured_noise(InputFile(path), windows(raw), CONFIG)
+    noise, note = measured_noise(PulseFile(path), windows(raw), CONFIG)
     assert note is not None
     assert "samples before the pulse; the noise needs 400 or more" in note
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
@@ -87,4 +87,4 @@ def test_without_energies_there_is_no_noise(path: Path) -> None:
     raw = Pulses.of(traces(60).waveforms, dt_ns=DT_NS)
     write_pulses(path, raw)
     with pytest.raises(CpunetError, match="only 0 flat baselines among 60 traces"):
-        measured_noise(InputFile(path), windows(raw), CONFIG)
+        measured_noise(PulseFile(path), windows(raw), CONFIG)

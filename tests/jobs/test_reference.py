@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 
 pytestmark = pytest.mark.slow
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_path: Path):
     """Trained on FEP, judged on SEP and DEP, which it has not seen."""
     folder = reference_data / "closure"
-    sim, data = InputFile(folder / "sim.lh5"), InputFile(folder / "data.lh5")
+    sim, data = PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5")
     train_run(sim, data, tmp_path / "run", load_recipe("fast"), TrainOptions(device="cpu"))
     metrics = validate_run(
         tmp_path / "run",
@@ -57,8 +57,8 @@ def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_p
 
 def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_path: Path):
     """Traces of a real detector, whose few events are taken from 300 keV on."""
-    sim = InputFile(reference_data / "closure" / "sim.lh5")
-    data = InputFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
+    sim = PulseFile(reference_data / "closure" / "sim.lh5")
+    data = PulseFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
     recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
     made = train_run(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.inputs import load_simulated
 from cpunet.jobs.simulation.hit_sources import (
     GammaSource,
     HitFile,
@@ -25,6 +25,7 @@ from cpunet.jobs.simulation.pulse_shape_library import write_library
 from cpunet.jobs.simulation.simulate import Resolution, simulate_file
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
 from cpunet.simulation.clustering import merge_hits
@@ -77,7 +78,7 @@ def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     assert summary.hits < summary.hits_before_merging
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
-    used = load_simulated(InputFile(out), recipe, selection).prepared
+    used = load_simulated(PulseFile(out), recipe, selection).prepared
     assert len(used) >= summary.lines["FEP"] > 10
     pulses = next(open_pulses(out).blocks())
     assert pulses.waveforms.shape == (summary.n_written, 100)

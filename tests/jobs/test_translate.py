@@ -23,7 +23,6 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
@@ -36,6 +35,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
@@ -165,7 +165,7 @@ def names(folder):
 
 def test_all_other_columns_are_kept(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5", **many_columns())
-    translate_file(run, InputFile(source), tmp_path / "out.lh5", device="cpu")
+    translate_file(run, PulseFile(source), tmp_path / "out.lh5", device="cpu")
     before, after = lh5.read("geds/sim", source), lh5.read("geds/ren", tmp_path / "out.lh5")
     assert set(after) == set(before) | {"rejection_source"}
     assert plain(after.rejection_source) == [9] * N
@@ -183,7 +183,7 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
         file["short"] = np.arange(3)
         file["pair"] = np.ones(N, complex)
     out = tmp_path / "out.lh5"
-    translate_file(run, InputFile(tmp_path / "sim.hdf5"), out, device="cpu")
+    translate_file(run, PulseFile(tmp_path / "sim.hdf5"), out, device="cpu")
     table = lh5.read("geds/ren", out)
     assert plain(table.depth) == list(range(N))
     assert plain(table.text) == [b"a", b"bc"] * (N // 2)
@@ -195,13 +195,13 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
     np.savez(
         tmp_path / "sim.npz", waveforms=charge(), energy_kev=np.full(N, 1e3), z=np.arange(N)
     )
-    source = InputFile(tmp_path / "sim.npz", dt_ns=DT_NS)
+    source = PulseFile(tmp_path / "sim.npz", dt_ns=DT_NS)
     translate_file(run, source, tmp_path / "npz.lh5", device="cpu")
     assert plain(lh5.read("geds/ren", tmp_path / "npz.lh5").z) == list(range(N))
 
 
 def test_realisations_repeat_rows(run, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
     told = translate_file(
         run,
         source,
@@ -230,7 +230,7 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
         for channel in ("ch1", "ch2"):
             file.copy("geds/sim", f"{channel}/sim")
         del file["geds"]
-    outcome = translate_channels(run, InputFile(source, "all"), tmp_path / "out", device="cpu")
+    outcome = translate_channels(run, PulseFile(source, "all"), tmp_path / "out", device="cpu")
     assert {name: told["translated"] for name, told in outcome.done.items()} == {
         "ch1": N,
         "ch2": N,
@@ -241,7 +241,7 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
 
 
 def test_the_options_of_a_translation_are_told(busy, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     adc = Adc(baseline=0.0)
     for number, (options, said) in enumerate(
         [
@@ -277,7 +277,7 @@ def test_blocks_are_regrouped(sizes, size):
 @pytest.fixture(scope="module")
 def in_blocks(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("blocks")
-    source = InputFile(sim_file(folder / "sim.lh5", n=50))
+    source = PulseFile(sim_file(folder / "sim.lh5", n=50))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(translate_job, "NOISE_ROWS", 16)
         translate_file(run, source, folder / "whole.lh5", device="cpu")
@@ -298,7 +298,7 @@ def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, l
 
 
 def test_options_may_be_numbers_of_numpy(run, tmp_path):
-    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
     options = TranslateOptions(seed=np.int64(3), realisations=np.int32(2))
     told = translate_file(run, source, out, options, device="cpu")
     options = TranslateOptions(seed=3, realisations=2)
@@ -323,7 +323,7 @@ def changed_record(path, change):
     ],
 )
 def test_a_file_with_another_record_is_not_kept(run, tmp_path, change, said):
-    source, out = InputFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
+    source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
     translate_file(run, source, out, device="cpu")
     assert translate_file(run, source, out, device="cpu", resume=True)["skipped"]
     changed_record(out, change)
@@ -347,7 +347,7 @@ def test_seeds_differ_by_file_block_and_realisation():
 @pytest.fixture(scope="module")
 def many(tmp_path_factory):
     folder = tmp_path_factory.mktemp("many")
-    return [InputFile(sim_file(folder / f"sim_{i}.lh5", seed=i)) for i in range(3)]
+    return [PulseFile(sim_file(folder / f"sim_{i}.lh5", seed=i)) for i in range(3)]
 
 
 @pytest.fixture(scope="module")
@@ -397,7 +397,7 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
 ):
     bad, out = tmp_path / "bad.lh5", tmp_path / "out"
     bad.write_bytes(many[0].path.read_bytes()[:3000])
-    sources = [InputFile(bad), *many]
+    sources = [PulseFile(bad), *many]
     with pytest.raises(
         CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"
     ) as error:
@@ -412,7 +412,7 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
 
 @pytest.mark.slow
 def test_what_processes_say_is_heard(run, tmp_path, caplog):
-    sources = [InputFile(tmp_path / f"sim_{i}.hdf5") for i in range(2)]
+    sources = [PulseFile(tmp_path / f"sim_{i}.hdf5") for i in range(2)]
     for source in sources:
         with h5py.File(source.path, "w") as file:
             file["waveform"], file["dt_ns"] = charge(), DT_NS
@@ -448,7 +448,7 @@ def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, 
     assert "was made with another run" in refused(run=network)
     assert "was made with other options (seed)" in refused(seed=1)
     assert "was made with other options (noise)" in refused(noise=False)
-    other = InputFile(sim_file(tmp_path / "sim_0.lh5", seed=9))
+    other = PulseFile(sim_file(tmp_path / "sim_0.lh5", seed=9))
     assert "sim_0.lh5: was made with another source" in refused(sources=[other])
     foreign = tmp_path / "out"
     foreign.mkdir()
@@ -501,7 +501,7 @@ def test_windows_are_extended_by_their_decay():
 @pytest.mark.parametrize("adc", [Adc(), ADC])
 def test_traces_in_adc_counts(run, tmp_path, adc):
     source, out = sim_file(tmp_path / "sim.lh5"), tmp_path / "out.lh5"
-    told = translate_file(run, InputFile(source), out, TranslateOptions(adc=adc), device="cpu")
+    told = translate_file(run, PulseFile(source), out, TranslateOptions(adc=adc), device="cpu")
     assert (told["translated"], told["saturated"]) == (N, 0)
     length, n_pre = adc.length or 800, adc.n_pre or 400
     table = lh5.read("geds/ren", out)
@@ -520,7 +520,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     config = load_recipe("fast").preparation
     clean = tmp_path / "clean.lh5"
     translate_file(
-        run, InputFile(source), clean, TranslateOptions(adc=adc, noise=False), device="cpu"
+        run, PulseFile(source), clean, TranslateOptions(adc=adc, noise=False), device="cpu"
     )
     back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
     assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
@@ -535,7 +535,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
 def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
     run, network, tmp_path, caplog
 ):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     translate_file(run, source, tmp_path / "chain.lh5", TranslateOptions(adc=ADC), device="cpu")
     traces = values(tmp_path / "chain.lh5").astype(float)
     for part in (slice(0, 250), slice(1150, 1400)):
@@ -559,7 +559,7 @@ def test_gain_is_the_height_of_a_fast_pulse(run, tmp_path):
     given = Adc(adc_per_kev=7.0, baseline=100.0)
     out = tmp_path / "out.lh5"
     translate_file(
-        run, InputFile(source), out, TranslateOptions(adc=given, noise=False), device="cpu"
+        run, PulseFile(source), out, TranslateOptions(adc=given, noise=False), device="cpu"
     )
     table = lh5.read("geds/ren", out)
     height = table.waveform.values.nda.max(axis=1) - 100.0
@@ -572,7 +572,7 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
     told = translate_file(
-        run, InputFile(path), tmp_path / "out.lh5", TranslateOptions(adc=ADC), device="cpu"
+        run, PulseFile(path), tmp_path / "out.lh5", TranslateOptions(adc=ADC), device="cpu"
     )
     assert told == {
         "read": 6,
@@ -593,7 +593,7 @@ def left_in(path, table="geds/ren"):
 
 
 def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder, name in ((busy, "a.lh5"), (run, "b.lh5")):
         translate_file(folder, source, tmp_path / name, device="cpu")
         with h5py.File(tmp_path / name) as file:
@@ -602,7 +602,7 @@ def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
 
 
 def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, many = tmp_path / "out.lh5", {"realisations": 40}
     translate_file(busy, source, out, TranslateOptions(remains="learned", **many), device="cpu")
     left = left_in(out)
@@ -620,7 +620,7 @@ def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
 
 
 def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for remains in ("none", "3"):
         out = tmp_path / f"{remains}.lh5"
         translate_file(
@@ -642,7 +642,7 @@ def piled(out):
 
 
 def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     options = {"adc": ADC, "seed": 3, "realisations": 5}
     translate_file(
         busy, source, tmp_path / "none.lh5", TranslateOptions(**options), device="cpu"
@@ -672,7 +672,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
 
 
 def test_second_pulses_are_within_windows(busy, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, options = tmp_path / "some.lh5", {"seed": 3, "realisations": 10}
     translate_file(busy, source, out, TranslateOptions(pile_up_khz=20, **options), device="cpu")
     count, kev, after_ns = piled(out)
@@ -705,7 +705,7 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
         translate_file(
             busy, source, tmp_path / "out.lh5", TranslateOptions(**options), device="cpu"
@@ -713,7 +713,7 @@ def test_options_that_cannot_be(busy, tmp_path, options, said):
 
 
 def test_runs_that_tell_of_no_remains(run, network, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of remains"):
             translate_file(
@@ -730,7 +730,7 @@ def test_runs_that_tell_of_no_remains(run, network, tmp_path):
 
 
 def test_adc_needs_to_be_known(network, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
 
     def refused(**adc):
         with pytest.raises(CpunetError) as error:
@@ -771,7 +771,7 @@ def test_a_file_that_changes_meanwhile_gives_no_output(run, tmp_path, monkeypatc
 
     monkeypatch.setattr(Stage, "update", lambda *_: os.utime(source, ns=(0, 0)))
     with pytest.raises(CpunetError, match=r"sim.lh5: changed while it was read"):
-        translate_file(run, InputFile(source), tmp_path / "out.lh5", device="cpu")
+        translate_file(run, PulseFile(source), tmp_path / "out.lh5", device="cpu")
     assert names(tmp_path) == ["sim.lh5"]
 
 
@@ -780,7 +780,7 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path):
     listing = r"out.lh5: cannot be written \(File too large\); make room"
     for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
         with nearly_full_disk(size), pytest.raises(CpunetError, match=listing):
-            translate_file(run, InputFile(source), out, device="cpu")
+            translate_file(run, PulseFile(source), out, device="cpu")
         assert names(out.parent) == []
 
 
@@ -788,7 +788,7 @@ def test_no_space_left_is_told(run, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError("Can't write (file write failed: errno = 28, error message = 'No ...')")
 
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     monkeypatch.setattr("cpunet.pulses.writing.lh5.write", full)
     with pytest.raises(CpunetError, match=r"out.lh5: cannot be written \(No space left on dev"):
         translate_file(run, source, tmp_path / "out.lh5", device="cpu")
@@ -796,7 +796,7 @@ def test_no_space_left_is_told(run, tmp_path, monkeypatch):
 
 
 def test_targets_that_cannot_be_written(run, tmp_path):
-    source = InputFile(sim_file(tmp_path / "sim.lh5"))
+    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=r"/proc/nowhere/out.lh5: cannot be written"):
         translate_file(run, source, Path("/proc/nowhere/out.lh5"), device="cpu")
     with pytest.raises(CpunetError, match="is the input; choose another"):
@@ -828,6 +828,6 @@ def test_names(run, many, tmp_path):
     twice = [many[0], many[0]]
     with pytest.raises(CpunetError, match=r"occur twice among the files, as sim_0.lh5"):
         translate_files(run, twice, tmp_path / "out", device="cpu")
-    shared = [InputFile(one.path, energy="hit.lh5:a/b") for one in many]
+    shared = [PulseFile(one.path, energy="hit.lh5:a/b") for one in many]
     with pytest.raises(CpunetError, match="belongs to one file"):
         translate_files(run, shared, tmp_path / "out", device="cpu")

@@ -128,7 +128,7 @@ def test_npy_needs_the_period(tmp_path):
         open_pulses(path)
     np.testing.assert_array_equal(open_pulses(path, dt_ns=8).read().waveforms, VALUES)
     for dt_ns in (0, -1, np.nan):
-        with pytest.raises(CpunetError, match=r"--dt-ns is .*; expected more than 0"):
+        with pytest.raises(CpunetError, match=r"dt_ns is .*; expected more than 0"):
             open_pulses(path, dt_ns=dt_ns)
 
 

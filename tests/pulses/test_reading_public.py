@@ -209,7 +209,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     simulated = phased_edges(N, np.random.default_rng(3), 500, 1000)
     pulses = cpunet.Pulses.of(simulated, dt_ns=10, energy_kev=np.full(N, KEV))
     write_pulses(sim, pulses)
-    data = cpunet.InputFile(raw, table="5", dt_ns=10)
+    data = cpunet.PulseFile(raw, table="5", dt_ns=10)
     run = cpunet.train(sim, data, tmp_path / "run", settings=SHORT, device="cpu")
     assert run.data.read == 2 * N * 2 // 3
     assert run.data.read_as == {"table": "5", "dt_ns": 10}
@@ -225,7 +225,7 @@ def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
     sim = write_pickles(tmp_path / "fep_wf_sim.pickle", phased_edges(N, rng, 500, 1000))
     raw = write_pickles(tmp_path / "fep_wf_ornl.pickle", measured(rng, N, 1600, 700))
     assert "pickled pulses" in told(capsys, monkeypatch, "info", raw, "--dt-ns", 16)
-    sides = cpunet.InputFile(sim, dt_ns=16), cpunet.InputFile(raw, dt_ns=16)
+    sides = cpunet.PulseFile(sim, dt_ns=16), cpunet.PulseFile(raw, dt_ns=16)
     run = cpunet.train(*sides, tmp_path / "run", settings=SHORT, device="cpu")
     assert run.sim.read == run.data.read == N
     report = cpunet.validate(run, *sides, rivals=False, device="cpu")

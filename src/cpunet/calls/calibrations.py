@@ -14,11 +14,12 @@ from pydantic import Field
 from cpunet.analysis.calibration_figures import calibration_figures
 from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
-from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
 from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.pulses.reading.files import Source, pulse_file
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
@@ -103,8 +104,8 @@ class CalibratedRun(Run):
 
 
 def calibrate(
-    sim: File | HitFile,
-    data: File,
+    sim: Source | HitFile,
+    data: Source,
     out: str | Path,
     *,
     detector: str | Path | Detector | None = None,
@@ -161,7 +162,7 @@ def calibrate(
     """
     known = detector if isinstance(detector, Detector | None) else read_detector(str(detector))
     start = Start(
-        sim=None if isinstance(sim, HitFile) else as_input(sim, "sim"),
+        sim=None if isinstance(sim, HitFile) else pulse_file(sim),
         hits=replace(sim, path=Path(sim.path)) if isinstance(sim, HitFile) else None,
         detector=known,
         settings=settings,
@@ -169,8 +170,8 @@ def calibrate(
     given = [f"{name}={float(v)!r}±{float(e)!r}" for name, (v, e) in (priors or {}).items()]
     job = Calibration(
         start,
-        as_input(data, "data"),
-        as_recipe(recipe, None),
+        pulse_file(data),
+        load_recipe(recipe),
         Freedom.of("auto" if free is None else ",".join(free), ",".join(fixed), given),
         peak=peak,
         events=events,

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import part
 from cpunet.analysis.report_folder import METRICS, VALUES
-from cpunet.calls.given import File, as_input
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.compare import read_metrics
@@ -24,6 +23,7 @@ from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.training.run import RunLike
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
@@ -166,8 +166,8 @@ class Report:
 
 def validate(
     run: RunLike,
-    sim: File,
-    data: File,
+    sim: Source,
+    data: Source,
     out: str | Path | None = None,
     *,
     truth: str | Path | None = None,
@@ -184,7 +184,7 @@ def validate(
     run
         A trained run or its folder.
     sim, data
-        Simulated and measured pulses: a path, or `cpunet.InputFile` with reading options.
+        Simulated and measured pulses: a path, or `cpunet.PulseFile` with reading options.
     out
         Folder for ``report.html`` and figures; None to write nothing.
     truth
@@ -212,8 +212,8 @@ def validate(
     """
     found, drawn = validated(
         run,
-        as_input(sim, "sim"),
-        as_input(data, "data"),
+        pulse_file(sim),
+        pulse_file(data),
         None if out is None else Path(out),
         ValidateOptions(
             None if truth is None else Path(truth), rivals, seed, ae_range_kev, device=device

@@ -6,16 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cpunet.calls.given import File, as_input, as_recipe
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.pulses.reading.files import Source, pulse_file
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, RunLike
 
 
 def train(
-    sim: File,
-    data: File,
+    sim: Source,
+    data: Source,
     out: str | Path,
     *,
     recipe: str | Path | Recipe = "fast",
@@ -32,7 +33,7 @@ def train(
     Parameters
     ----------
     sim, data
-        Simulated and measured pulses: a path, or `cpunet.InputFile` with reading options.
+        Simulated and measured pulses: a path, or `cpunet.PulseFile` with reading options.
     out
         Folder of the run; it appears when the training is done.
     recipe
@@ -64,9 +65,9 @@ def train(
         If an argument cannot be used; the message is one line that says what to do.
     """
     return train_run(
-        as_input(sim, "sim"),
-        as_input(data, "data"),
+        pulse_file(sim),
+        pulse_file(data),
         Path(out),
-        as_recipe(recipe, settings),
+        load_recipe(recipe, settings or ()),
         TrainOptions(peak, seed, device, init, resume, force),
     )

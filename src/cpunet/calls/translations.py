@@ -18,15 +18,14 @@ from matplotlib.figure import Figure
 from cpunet.analysis.comparisons import data_axis
 from cpunet.analysis.html_pages import notebook_picture, part
 from cpunet.analysis.style import COLOURS, styled
-from cpunet.calls.given import File, as_input
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile, Source, pulse_file
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import RunLike
@@ -163,7 +162,7 @@ class Translation:
 
 def translate(
     run: RunLike,
-    pulses: File | Pulses,
+    pulses: Source,
     out: str | Path | None = None,
     *,
     inverse: bool = False,
@@ -238,7 +237,7 @@ def translate(
                 "cpunet.pulses.writing.write_pulses and give that file"
             )
         return _in_memory(job, made, pulses)
-    source = as_input(pulses, "pulses")
+    source = pulse_file(pulses)
     if out is None:
         return _in_memory(job, made, source)
     counts = job(source, Path(out), resume=resume, force=force)
@@ -246,7 +245,7 @@ def translate(
 
 
 def _in_memory(
-    job: FileTranslation, made: Translation, given: Pulses | InputFile
+    job: FileTranslation, made: Translation, given: Pulses | PulseFile
 ) -> Translation:
     pulses = given if isinstance(given, Pulses) else job.opened(given).read()
     if not len(pulses):

@@ -190,7 +190,7 @@ def _start(
     insist: bool,
 ) -> Start:
     from cpunet.jobs.calibration.calibration_inputs import Start
-    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.pulses.reading.files import PulseFile
     from cpunet.settings import read_settings
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.settings import SimulationSettings, split_overrides
@@ -200,7 +200,7 @@ def _start(
         raise CpunetError(f"--set {next(iter(of_detector))}: give the --detector that it is of")
     given = settings_file is not None or of_settings
     return Start(
-        None if sim is None else InputFile(sim, insist=insist),
+        None if sim is None else PulseFile(sim, insist=insist),
         None if hits is None else frame.file(hits),
         None if detector is None else read_detector(detector, of_detector, crystal),
         read_settings(SimulationSettings, settings_file, of_settings) if given else None,

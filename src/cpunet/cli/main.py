@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 
 import cpunet
+from cpunet.cli.app import app as commands
+from cpunet.cli.app import run
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
 from cpunet.cli.check import check
@@ -98,7 +100,10 @@ def main() -> None:
             share_the_machine()
             if clash := other_package():
                 log.warning(clash)
-            status = app(words, standalone_mode=False)
+            of_functions = (
+                words[:1] and not words[0].startswith("-") and words[0] in [*commands]
+            )
+            status = run(words) if of_functions else app(words, standalone_mode=False)
         except BaseException as error:
             status = ended_with(error, words, debug=debug)
     sys.exit(status or 0)

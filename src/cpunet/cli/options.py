@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 if TYPE_CHECKING:
-    from cpunet.jobs.common.inputs import InputFile
+    from cpunet.pulses.reading.files import PulseFile
     from cpunet.recipes.schema import Recipe
 
 # Far beyond what anyone needs, and what a job can hold or live to see.
@@ -203,11 +203,11 @@ class DataAs:
     dt: Dt = None
     insist: Insist = False
 
-    def data(self, path: Path) -> InputFile:
+    def data(self, path: Path) -> PulseFile:
         """The measured file."""
-        from cpunet.jobs.common.inputs import InputFile
+        from cpunet.pulses.reading.files import PulseFile
 
-        return InputFile(
+        return PulseFile(
             path, self.data_table, self.data_energy, self.kev_per_adc, self.dt, self.insist
         )
 
@@ -224,11 +224,11 @@ class SimAs:
 class ReadAs(DataAs, SimAs):
     """How the files of both sides are read."""
 
-    def sim(self, path: Path) -> InputFile:
+    def sim(self, path: Path) -> PulseFile:
         """The simulated file."""
-        from cpunet.jobs.common.inputs import InputFile
+        from cpunet.pulses.reading.files import PulseFile
 
-        return InputFile(
+        return PulseFile(
             path, self.sim_table, self.sim_energy, dt_ns=self.dt, insist=self.insist
         )
 

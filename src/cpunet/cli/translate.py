@@ -173,14 +173,14 @@ def translate(
     Example: cpunet translate runs sim.lh5 --table all --out translated/
     """
     from cpunet.jobs.common.channels import ALL
-    from cpunet.jobs.common.inputs import InputFile
     from cpunet.jobs.translation.translate import translate_file
     from cpunet.jobs.translation.translate_channels import translate_channels
     from cpunet.jobs.translation.translate_files import expanded, translate_files
     from cpunet.jobs.translation.translate_options import TranslateOptions
+    from cpunet.pulses.reading.files import PulseFile
 
     adc = adc_options.adc()
-    files = [InputFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
+    files = [PulseFile(f, table, energy, kev_per_adc, dt, insist) for f in expanded(sources)]
     place = Path(out_name)
     form = TranslateOptions(
         inverse, noise, seed, out_table, realisations, adc, remains, pile_up_khz

@@ -7,7 +7,6 @@ from typing import Any
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
 from cpunet.jobs.simulation.hit_sources import energy_windows
 from cpunet.jobs.simulation.stand import write_stand
@@ -17,6 +16,7 @@ from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 
@@ -79,7 +79,7 @@ def demonstrate(
     require_same_parts(out, plan, recipe, _PEAK)
     if not is_there(out, "stand"):
         write_stand(plan, stand)
-    sim, data = InputFile(stand / "sim.lh5"), InputFile(stand / "data.lh5")
+    sim, data = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
     if not is_there(out, "run"):
         train_run(
             sim,

@@ -22,7 +22,6 @@ from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -36,6 +35,7 @@ from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import checked
 from cpunet.training.checkpoints import differences
@@ -62,8 +62,8 @@ UNCHANGED, REASON, BEGUN = "unchanged recipe", "reason", "begun with"  # user at
 
 
 def tune_recipe(
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path,
     recipe: Recipe,
     *,
@@ -295,7 +295,7 @@ class HeldOut:
 
     @classmethod
     def of(
-        cls, sim: InputSet, data: InputSet, data_file: InputFile, recipe: Recipe, seed: int
+        cls, sim: InputSet, data: InputSet, data_file: PulseFile, recipe: Recipe, seed: int
     ) -> Self:
         """Split both sides at random.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from cpunet.errors import CpunetError
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Set, names, read_settings
 
@@ -15,25 +16,34 @@ def recipe_names() -> list[str]:
     return names(_FOLDER)
 
 
-def load_recipe(name: str | Path, overrides: Set = ()) -> Recipe:
+def load_recipe(recipe: str | Path | Recipe, settings: Set = ()) -> Recipe:
     """Read a recipe by name, or from a YAML file, and override single values.
 
     Parameters
     ----------
-    name
-        One of `recipe_names`, or a path to a YAML file.
-    overrides
+    recipe
+        One of `recipe_names`, a path to a YAML file, or a recipe, which is returned.
+    settings
         ``"training.batch_size=16"`` and the like; values are YAML. Or a mapping.
 
     Raises
     ------
     CpunetError
-        If there is no such recipe, or a key or value is not allowed.
+        If there is no such recipe, or a key or value is not allowed, or a recipe that is whole
+        already is to be overridden.
 
     Examples
     --------
-    >>> recipe = load_recipe("paper", ["training.batch_size=16"])
+    >>> recipe = load_recipe("paper", {"training.batch_size": 16})
     >>> recipe.generator.width, recipe.training.batch_size
     (40, 16)
     """
-    return read_settings(Recipe, name, overrides, _FOLDER)
+    if not isinstance(recipe, Recipe):
+        return read_settings(Recipe, recipe, settings, _FOLDER)
+    if settings:
+        raise CpunetError(
+            "settings override values of a recipe that is given by name; this one is whole "
+            "already",
+            "change it, and leave settings out",
+        )
+    return recipe

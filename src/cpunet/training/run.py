@@ -34,6 +34,7 @@ from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.cuts import CutWindows
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.training.loop import Record
@@ -96,6 +97,15 @@ class SideInfo(_Part):
     rejections: dict[str, int] = {}
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
     sha256: str | None = None
+
+    def reading(self, file: PulseFile) -> PulseFile:
+        """A file with the reading options that the training had for it as defaults."""
+        told = self.read_as
+        if self.file is None or Path(self.file).resolve() != file.path.resolve():
+            return file
+        if any(told.get(name) != value for name, value in file.options.items()):
+            return file
+        return replace(file, **told)
 
 
 class RemainsInfo(_Part):

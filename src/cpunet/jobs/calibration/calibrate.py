@@ -32,7 +32,7 @@ from cpunet.jobs.calibration.calibration_inputs import (
     known_depletion,
     read_sides,
 )
-from cpunet.jobs.common.inputs import InputFile, load_simulated
+from cpunet.jobs.common.inputs import load_simulated
 from cpunet.jobs.common.matrices import one_thread_for_matrices
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
@@ -43,6 +43,7 @@ from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.progress import stage
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
@@ -92,7 +93,7 @@ class Calibration:
     """
 
     start: Start
-    data: InputFile
+    data: PulseFile
     recipe: Recipe
     freedom: Freedom = field(default_factory=Freedom)
     peak: str = "FEP"
@@ -146,7 +147,7 @@ class Calibration:
             for note in content["notes"]:
                 log.info(titled(note))
             _simulate_calibrated(calibrated, sides, folder, self.seed)
-            again = load_simulated(InputFile(folder / SIM), self.recipe, sides.selection)
+            again = load_simulated(PulseFile(folder / SIM), self.recipe, sides.selection)
             # not stretched: what is off in the drift is for the physics to explain
             training = self.recipe.training.model_copy(update={"drift_terms": 0})
             recipe = self.recipe.model_copy(update={"training": training})

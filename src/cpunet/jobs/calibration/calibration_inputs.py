@@ -13,7 +13,6 @@ import numpy as np
 from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -24,6 +23,7 @@ from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
@@ -113,7 +113,7 @@ class Start:
         Distance in mm below which `hits` are merged.
     """
 
-    sim: InputFile | None = None
+    sim: PulseFile | None = None
     hits: HitFile | None = None
     detector: Detector | None = None
     settings: SimulationSettings | None = None
@@ -167,7 +167,7 @@ class Sides:
 
 def read_sides(
     start: Start,
-    data_file: InputFile,
+    data_file: PulseFile,
     recipe: Recipe,
     peak: str,
     events: int,
@@ -193,7 +193,7 @@ def read_sides(
     sim, temporary = start.sim, None
     if sim is None:
         temporary = folder / "as_simulated.lh5"
-        sim = InputFile(_simulated(start, temporary, data.dt_ns))
+        sim = PulseFile(_simulated(start, temporary, data.dt_ns))
     stored = StoredSimulation.read(sim.path)
     simulated = load_simulated(sim, recipe, selection)
     require_same_sampling(simulated, data)

@@ -11,8 +11,8 @@ from typing import Generic, TypeVar
 from urllib.parse import quote
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.outputs import MARKER
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import tables_of
 
 log = logging.getLogger(__name__)
@@ -21,7 +21,7 @@ ALL = "all"  # in place of the name of a table
 CHANNEL = "{channel}"  # in the name of an energy column
 
 R = TypeVar("R")
-Pair = tuple[InputFile, InputFile]
+Pair = tuple[PulseFile, PulseFile]
 
 
 def channel_names(tables: list[str]) -> dict[str, str]:
@@ -49,7 +49,7 @@ def channel_names(tables: list[str]) -> dict[str, str]:
     return dict(zip(names, tables, strict=True))
 
 
-def channels_of(file: InputFile) -> dict[str, InputFile]:
+def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     """Each channel of a file whose table is ``"all"``, by its short name.
 
     In the name of the energy column ``{channel}`` stands for the name of the channel.
@@ -77,7 +77,7 @@ def channels_of(file: InputFile) -> dict[str, InputFile]:
     }
 
 
-def paired(sim: InputFile, data: InputFile) -> dict[str, Pair | CpunetError]:
+def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
     """The simulation and the data of each channel of the data.
 
     A single table of simulated pulses is used for all channels.  If its table is ``"all"`` too,

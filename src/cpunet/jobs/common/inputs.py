@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.reading.energies import amplitude
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import recorded_detector, require_side
@@ -26,7 +26,6 @@ from cpunet.training.run import SideInfo
 
 log = logging.getLogger(__name__)
 
-_READ_AS = ("table", "energy", "kev_per_adc", "dt_ns")
 Energies = npt.NDArray[np.float64]
 
 MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
@@ -34,51 +33,12 @@ LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
-@dataclass(frozen=True)
-class InputFile:
-    """A file of pulses and how to read it, see `cpunet.pulses.reading.open_pulses`.
-
-    With `insist` its pulses are accepted as simulated or measured, whatever they look like.
-    """
-
-    path: Path
-    table: str | None = None
-    energy: str | None = None
-    kev_per_adc: float | None = None
-    dt_ns: float | None = None
-    insist: bool = False
-
-    @property
-    def files(self) -> tuple[Path | str | None, ...]:
-        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
-        return self.path, self.energy
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """The reading options given by the user."""
-        given = {name: getattr(self, name) for name in _READ_AS}
-        return {name: value for name, value in given.items() if value is not None}
-
-    def as_before(self, side: SideInfo) -> InputFile:
-        """The same file, with the reading options that a run used for it as defaults."""
-        read_as = side.read_as
-        if side.file is None or Path(side.file).resolve() != self.path.resolve():
-            return self
-        if any(read_as.get(name) != value for name, value in self.options.items()):
-            return self
-        return replace(self, **{name: read_as[name] for name in _READ_AS if name in read_as})
-
-    def open(self) -> PulseSource:
-        """Open the file."""
-        return open_pulses(self.path, **self.options)
-
-
 @dataclass(frozen=True, eq=False)
 class InputSet:
     """The prepared pulses of a file, with the quality cuts if they are measured.
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
-    ``read_as`` the reading options, see `InputFile.options`; ``detector`` the name of the
+    ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
     simulated detector, if the file contains it.
     """
 
@@ -110,7 +70,7 @@ class InputSet:
 
 
 def load_simulated(
-    file: InputFile,
+    file: PulseFile,
     recipe: Recipe,
     selection: EnergySelection,
     *,
@@ -125,7 +85,7 @@ def load_simulated(
 
 
 def load_measured(
-    file: InputFile,
+    file: PulseFile,
     recipe: Recipe,
     selection: EnergySelection,
     *,
@@ -183,7 +143,7 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
 
 
 def _load(
-    file: InputFile,
+    file: PulseFile,
     side: Kind,
     recipe: Recipe,
     selection: EnergySelection,

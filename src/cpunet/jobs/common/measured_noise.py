@@ -7,8 +7,8 @@ import numpy as np
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import PreparationConfig
 
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
@@ -16,7 +16,7 @@ MIN_EMPTY = 200  # minimum number of these if traces with remains are left out
 
 
 def measured_noise(
-    data_file: InputFile,
+    data_file: PulseFile,
     windows: Pulses,
     config: PreparationConfig,
     remains: Remains | None = None,
@@ -53,7 +53,7 @@ def measured_noise(
 
 
 def noise_of_traces(
-    data_file: InputFile, config: PreparationConfig, remains: Remains | None = None
+    data_file: PulseFile, config: PreparationConfig, remains: Remains | None = None
 ) -> BaselineNoise:
     """Measure the noise from the raw samples before the pulses.
 

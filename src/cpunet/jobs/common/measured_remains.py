@@ -12,9 +12,10 @@ import numpy as np
 from cpunet.electronics.drawn_remains import DrawnRemains, passing
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.inputs import InputSet
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import PreparationConfig
 
 log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class FoundRemains(NamedTuple):
 
 
 def find_remains(
-    data_file: InputFile, data: InputSet, config: PreparationConfig
+    data_file: PulseFile, data: InputSet, config: PreparationConfig
 ) -> FoundRemains:
     """Measure the remains in a file for a training, and note what was found.
 
@@ -74,7 +75,7 @@ def find_remains(
 
 
 def measured_remains(
-    data_file: InputFile, config: PreparationConfig
+    data_file: PulseFile, config: PreparationConfig
 ) -> tuple[Remains | None, str | None]:
     """Measure the remains in the traces of a file.
 
@@ -90,7 +91,7 @@ def measured_remains(
 
 
 def drawn_like(
-    remains: Remains, data_file: InputFile, data: InputSet, config: PreparationConfig
+    remains: Remains, data_file: PulseFile, data: InputSet, config: PreparationConfig
 ) -> DrawnRemains:
     """Distribution of remains like that of the data after their quality cuts.
 
@@ -120,7 +121,7 @@ def drawn_like(
     )
 
 
-def _rows(data_file: InputFile, data: InputSet) -> Iterator[Pulses]:
+def _rows(data_file: PulseFile, data: InputSet) -> Iterator[Pulses]:
     """Raw traces of the pulses in use, block by block."""
     first, index = 0, data.prepared.index
     for block in islice(data_file.open().blocks(BLOCK), MAX_BLOCKS):

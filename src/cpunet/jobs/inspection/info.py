@@ -14,7 +14,6 @@ from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.channels import ALL, channels_of
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
@@ -24,6 +23,7 @@ from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.energies import amplitude
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import table_sizes
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
@@ -140,7 +140,7 @@ def describe(
         peaks = recipe.peaks if recipe else {}
         told = describe_hits(path, chosen, peaks, detector, hit_units)
     else:
-        file = InputFile(path, table, energy, kev_per_adc, dt_ns)
+        file = PulseFile(path, table, energy, kev_per_adc, dt_ns)
         told, spectrum = _of_file(file, recipe, without_remains, force=force)
     if out is not None:
         if spectrum is None or not np.isfinite(spectrum.values).any():
@@ -155,7 +155,7 @@ def describe(
 
 
 def _of_file(
-    file: InputFile, recipe: Recipe | None, without_remains: Path | None, *, force: bool
+    file: PulseFile, recipe: Recipe | None, without_remains: Path | None, *, force: bool
 ) -> tuple[dict[str, Any], Spectrum | None]:
     """Describe a file of pulses; also return its spectrum if one table was read."""
     if file.table == ALL and without_remains is None:
@@ -174,7 +174,7 @@ def _of_file(
 
 
 def _of_pulses(
-    file: InputFile,
+    file: PulseFile,
     recipe: Recipe | None,
     without_remains: Path | None = None,
     *,

@@ -10,12 +10,13 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
@@ -38,7 +39,7 @@ class Sides:
 
     sim: Pulses
     data: Pulses
-    data_file: InputFile
+    data_file: PulseFile
     data_set: InputSet | None = None
 
 

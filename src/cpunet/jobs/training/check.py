@@ -17,7 +17,6 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -29,6 +28,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Rejection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes.schema import Recipe
 
@@ -97,7 +97,7 @@ class Checked:
         return max(levels, key=list(Level).index, default=Level.FINE)
 
 
-def check(sim: InputFile, data: InputFile, recipe: Recipe, peak: str) -> Checked:
+def check(sim: PulseFile, data: PulseFile, recipe: Recipe, peak: str) -> Checked:
     """Read both sides as in a training, and check them.
 
     Parameters

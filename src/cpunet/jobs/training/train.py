@@ -13,7 +13,6 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -28,6 +27,7 @@ from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.outputs import folder_written_aside
 from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import unfinished_folder
 from cpunet.training.run import RUN, Run, as_run
@@ -43,8 +43,8 @@ FITS: dict[str, Callable[[TrainingJob], Run]] = {
 
 @one_thread_for_matrices()
 def train_run(
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path,
     recipe: Recipe,
     options: TrainOptions = AS_USUAL,
@@ -107,8 +107,8 @@ def _workplace(
 
 
 def _read(
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     recipe: Recipe,
     selection: EnergySelection,
 ) -> tuple[InputSet, InputSet]:

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import unfinished_name
 from cpunet.training.loop import StoppedError
@@ -22,8 +22,8 @@ AS_USUAL = TrainOptions()
 
 
 def train_channels(
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path,
     recipe: Recipe,
     options: TrainOptions = AS_USUAL,

@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from cpunet.jobs.common.devices import peak_memory_mb
-from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.training.chain_and_inverse import Sides
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, RunLike, versions
 
@@ -67,7 +68,7 @@ class TrainingJob:
     options: TrainOptions
     sim: InputSet
     data: InputSet
-    data_file: InputFile
+    data_file: PulseFile
     init: Run | None
     folder: Path
     stop: Callable[[], bool] = lambda: False

@@ -13,7 +13,6 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.common.memory import give_back_large_arrays
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.jobs.translation.translation_blocks import (
@@ -33,6 +32,7 @@ from cpunet.jobs.translation.translation_record import (
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
@@ -92,7 +92,7 @@ class FileTranslation:
 
     def __call__(
         self,
-        source: InputFile,
+        source: PulseFile,
         out: Path,
         *,
         noise_key: str | None = None,
@@ -133,7 +133,7 @@ class FileTranslation:
             writer.stamp(TRANSLATION, as_json(record))
         return told
 
-    def opened(self, source: InputFile) -> PulseSource:
+    def opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate.
 
         Raises
@@ -164,7 +164,7 @@ class FileTranslation:
         )
         return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains, pile_up)
 
-    def _require_sampling(self, source: InputFile, pulses: PulseSource) -> None:
+    def _require_sampling(self, source: PulseFile, pulses: PulseSource) -> None:
         if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
             raise CpunetError(
                 f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
@@ -178,7 +178,7 @@ class FileTranslation:
             return f"translate the {self.kind.takes} ones that they were made of"
         return "leave out --inverse" if self.options.inverse else "give --inverse"
 
-    def _require_some(self, source: InputFile, counts: Counts) -> None:
+    def _require_some(self, source: PulseFile, counts: Counts) -> None:
         if counts.translated:
             return
         reasons = ", ".join(f"{n} {reason}" for reason, n in counts.rejections.items())
@@ -230,7 +230,7 @@ class FileTranslation:
 
 def translate_file(
     run: RunLike,
-    source: InputFile,
+    source: PulseFile,
     out: Path,
     options: TranslateOptions = DEFAULTS,
     *,

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, own_folder
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import INFO
 
 DEFAULTS = TranslateOptions()
@@ -16,7 +16,7 @@ DEFAULTS = TranslateOptions()
 
 def translate_channels(
     runs: Path,
-    source: InputFile,
+    source: PulseFile,
     out: Path,
     options: TranslateOptions = DEFAULTS,
     **how: Any,

@@ -25,12 +25,12 @@ from typing import Any
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import stage
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, RunLike, as_run
 
 log = logging.getLogger(__name__)
@@ -44,13 +44,13 @@ _Outcomes = Generator[tuple["_Task", Told | str]]
 
 @dataclass(frozen=True)
 class _Task:
-    source: InputFile
+    source: PulseFile
     out: Path
 
 
 def translate_files(
     run: RunLike,
-    sources: Sequence[InputFile],
+    sources: Sequence[PulseFile],
     out: Path,
     options: TranslateOptions = DEFAULTS,
     *,

@@ -12,14 +12,14 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.common.inputs import InputFile
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.side import TRANSLATION
 from cpunet.training.run import Run
 
 Record = dict[str, Any]
 
 
-def source_print(source: InputFile) -> Record:
+def source_print(source: PulseFile) -> Record:
     """Names, sizes and modification times of the input files, and how they are read.
 
     Raises
@@ -47,7 +47,7 @@ def source_print(source: InputFile) -> Record:
     }
 
 
-def require_unchanged(source: InputFile, before: Record) -> None:
+def require_unchanged(source: PulseFile, before: Record) -> None:
     """Raise a `CpunetError` if a file changed since `before` was taken."""
     if source_print(source) != before:
         raise CpunetError(

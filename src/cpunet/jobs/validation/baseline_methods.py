@@ -13,11 +13,12 @@ from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputFile, InputSet
+from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.common.measured_noise import noise_of_traces
 from cpunet.jobs.common.measured_remains import measured_remains
 from cpunet.progress import stage
 from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 
 log = logging.getLogger(__name__)
@@ -48,7 +49,7 @@ class FittedBaselineMethods:
 def fit_baseline_methods(
     sim: InputSet,
     data: InputSet,
-    data_file: InputFile,
+    data_file: PulseFile,
     fit_on: EnergySelection,
     recipe: Recipe,
     *,

@@ -16,7 +16,6 @@ from cpunet.analysis.verdicts import summaries, verdict_table
 from cpunet.errors import CpunetError
 from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.common.inputs import (
-    InputFile,
     InputSet,
     load_measured,
     load_simulated,
@@ -38,6 +37,7 @@ from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
 from cpunet.progress import stage
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
@@ -110,7 +110,7 @@ class ValidateOptions:
 
 
 @one_thread_for_matrices()
-def evaluate(run: Run, sim: InputFile, data: InputFile, how: ValidateOptions) -> Evaluation:
+def evaluate(run: Run, sim: PulseFile, data: PulseFile, how: ValidateOptions) -> Evaluation:
     """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
 
     Raises
@@ -189,8 +189,8 @@ def evaluate(run: Run, sim: InputFile, data: InputFile, how: ValidateOptions) ->
 
 def _load_both(
     ren: REN,
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     names: list[str],
     how: ValidateOptions,
 ) -> tuple[InputSet, InputSet]:

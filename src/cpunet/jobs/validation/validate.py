@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpunet.analysis.report_folder import REPORT, VALUES
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.outputs import folder_written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, RunLike, as_run
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ AS_USUAL = ValidateOptions()
 
 def validate_run(
     run: RunLike,
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path,
     how: ValidateOptions = AS_USUAL,
     *,
@@ -65,8 +65,8 @@ def validate_run(
 
 def validated(
     run: RunLike,
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path | None,
     how: ValidateOptions = AS_USUAL,
     *,
@@ -74,7 +74,7 @@ def validated(
 ) -> tuple[Evaluation, dict[str, Drawing]]:
     """Like `validate_run`, also without `out`; return results, and functions that draw."""
     run = as_run(run)
-    sim, data = sim.as_before(run.sim), data.as_before(run.data)
+    sim, data = run.sim.reading(sim), run.data.reading(data)
     if out is None:
         found = evaluate(run, sim, data, how)
         return found, drawings(found)

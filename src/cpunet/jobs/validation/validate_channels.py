@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
-from cpunet.jobs.common.inputs import InputFile
 from cpunet.jobs.validation.compare import compare_reports
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import INFO
 
 AS_USUAL = ValidateOptions()
@@ -18,8 +18,8 @@ INDEX = "index.html"
 
 def validate_channels(
     runs: Path,
-    sim: InputFile,
-    data: InputFile,
+    sim: PulseFile,
+    data: PulseFile,
     out: Path,
     how: ValidateOptions = AS_USUAL,
     *,

@@ -13,8 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
 
@@ -57,7 +59,7 @@ class ArraySource(PulseSource):
     ``dt``), energies and event numbers, are columns.
     """
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         arrays = read_arrays(options.path)
         name = _waveform_name(options, arrays)
         self._values = arrays[name]
@@ -78,7 +80,25 @@ class ArraySource(PulseSource):
             yield Traces(self._values[start : start + size])
 
 
-def _waveform_name(options: ReadOptions, arrays: Arrays) -> str:
+class MemorySource(PulseSource):
+    """Pulses in memory."""
+
+    def __init__(self, options: PulseFile, pulses: Pulses) -> None:
+        self._in_memory = pulses
+        columns = {
+            "energy_kev": MemoryColumn(pulses.energy_kev),
+            "event_number": MemoryColumn(pulses.event_number),
+            "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
+        }
+        shape = pulses.waveforms.shape
+        super().__init__(options, Layout.of_array("memory", "", shape, columns))
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        for start in range(0, len(self._in_memory), size):
+            yield Traces(self._in_memory.waveforms[start : start + size])
+
+
+def _waveform_name(options: PulseFile, arrays: Arrays) -> str:
     matrices = [name for name, values in arrays.items() if values.ndim == 2]
     if options.table is not None:
         if options.table not in matrices:

@@ -15,7 +15,8 @@ from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 
 class FlashCamSource(PulseSource):
@@ -25,7 +26,7 @@ class FlashCamSource(PulseSource):
     The energy of the digitiser's own filter is not in keV and is not read.
     """
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         with _opened(options.path) as stream:
             n_channels = _n_channels(options.path, stream)
             length = int(stream.config.eventsamples)
@@ -121,7 +122,7 @@ def _next(path: Path, stream: FCIO) -> bool:
         raise CpunetError(f"{path}: damaged ({said}); copy it again") from error
 
 
-def _channel(options: ReadOptions, n_channels: int) -> int:
+def _channel(options: PulseFile, n_channels: int) -> int:
     known = [str(channel) for channel in range(n_channels)]
     if options.table is None:
         if n_channels == 1:

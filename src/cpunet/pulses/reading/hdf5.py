@@ -16,15 +16,16 @@ from lgdo import VectorOfVectors
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.pulses.reading.columns import shortened
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 # preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
-def open_hdf5(options: ReadOptions) -> PulseSource:
+def open_hdf5(options: PulseFile) -> PulseSource:
     """Open the waveforms of an HDF5 file, LH5 or not; see `opening.open_pulses`."""
     with opened(options.path) as file:
         if is_majorana(file):
@@ -36,7 +37,7 @@ def open_hdf5(options: ReadOptions) -> PulseSource:
 class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
-    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
             n_pulses = lh5.read_n_rows(self._values, file) or 0
@@ -85,7 +86,7 @@ class Lh5Source(PulseSource):
 class Hdf5Source(PulseSource):
     """A dataset of shape ``(events, samples)``, and the columns beside it."""
 
-    def __init__(self, options: ReadOptions, chosen: WaveformColumn) -> None:
+    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
         self._values = chosen.path
         with opened(options.path) as file:
             dataset = file[chosen.path]

@@ -19,7 +19,8 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.pulses.reading.columns import MemoryColumn, shortened
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -44,7 +45,7 @@ def detectors(file: h5py.File) -> list[str]:
 class MajoranaSource(PulseSource):
     """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         path = options.path
         with opened(path) as file:
             dataset = file[WAVEFORMS]
@@ -87,7 +88,7 @@ class MajoranaSource(PulseSource):
                 yield Traces(np.concatenate(waiting))
 
 
-def _rows(options: ReadOptions, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
+def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
     """Rows of the chosen detector, in order."""
     if options.table == WAVEFORMS:
         return np.arange(n)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.source import PulseSource, ReadOptions
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import PulseSource
 
 Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "pickle", "text"]
 
@@ -83,7 +84,15 @@ def open_pulses(
         If the file is missing, of an unknown format, damaged or without pulses, if `table` or
         `energy` is missing or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
     """
-    options = ReadOptions(Path(path), table, energy, kev_per_adc, dt_ns)
+    return open_file(PulseFile(Path(path), table, energy, kev_per_adc, dt_ns))
+
+
+def open_file(options: PulseFile) -> PulseSource:
+    """Like `open_pulses`; a file of pulses in memory is a source, too."""
+    if options.pulses is not None:
+        from cpunet.pulses.reading.arrays import MemorySource
+
+        return MemorySource(options, options.pulses)
     # readers are imported when needed: the LH5 library alone takes seconds to load
     match recognise(options.path):
         case "hdf5":

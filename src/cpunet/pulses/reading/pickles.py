@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
 _ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
@@ -184,7 +185,7 @@ class _PickledColumn:
 class PickleSource(PulseSource):
     """Pickled dictionaries, one after the other (streamed) or in lists (held one at a time)."""
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         if options.table is not None:
             raise CpunetError(
                 f"{options.path}: a file of pickled pulses has no tables; leave out --table"

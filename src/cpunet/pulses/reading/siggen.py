@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.columns import MemoryColumn
-from cpunet.pulses.reading.source import Layout, PulseSource, ReadOptions, Traces
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 # Radware's spectrum, written by siggen's `stester`: one Fortran record of 24 bytes
 # (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
@@ -27,7 +28,7 @@ _UNEVEN = 0.1  # of a step: times are printed with few digits
 class SpectrumSource(PulseSource):
     """A ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         path = options.path
         with path.open("rb") as file:
             header = file.read(_SPE.size)
@@ -64,7 +65,7 @@ class TextSource(PulseSource):
     ``signal:``, as printed by siggen, all numbers are one pulse.
     """
 
-    def __init__(self, options: ReadOptions) -> None:
+    def __init__(self, options: PulseFile) -> None:
         path = options.path
         first, second = [*islice(_lines(path), 2), None, None][:2]
         if first is None:

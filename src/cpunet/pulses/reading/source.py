@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,26 +14,11 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.columns import Column, require_length
 from cpunet.pulses.reading.energies import resolve_energies, resolve_sampling
+from cpunet.pulses.reading.files import PulseFile
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Options for reading a file; see `cpunet.pulses.reading.open_pulses`."""
-
-    path: Path
-    table: str | None = None
-    energy: str | None = None
-    kev_per_adc: float | None = None
-    dt_ns: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, value in (("--kev-per-adc", self.kev_per_adc), ("--dt-ns", self.dt_ns)):
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise CpunetError(f"{self.path}: {name} is {value}; expected more than 0")
 
 
 @dataclass(frozen=True)
@@ -106,7 +90,7 @@ class PulseSource(ABC):
         Samples per pulse.
     """
 
-    def __init__(self, options: ReadOptions, layout: Layout) -> None:
+    def __init__(self, options: PulseFile, layout: Layout) -> None:
         if layout.n_pulses == 0 or layout.length == 0:
             raise CpunetError(
                 f"{options.path}: {layout.table or layout.format} holds no pulses; "
