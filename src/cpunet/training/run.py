@@ -127,6 +127,7 @@ class FitInfo(_Part):
     covariance: list[list[float]] = []
     pulls: dict[str, float] = {}
     noise: dict[str, float] = {}
+    in_no_band: dict[str, int] = {}
     remains: RemainsInfo | None = None
 
     @property

@@ -69,9 +69,7 @@ class Matched(NamedTuple):
     model
         Module with ``ren`` and ``iren``.
     info
-        The entry on the fit for ``run.json``.
-    in_no_band
-        Number of pulses of each side that were not compared.
+        What a run keeps of the fit.
     recipe
         Recipe of the response as fitted: a ringing or a stretch may have been added.
     fit
@@ -82,7 +80,6 @@ class Matched(NamedTuple):
 
     model: nn.Module
     info: FitInfo
-    in_no_band: dict[str, int]
     recipe: Recipe
     fit: Fit
     remark: str | None
@@ -94,7 +91,7 @@ class Matched(NamedTuple):
             log.warning(self.remark)
         compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
         log.info(f"compared (simulated/measured pulses): {compared}")
-        beside = self.in_no_band
+        beside = info.in_no_band
         if any(beside.values()):
             log.info(
                 f"in no band, since one side has too few of their energies: {beside['sim']} "
@@ -164,8 +161,7 @@ def match(
     chain.remains = drawn
     iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
     model = nn.ModuleDict({"ren": chain, "iren": iren})
-    info = FitInfo.model_validate(told)
-    return Matched(model, info, told["in_no_band"], recipe, fit, remark)
+    return Matched(model, FitInfo.model_validate(told), recipe, fit, remark)
 
 
 def _described(
