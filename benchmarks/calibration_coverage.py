@@ -27,9 +27,9 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
-from cpunet.jobs.common.inputs import load_measured, load_simulated
-from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.electronics.measured_noise import measured_noise
 from cpunet.jobs.simulation.stored_simulation import StoredSimulation
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe

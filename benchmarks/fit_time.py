@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.jobs.common.inputs import load_measured, load_simulated
-from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.electronics.measured_noise import measured_noise
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe

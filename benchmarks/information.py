@@ -21,11 +21,11 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.jobs.common.inputs import load_measured, load_simulated
-from cpunet.jobs.common.measured_noise import measured_noise
+from cpunet.electronics.measured_noise import measured_noise
 from cpunet.jobs.training.chain_and_inverse import known_response
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare

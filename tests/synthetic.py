@@ -21,10 +21,10 @@ import torch
 from matplotlib.figure import Figure
 
 from cpunet.analysis.paired import PairedScores, pair_squares, scores_of_squares
+from cpunet.analysis.truth import Responses
 from cpunet.electronics.finishing import finish
-from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.common.truth import Responses
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes.schema import PreparationConfig, Recipe

@@ -19,9 +19,11 @@ __all__ = [
     "REN",
     "CalibratedRun",
     "CpunetError",
+    "FileOptions",
     "HitFile",
     "PulseFile",
     "Pulses",
+    "ReadOptions",
     "Report",
     "Run",
     "Translation",
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
     from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
-    from cpunet.pulses.reading.files import PulseFile
+    from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
     from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
@@ -54,7 +56,7 @@ _HOMES = {
     "calls.translations": ("Translation", "translate"),
     "errors": ("CpunetError",),
     "jobs.simulation.hit_sources": ("HitFile",),
-    "jobs.common.inputs": ("PulseFile",),
+    "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
     "training.run": ("Run",),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.jobs.common.inputs import load_measured, load_simulated
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe

@@ -15,7 +15,6 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.jobs.training.train import train_run
@@ -23,6 +22,7 @@ from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile

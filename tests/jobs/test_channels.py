@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.channels import (
+from cpunet.pulses.channels import (
     channel_names,
     channels_of,
     one_by_one,

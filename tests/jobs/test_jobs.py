@@ -10,25 +10,25 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.inputs import (
-    InputSet,
-    load_measured,
-    load_simulated,
-    require_same_sampling,
-)
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import (
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_same_sampling,
+)
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from synthetic import (
     KEV,

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 from threadpoolctl import threadpool_info
 
-from cpunet.jobs.common.matrices import one_thread_for_matrices
+from cpunet.matrices import one_thread_for_matrices
 
 
 def threads() -> list[int]:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cpunet.electronics.measured_noise import measured_noise, noise_of_traces
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.measured_noise import measured_noise, noise_of_traces
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import load_simulated
 from cpunet.jobs.simulation.hit_sources import (
     GammaSource,
     HitFile,
@@ -23,6 +22,7 @@ from cpunet.jobs.simulation.hit_sources import (
 )
 from cpunet.jobs.simulation.pulse_shape_library import write_library
 from cpunet.jobs.simulation.simulate import Resolution, simulate_file
+from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile

@@ -12,7 +12,6 @@ import torch
 
 from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import load_measured, load_simulated
 from cpunet.jobs.tune import (
     JOURNAL,
     UNCHANGED,
@@ -23,6 +22,7 @@ from cpunet.jobs.tune import (
     with_values,
 )
 from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe

@@ -142,7 +142,7 @@ def calibrate(
     """
     from cpunet.jobs.calibration.calibrate import Calibration
     from cpunet.jobs.calibration.calibration_inputs import Freedom
-    from cpunet.jobs.common.channels import ALL
+    from cpunet.pulses.channels import ALL
     from cpunet.recipes import load_recipe
 
     if read_as.data_table == ALL:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 from cpunet.cli.messages import tell
 
 if TYPE_CHECKING:
-    from cpunet.jobs.common.channels import Outcome
+    from cpunet.pulses.channels import Outcome
 
 R = TypeVar("R")
 

@@ -47,8 +47,8 @@ def check(
 
     Example: cpunet check --sim sim.lh5 --data raw.lh5 --data-table all
     """
-    from cpunet.jobs.common.channels import ALL, paired
     from cpunet.jobs.training.check import Checked, Level, check
+    from cpunet.pulses.channels import ALL, paired
 
     sides = read_as.sim(sim), read_as.data(data)
     if out_file is not None:

@@ -55,11 +55,11 @@ def train(
 
     Example: cpunet train --sim sim.lh5 --data raw.lh5 --data-table all --out runs
     """
-    from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.training.train import train_run
     from cpunet.jobs.training.train_channels import train_channels
     from cpunet.jobs.training.training_job import TrainOptions
     from cpunet.kernels import use_threads
+    from cpunet.pulses.channels import ALL, Outcome
     from cpunet.training.loop import StoppedError
 
     refuse_inputs(out_folder, on.recipe)

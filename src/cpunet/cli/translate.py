@@ -172,11 +172,11 @@ def translate(
 
     Example: cpunet translate runs sim.lh5 --table all --out translated/
     """
-    from cpunet.jobs.common.channels import ALL
     from cpunet.jobs.translation.translate import translate_file
     from cpunet.jobs.translation.translate_channels import translate_channels
     from cpunet.jobs.translation.translate_files import expanded, translate_files
     from cpunet.jobs.translation.translate_options import TranslateOptions
+    from cpunet.pulses.channels import ALL
     from cpunet.pulses.reading.files import PulseFile
 
     adc = adc_options.adc()

@@ -53,10 +53,10 @@ def validate(
 
     Example: cpunet validate runs --sim sim.lh5 --data raw.lh5 --data-table all --out reports
     """
-    from cpunet.jobs.common.channels import ALL, Outcome
     from cpunet.jobs.validation.evaluation import ValidateOptions
     from cpunet.jobs.validation.validate import validate_run
     from cpunet.jobs.validation.validate_channels import INDEX, validate_channels
+    from cpunet.pulses.channels import ALL, Outcome
 
     span = None
     if ae_range is not None:

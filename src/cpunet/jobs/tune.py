@@ -20,25 +20,25 @@ from torch import nn
 from cpunet.analysis.distances import null_distances, wasserstein
 from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.inputs import (
+from cpunet.jobs.training.chain_and_inverse import Sides, match
+from cpunet.jobs.training.cyclegan_trainer import outside_noise
+from cpunet.outputs import refuse_inputs, written_aside
+from cpunet.progress import stage
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import (
     InputSet,
     load_measured,
     load_simulated,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.training.chain_and_inverse import Sides, match
-from cpunet.jobs.training.cyclegan_trainer import outside_noise
-from cpunet.outputs import refuse_inputs, written_aside
-from cpunet.progress import stage
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import checked
 from cpunet.training.checkpoints import differences
+from cpunet.training.devices import resolve_device
 from cpunet.training.loop import train
 from cpunet.training.run import Run
 from cpunet.translation.learned_remains import LEARNED, wanted_remains

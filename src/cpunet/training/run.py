@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
 
 import torch
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
@@ -33,8 +33,7 @@ import cpunet
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.pulses.cuts import CutWindows
-from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.loading import Part, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.training.loop import Record
@@ -62,60 +61,14 @@ Network = TypeVar("Network", bound=nn.Module)
 _NOT_STORED: Any = {"exclude": True, "repr": False}
 
 
-class _Part(BaseModel):
-    """Further entries are kept as they are."""
-
-    model_config = ConfigDict(
-        extra="allow",
-        frozen=True,
-        strict=True,
-        allow_inf_nan=False,
-        arbitrary_types_allowed=True,
-    )
-
-
-class SideInfo(_Part):
-    """The pulses of one side of a training, as far as they are known.
-
-    Parameters
-    ----------
-    file, read_as, dt_ns
-        File, its reading options, and its sampling period in ns.
-    read, used, rejections
-        Number of pulses read, of those used (text if unknown), and of others by reason.
-    cuts
-        Quality cuts of measured pulses.
-    sha256
-        Fingerprint of the pulses used.
-    """
-
-    file: str | None = None
-    read_as: dict[str, Any] = {}
-    dt_ns: float | None = None
-    read: int | None = None
-    used: int | str | None = None
-    rejections: dict[str, int] = {}
-    cuts: Annotated[CutWindows | None, Field(strict=False)] = None
-    sha256: str | None = None
-
-    def reading(self, file: PulseFile) -> PulseFile:
-        """A file with the reading options that the training had for it as defaults."""
-        told = self.read_as
-        if self.file is None or Path(self.file).resolve() != file.path.resolve():
-            return file
-        if any(told.get(name) != value for name, value in file.options.items()):
-            return file
-        return replace(file, **told)
-
-
-class RemainsInfo(_Part):
+class RemainsInfo(Part):
     """What was measured of remains of earlier pulses, and what to draw them from."""
 
     rate_khz: float = 0.0
     drawn: dict[str, Any] | None = None
 
 
-class FitInfo(_Part):
+class FitInfo(Part):
     """Fit of a readout chain: its parameters, their errors and covariance, and its quality."""
 
     chi_square: float | None = None
@@ -138,7 +91,7 @@ class FitInfo(_Part):
         return self.chi_square / self.moments
 
 
-class Run(_Part):
+class Run(Part):
     """A training run, returned by `cpunet.train` or opened with `Run.load`.
 
     Parameters

@@ -23,6 +23,8 @@ from cpunet.calibration.nuisances import Physics, known_before
 from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
 from cpunet.calibration.titles import titled
+from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured_remains import drawn_like, measured_remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibration_inputs import (
     DEPLETION,
@@ -32,17 +34,15 @@ from cpunet.jobs.calibration.calibration_inputs import (
     known_depletion,
     read_sides,
 )
-from cpunet.jobs.common.inputs import load_simulated
-from cpunet.jobs.common.matrices import one_thread_for_matrices
-from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.measured_remains import drawn_like, measured_remains
-from cpunet.jobs.common.memory import keep_freed_memory
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.jobs.training.response_trainer import train_chain
 from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
+from cpunet.matrices import one_thread_for_matrices
+from cpunet.memory import keep_freed_memory
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.progress import stage
+from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector

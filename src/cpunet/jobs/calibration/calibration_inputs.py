@@ -12,16 +12,16 @@ import numpy as np
 
 from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import (
+from cpunet.jobs.simulation.hit_sources import HitFile
+from cpunet.jobs.simulation.simulate import simulate_file
+from cpunet.jobs.simulation.stored_simulation import StoredSimulation
+from cpunet.pulses.loading import (
     InputSet,
     load_measured,
     load_simulated,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.simulation.hit_sources import HitFile
-from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe

@@ -13,11 +13,11 @@ import cpunet
 from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.channels import ALL, channels_of
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
 from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.inspection.trace_properties import BLOCK, trace_properties
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.pulses.channels import ALL, channels_of
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.preparation import Kind

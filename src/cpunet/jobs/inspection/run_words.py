@@ -10,7 +10,8 @@ from cpunet.analysis.nested_tables import with_std
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import noise_kev
 from cpunet.jobs.inspection.info_words import Lines, counted, percent, remains_lines, short
-from cpunet.training.run import FitInfo, Run, SideInfo
+from cpunet.pulses.loading import SideInfo
+from cpunet.training.run import FitInfo, Run
 
 PARTS = 8  # maximum number of deviating parts of a fit
 UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured_remains import FoundRemains, find_remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.common.measured_noise import measured_noise
-from cpunet.jobs.common.measured_remains import FoundRemains, find_remains
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe

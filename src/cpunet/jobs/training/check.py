@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import (
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import (
     InputSet,
     load_measured,
     load_simulated,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
-from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Rejection

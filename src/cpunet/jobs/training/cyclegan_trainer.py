@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.measured_noise import measured_noise
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.measured_noise import measured_noise
 from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
 from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.progress import stage

@@ -17,12 +17,13 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import SideInfo
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.pickles import PickledPulse, TruncatedError, as_pulse, entries
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run import Run, SideInfo, versions
+from cpunet.training.run import Run, versions
 from cpunet.translation.published import read_discriminator, read_generator
 
 BLOCK = 1024

@@ -11,25 +11,25 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.inputs import (
+from cpunet.jobs.training.check import Level, compare_sides
+from cpunet.jobs.training.cyclegan_trainer import train_networks
+from cpunet.jobs.training.response_trainer import train_chain
+from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
+from cpunet.matrices import one_thread_for_matrices
+from cpunet.memory import keep_freed_memory
+from cpunet.outputs import folder_written_aside
+from cpunet.pulses.loading import (
     InputSet,
     load_measured,
     load_simulated,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.jobs.common.matrices import one_thread_for_matrices
-from cpunet.jobs.common.memory import keep_freed_memory
-from cpunet.jobs.training.check import Level, compare_sides
-from cpunet.jobs.training.cyclegan_trainer import train_networks
-from cpunet.jobs.training.response_trainer import train_chain
-from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
-from cpunet.outputs import folder_written_aside
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import unfinished_folder
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import RUN, Run, as_run
 
 log = logging.getLogger(__name__)

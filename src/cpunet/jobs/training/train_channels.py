@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
+from cpunet.pulses.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import unfinished_name

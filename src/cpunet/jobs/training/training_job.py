@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import nn
 
-from cpunet.jobs.common.devices import peak_memory_mb
-from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.training.chain_and_inverse import Sides
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
+from cpunet.training.devices import peak_memory_mb
 from cpunet.training.run import Run, RunLike, versions
 
 

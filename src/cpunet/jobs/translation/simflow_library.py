@@ -19,7 +19,6 @@ import numpy.typing as npt
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
@@ -31,6 +30,7 @@ from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.low_rank import MOST, Loss, components

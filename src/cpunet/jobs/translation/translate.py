@@ -12,8 +12,6 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.memory import give_back_large_arrays
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.jobs.translation.translation_blocks import (
     NOISE_ROWS,
@@ -29,6 +27,7 @@ from cpunet.jobs.translation.translation_record import (
     run_print,
     source_print,
 )
+from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
@@ -37,6 +36,7 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.writing import PulseWriter
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
 from cpunet.translation.output_form import Formed, Normalised, OutputForm

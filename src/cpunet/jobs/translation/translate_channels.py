@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from cpunet.jobs.common.channels import Outcome, Pair, channels_of, one_by_one, own_folder
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
+from cpunet.pulses.channels import Outcome, Pair, channels_of, one_by_one, own_folder
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import INFO
 

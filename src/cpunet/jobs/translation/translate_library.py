@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.hdf5_files import opened
-from cpunet.jobs.common.devices import resolve_device
 from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
 from cpunet.jobs.translation.library_file import (
     WAVEFORM,
@@ -28,6 +27,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.reading.source import BLOCK_BYTES
 from cpunet.pulses.writing import FileInTheMaking
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN

@@ -12,11 +12,11 @@ from cpunet.electronics.baseline_methods.base import BaselineMethod
 from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
+from cpunet.electronics.measured_noise import noise_of_traces
+from cpunet.electronics.measured_remains import measured_remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.common.measured_noise import noise_of_traces
-from cpunet.jobs.common.measured_remains import measured_remains
 from cpunet.progress import stage
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe

@@ -10,7 +10,7 @@ import numpy as np
 
 from cpunet.analysis.ae_energy import against_energy
 from cpunet.analysis.range_survival import survival_by_range
-from cpunet.jobs.common.inputs import InputSet
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe

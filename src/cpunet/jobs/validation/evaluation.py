@@ -12,17 +12,9 @@ import numpy as np
 
 import cpunet
 from cpunet.analysis.linearity import linearity_residual
+from cpunet.analysis.truth import Responses
 from cpunet.analysis.verdicts import summaries, verdict_table
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.devices import resolve_device
-from cpunet.jobs.common.inputs import (
-    InputSet,
-    load_measured,
-    load_simulated,
-    require_same_sampling,
-)
-from cpunet.jobs.common.matrices import one_thread_for_matrices
-from cpunet.jobs.common.truth import Responses
 from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
 from cpunet.jobs.validation.energy_ranges import (
     Range,
@@ -35,10 +27,18 @@ from cpunet.jobs.validation.peak_sets import PeakSets, current_amplitudes, peak_
 from cpunet.jobs.validation.pulse_tests import survivals
 from cpunet.jobs.validation.scoring import ByMethod, score_peak
 from cpunet.jobs.validation.translations import translate_all
+from cpunet.matrices import one_thread_for_matrices
 from cpunet.progress import stage
+from cpunet.pulses.loading import (
+    InputSet,
+    load_measured,
+    load_simulated,
+    require_same_sampling,
+)
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
+from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
 

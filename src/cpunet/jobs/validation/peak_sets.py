@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from cpunet.analysis.paired import PairedScores, scores_of_squares
 from cpunet.analysis.style import NO_NOISE
-from cpunet.jobs.common.inputs import InputSet
 from cpunet.jobs.validation.translations import Translations
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe

@@ -14,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.analysis.paired import pair_squares
+from cpunet.analysis.truth import Responses
 from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.drawn_remains import SameNoise
 from cpunet.electronics.finishing import blocks, finish, finish_both
-from cpunet.jobs.common.inputs import InputSet
-from cpunet.jobs.common.truth import Responses
 from cpunet.jobs.validation.baseline_methods import FittedBaselineMethods
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.learned_remains import LEARNED, wanted_remains

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from cpunet.jobs.common.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.jobs.validation.compare import compare_reports
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
+from cpunet.pulses.channels import Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import INFO
 

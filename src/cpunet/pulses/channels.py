@@ -103,6 +103,17 @@ class Outcome(Generic[R]):
     done: dict[str, R] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def ok(self) -> bool:
+        """Whether no channel failed."""
+        return not self.failed
+
+    def __str__(self) -> str:
+        lines = {name: str(found) for name, found in self.done.items()}
+        lines |= {name: f"failed: {reason}" for name, reason in self.failed.items()}
+        width = max(map(len, lines), default=0)
+        return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
+
     def require_all(self, out: Path) -> None:
         """Raise a `CpunetError` with the number of failed channels, if any failed."""
         if not self.failed:

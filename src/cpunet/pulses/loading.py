@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
@@ -22,7 +23,6 @@ from cpunet.pulses.sets import load_prepared
 from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import Recipe
-from cpunet.training.run import SideInfo
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +31,52 @@ Energies = npt.NDArray[np.float64]
 MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+
+
+class Part(BaseModel):
+    """Further entries are kept as they are."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+    )
+
+
+class SideInfo(Part):
+    """The pulses of one side of a training, as far as they are known.
+
+    Parameters
+    ----------
+    file, read_as, dt_ns
+        File, its reading options, and its sampling period in ns.
+    read, used, rejections
+        Number of pulses read, of those used (text if unknown), and of others by reason.
+    cuts
+        Quality cuts of measured pulses.
+    sha256
+        Fingerprint of the pulses used.
+    """
+
+    file: str | None = None
+    read_as: dict[str, Any] = {}
+    dt_ns: float | None = None
+    read: int | None = None
+    used: int | str | None = None
+    rejections: dict[str, int] = {}
+    cuts: Annotated[CutWindows | None, Field(strict=False)] = None
+    sha256: str | None = None
+
+    def reading(self, file: PulseFile) -> PulseFile:
+        """A file with the reading options that the training had for it as defaults."""
+        told = self.read_as
+        if self.file is None or Path(self.file).resolve() != file.path.resolve():
+            return file
+        if any(told.get(name) != value for name, value in file.options.items()):
+            return file
+        return replace(file, **told)
 
 
 @dataclass(frozen=True, eq=False)

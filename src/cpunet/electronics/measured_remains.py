@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cpunet.electronics.drawn_remains import DrawnRemains, passing
+from cpunet.electronics.extension import PADDING_BEFORE
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputSet
-from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import PreparationConfig
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from cpunet.electronics.finishing import BLOCK
 from cpunet.errors import CpunetError
-from cpunet.jobs.common.inputs import InputSet
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.arrays import read_arrays
 
 _NAME = "response"
