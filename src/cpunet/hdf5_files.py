@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
-
-# The package provides the compression filters of LEGEND's files.
-from lh5.io.exceptions import LH5DecodeError
+import hdf5plugin  # noqa: F401 - provides the compression filters of LEGEND's files
 
 from cpunet.errors import CpunetError
 
@@ -32,12 +31,29 @@ def opened(path: Path) -> Iterator[h5py.File]:
         raise
     except FileNotFoundError:
         raise CpunetError(f"{path}: no such file; check the name") from None
-    except (OSError, RuntimeError, ValueError, LH5DecodeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         text = " ".join(str(error).split())
         if "file signature not found" in text:
             raise CpunetError(f"{path}: not an HDF5 file; give an LH5 or HDF5 file") from error
         what = "is truncated" if "truncated" in text else f"cannot be read ({text[:160]})"
         raise CpunetError(f"{path}: {what}; copy or write it again") from error
+
+
+def lh5_rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> Any:
+    """Rows of an LH5 object through LEGEND's library, which decodes compressed traces.
+
+    Raises
+    ------
+    ValueError
+        If the library cannot decode the object.
+    """
+    import lh5  # a second, which plain arrays do not need
+    from lh5.io.exceptions import LH5DecodeError
+
+    try:
+        return lh5.read(item.name, item.file, start_row=start, n_rows=n)
+    except LH5DecodeError as error:
+        raise ValueError(str(error)) from error
 
 
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:

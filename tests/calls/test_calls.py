@@ -64,7 +64,7 @@ def test_importing_is_light_and_all_is_there():
     assert done.stdout.strip() == "[]", done.stderr
     for name in cpunet.__all__:
         assert getattr(cpunet, name) is not None
-    assert set(cpunet.__all__) <= set(dir(cpunet))
+    assert dir(cpunet) == sorted(cpunet.__all__)
     with pytest.raises(AttributeError, match="no attribute 'tran'"):
         _ = cpunet.tran
 

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 
@@ -35,6 +37,34 @@ def test_the_help_does_not_load_torch():
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["pulses.lh5", "pulses.h5", "pulses.npy", "pulses.npz"])
+def test_plain_files_load_neither_torch_nor_the_lh5_library(stand, tmp_path, name):
+    """A look at a file waits for nothing that networks, compressed traces or figures need."""
+    file, traces = tmp_path / name, stand.data_waveforms
+    if name.endswith(".lh5"):
+        stand.write(file, "geds/raw", traces, stand.data_kev)
+    elif name.endswith(".h5"):
+        with h5py.File(file, "w") as out:
+            out["waveforms"], out["energy_kev"] = traces, stand.data_kev
+    elif name.endswith(".npz"):
+        np.savez(file, waveforms=traces, energy_kev=stand.data_kev)
+    else:
+        np.save(file, traces)
+    period = [] if name.endswith(".lh5") else ["--dt-ns", "16"]
+    program = (
+        "import sys, cpunet.cli.main as program\n"
+        f"sys.argv[1:] = {['info', str(file), *period]}\n"
+        "try:\n    program.main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "heavy = {'torch', 'lh5', 'lgdo', 'dspeed', 'pandas', 'matplotlib', 'hist'}\n"
+        "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{len(traces)} of {traces.shape[1]} samples, every 16 ns" in done.stdout
 
 
 @pytest.mark.thorough

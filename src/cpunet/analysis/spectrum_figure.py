@@ -2,35 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.analysis.style import COLOURS, DATA_FILL, styled
-from cpunet.pulses.spectrum import SOURCES, Suggestion, Values
+from cpunet.pulses.spectrum import SOURCES, Spectrum
 
 BINS = 1000
 HIGHEST = 0.999  # quantile of the values; the axis ends a little above it
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Energies in keV, or amplitudes in ADC counts if no energy is known.
-
-    Parameters
-    ----------
-    values
-        One per pulse, shape ``(n,)``.
-    in_kev
-        Whether they are energies.
-    found
-        Lines found, and the calibration that gives them the right energies.
-    """
-
-    values: Values
-    in_kev: bool
-    found: Suggestion | None
 
 
 @styled

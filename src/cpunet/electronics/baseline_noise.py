@@ -14,24 +14,24 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-import scipy.cluster.vq
 import scipy.fft
 
+from cpunet.electronics.baseline_tails import (
+    MIN_N,
+    SHORTEST_SHARE,
+    SIGMA_PER_MAD,
+    samples_before_pulses,
+)
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.noise_spectrum import FIRST_CLEAN_BIN, spectrum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Prepared, prepare
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
 MIN_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
-MIN_N = 30  # minimum number of flat baselines
-SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
-# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
-START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
 TRACES = 64  # drawn at a time, to bound memory
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and number of iterations
-SIGMA_PER_MAD = 1.4826
 # Baselines are clustered along directions in which their band powers spread this many times
 # more than those of baselines from a single spectrum.
 KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
@@ -275,6 +275,8 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     The features are the logarithms of the power in bands, along directions in which their
     spread exceeds that of baselines drawn from the mean spectrum.
     """
+    import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
+
     one = np.zeros(len(flat), np.intp)
     kinds = min(KINDS, len(flat) // MIN_N)
     bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
@@ -331,18 +333,6 @@ def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
     return np.asarray(
         (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
     )
-
-
-def samples_before_pulses(
-    prepared: Prepared, config: PreparationConfig
-) -> npt.NDArray[np.int64]:
-    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
-    windows = prepared.pulses.waveforms[:, : config.samples_before]
-    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
-    above = windows >= level[:, np.newaxis]
-    # Start of the pulse proper: every sample from there to the alignment is above threshold.
-    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
-    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:

@@ -1,13 +1,20 @@
-"""Level and tilt of baselines, and the tails of earlier pulses that they indicate."""
+"""Length, level and tilt of baselines, and the tails of earlier pulses that they indicate."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import MIN_N, SIGMA_PER_MAD
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
+from cpunet.pulses.preparation import Prepared
+from cpunet.recipes.schema import PreparationConfig
 
+MIN_N = 30  # minimum number of baselines
+SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
+# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
+START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
+SIGMA_PER_MAD = 1.4826
 MIN_LARGE = 20  # minimum number of large remainders to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
 # that of a remainder.
@@ -15,6 +22,18 @@ COUPLED = 2.5
 # Number of Gaussian standard deviations of the residual RMS beyond which a baseline holds
 # another pulse.
 DISTURBED = 6.0
+
+
+def samples_before_pulses(
+    prepared: Prepared, config: PreparationConfig
+) -> npt.NDArray[np.int64]:
+    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
+    windows = prepared.pulses.waveforms[:, : config.samples_before]
+    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+    above = windows >= level[:, np.newaxis]
+    # Start of the pulse proper: every sample from there to the alignment is above threshold.
+    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
+    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
 
 
 def tail_shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:

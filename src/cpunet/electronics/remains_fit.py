@@ -14,13 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import scipy.optimize
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_law import RemainsLaw, characteristic_exponents
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 Function = Callable[[FloatArray], float]
 
@@ -247,7 +250,9 @@ def _weights(energies: FloatArray, fixed: FloatArray | None, vector: FloatArray)
     return np.asarray(weights / weights.sum(), float)
 
 
-def _minimum(function: Function, start: Sequence[float]) -> scipy.optimize.OptimizeResult:
+def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
+    import scipy.optimize  # costs more than all the rest, and few channels come so far
+
     steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
     simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.special
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
@@ -122,6 +121,8 @@ def characteristic_exponents(
     >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
     [[0.001]]
     """
+    import scipy.special  # a fifth of a second, for those who look for remains only
+
     phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
     sine, cosine = scipy.special.sici(phase)
     return np.asarray(1j * sine - (np.euler_gamma + np.log(phase) - cosine))

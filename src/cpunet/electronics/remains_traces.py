@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import MIN_N, SHORTEST_SHARE, samples_before_pulses
+from cpunet.electronics.baseline_tails import MIN_N, SHORTEST_SHARE, samples_before_pulses
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses

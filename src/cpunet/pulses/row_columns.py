@@ -12,7 +12,7 @@ import lh5
 import numpy as np
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
-from cpunet.hdf5_files import opened, text_attribute
+from cpunet.hdf5_files import lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
@@ -118,7 +118,7 @@ def repeated(column: LGDO, repeats: int) -> LGDO:
 
 def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:
     if text_attribute(item, "datatype"):
-        return lh5.read(item.name, item.file, start_row=start, n_rows=n)
+        return lh5_rows(item, start, n)
     attrs = {"units": units} if (units := text_attribute(item, "units")) else {}
     if item.ndim == 0:
         return Array(np.full(n, item[()]), attrs=attrs)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 Values = npt.NDArray[np.float64]
 
@@ -98,6 +98,25 @@ class Suggestion(NamedTuple):
         return f"{self.source} ({lines} keV) at --kev-per-adc {self.kev_per_adc:.4g}"
 
 
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Energies in keV, or amplitudes in ADC counts if no energy is known.
+
+    Parameters
+    ----------
+    values
+        One per pulse, shape ``(n,)``.
+    in_kev
+        Whether they are energies.
+    found
+        Lines found, and the calibration that gives them the right energies.
+    """
+
+    values: Values
+    in_kev: bool
+    found: Suggestion | None
+
+
 def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     """Search a spectrum of amplitudes for the lines of calibration sources.
 
@@ -148,6 +167,8 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
 
 def _excess(counts: npt.NDArray[np.integer]) -> Values:
     """Excess of the counts of three bins over their background, in standard deviations."""
+    import scipy.ndimage  # a fifth of a second, for those who search only
+
     beside = scipy.ndimage.median_filter(counts.astype(float), 2 * BACKGROUND + 1)
     smooth = scipy.ndimage.uniform_filter1d(counts.astype(float), 2 * BACKGROUND + 1)
     under = 3 * np.maximum(beside, 0.3 * smooth)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 import cpunet
-from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
@@ -27,8 +26,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import table_sizes
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.side import MADE_BY, SIDE, apparent_side, recorded_side
-from cpunet.pulses.spectrum import Values, suggested_calibration
-from cpunet.pulses.writing import PulseWriter
+from cpunet.pulses.spectrum import Spectrum, Values, suggested_calibration
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
@@ -148,6 +146,8 @@ def describe(
                 f"{path}: no spectrum to draw; give the --table of one detector's pulses, or "
                 "leave out --out"
             )
+        from cpunet.analysis.spectrum_figure import spectrum_figure  # loads matplotlib
+
         figure = spectrum_figure(spectrum)
         with written_aside(out) as aside:
             figure.savefig(aside, format=out.suffix[1:].lower(), dpi=DPI)
@@ -243,6 +243,8 @@ def _side(source: PulseSource) -> Kind | None:
 
 def _write_without(source: PulseSource, remains: Remains, out: Path, *, force: bool) -> None:
     """Write the traces after subtraction of their remains, with the remains as columns."""
+    from cpunet.pulses.writing import PulseWriter  # loads the LH5 library: a second
+
     attrs = {MADE_BY: f"cpunet info {cpunet.__version__}", SIDE: "measured"}
     with PulseWriter(
         out, table="geds/raw", waveform_units="ADC", attrs=attrs, force=force

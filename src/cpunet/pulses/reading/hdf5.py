@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import lh5
 import numpy as np
 import numpy.typing as npt
-from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.columns import shortened
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
@@ -40,7 +38,7 @@ class Lh5Source(PulseSource):
     def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
-            n_pulses = lh5.read_n_rows(self._values, file) or 0
+            n_pulses = _n_rows(file[self._values])
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             layout = Layout(
                 format="LH5",
@@ -61,10 +59,11 @@ class Lh5Source(PulseSource):
     def _rows(
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
-        # lh5 decodes LEGEND's encoded waveforms; it reads only the requested rows.
-        values = lh5.read(self._values, file, start_row=start, n_rows=size)
-        if not isinstance(values, VectorOfVectors):
-            traces = np.asarray(values.nda)
+        item = file[self._values]
+        plain = isinstance(item, h5py.Dataset)
+        values = item[start : start + size] if plain else lh5_rows(item, start, size)
+        if not hasattr(values, "cumulative_length"):
+            traces = np.asarray(getattr(values, "nda", values))
             if traces.ndim != 2 or traces.dtype.kind not in "iuf":
                 raise CpunetError(
                     f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
@@ -132,6 +131,13 @@ class Hdf5Column:
             if self.constant:
                 return np.full(stop - start, file[self.dataset][()])
             return np.asarray(file[self.dataset][start:stop])
+
+
+def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
+    """Number of traces; a group holds them encoded, or as vectors of their own lengths."""
+    if isinstance(values, h5py.Group):
+        values = values.get("encoded_data", values).get("cumulative_length")
+    return int(values.shape[0]) if values is not None and values.ndim else 0
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:

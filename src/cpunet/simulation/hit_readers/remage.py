@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import lh5
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
 from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
 
 _AXES = ("xloc", "yloc", "zloc")
@@ -117,9 +116,7 @@ def _read(path: Path, name: str, rows: slice) -> dict[str, Any]:
                 raise CpunetError(
                     f"{path}: {name} has no column {column}; choose a germanium detector"
                 )
-            table[column] = lh5.read(
-                item.name, item.file, start_row=rows.start, n_rows=rows.stop - rows.start
-            )
+            table[column] = lh5_rows(item, rows.start, rows.stop - rows.start)
     return table
 
 
