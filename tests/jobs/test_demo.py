@@ -80,6 +80,17 @@ def test_every_rival_and_the_truth_stand_beside_the_ren(
 
 
 @pytest.mark.thorough
+def test_a_quick_look_has_three_figures_and_says_what_it_is(interrupted: Path) -> None:
+    demonstrate(**OPTIONS, out=interrupted, quick=True)
+    report = interrupted / "report"
+    drawn = {path.stem for path in report.glob("*.png")}
+    assert drawn == {"SEP_mean_pulse", "SEP_current_amplitude", "SEP_single_pulse"}
+    page = (report / "report.html").read_text()
+    assert "This is a quick look" in page
+    assert all(peak in page for peak in EVENTS)
+
+
+@pytest.mark.thorough
 def test_finished_parts_are_kept_and_a_whole_one_is_refused(
     whole: tuple[Path, dict[str, Any]], interrupted: Path
 ) -> None:

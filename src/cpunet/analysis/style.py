@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.container import Container
     from matplotlib.figure import Figure
@@ -125,12 +126,23 @@ def _group_legends(figure: Figure) -> None:
     from matplotlib.legend import Legend
     from matplotlib.offsetbox import HPacker, TextArea
 
-    ids = {artist.get_gid() or "" for artist in figure.findobj()}
+    artists = list(_without_ticks(figure))
+    ids = {artist.get_gid() or "" for artist in artists}
     by_label = {label(i.removeprefix(GROUP)): i for i in sorted(ids) if i.startswith(GROUP)}
-    for legend in figure.findobj(Legend):
+    for legend in (artist for artist in artists if isinstance(artist, Legend)):
         for entry in legend.findobj(HPacker):
             for text in entry.get_children():
                 if isinstance(text, TextArea):
                     begins = [name for name in by_label if text.get_text().startswith(name)]
                     for artist in entry.findobj() if begins else ():
                         artist.set_gid(by_label[max(begins, key=len)])
+
+
+def _without_ticks(artist: Artist) -> Iterator[Artist]:
+    """An artist and its children, but no scales: asked for their ticks, they make them."""
+    from matplotlib.axis import Axis
+
+    yield artist
+    for child in artist.get_children():
+        if not isinstance(child, Axis):
+            yield from _without_ticks(child)

@@ -10,10 +10,11 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import tell
 from cpunet.cli.scores import print_scores
-from cpunet.cli.stand import Events, Kind, KindOption, Preset
+from cpunet.cli.stand import Kind, KindOption, Preset
 from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
 
+EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=700,SEP=250,DEP=250"
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
 RecipeName = Annotated[
     str, typer.Option("--recipe", help="fast, paper, or a YAML file of your own.")
@@ -22,16 +23,27 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a value: --set training.steps=30 (repeatable)."),
 ]
+Quick = Annotated[
+    bool, typer.Option("--quick", help=f"A quick look: {FEW}, scores and three figures.")
+]
+Events = Annotated[
+    str | None,
+    typer.Option(
+        help="Events of each peak or range (keV), for sim and data each.",
+        show_default=f"{EVENTS}",
+    ),
+]
 
 
 def demo(
     out_folder: Out = Path("demo"),
     preset: Preset = "legend200",
     detector: options.DetectorFile = "icpc",
-    events: Events = "FEP=2500,SEP=1000,DEP=1000",
+    events: Events = None,
     kind: KindOption = Kind.matched,
     recipe: RecipeName = "fast",
     set_values: Set = None,
+    quick: Quick = False,
     seed: options.Seed = 0,
     device: options.Device = "auto",
     force: options.Force = False,
@@ -39,6 +51,8 @@ def demo(
     """Simulate, digitise, train, translate and validate on a stand with a known answer.
 
     Example: cpunet demo --out demo
+
+    Example: cpunet demo --quick
 
     Example: cpunet demo --preset ornl --kind shifted --out demo2
     """
@@ -50,7 +64,7 @@ def demo(
 
     for part in PARTS:
         refuse_inputs(out_folder / part, preset, detector, recipe)
-    names, numbers = wanted_events(events)
+    names, numbers = wanted_events(events or (FEW if quick else EVENTS))
     metrics = demonstrate(
         read_electronics(preset),
         read_detector(detector),
@@ -61,6 +75,7 @@ def demo(
         seed=seed,
         device=device,
         force=force,
+        quick=quick,
     )
     print_scores(metrics, leave_out=("FEP",))
     tell(f"{out_folder / 'report' / 'report.html'}")

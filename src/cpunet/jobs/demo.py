@@ -35,6 +35,7 @@ def demonstrate(
     seed: int = 0,
     device: str = "auto",
     force: bool = False,
+    quick: bool = False,
 ) -> dict[str, Any]:
     """Make a stand, train on its FEP, and score every method on all its lines.
 
@@ -51,6 +52,8 @@ def demonstrate(
         with the same options are kept.
     force
         Whether to make all parts again.
+    quick
+        Whether the report is a quick look, see `ValidateOptions`.
     seed, device
         See `cpunet.jobs.training.train.train_run`.
 
@@ -100,5 +103,5 @@ def demonstrate(
         sim,
         data,
         report,
-        ValidateOptions(stand / "truth.npz", seed=seed, device=device),
+        ValidateOptions(stand / "truth.npz", seed=seed, device=device, quick=quick),
     )

@@ -99,6 +99,8 @@ class ValidateOptions:
         Maximum number of pulses per side; of larger sets, a random sample is compared.
     device
         ``"cpu"``, ``"cuda"`` or ``"auto"``.
+    quick
+        Whether the report is a quick look: with a few figures only, and a note that says so.
     """
 
     truth: Path | None = None
@@ -107,6 +109,7 @@ class ValidateOptions:
     ae_range_kev: Range | None = None
     most: int = MOST_PULSES
     device: str = "auto"
+    quick: bool = False
 
 
 @one_thread_for_matrices()

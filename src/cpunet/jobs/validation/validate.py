@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from cpunet.jobs.validation.drawings import Drawing
 
 AS_USUAL = ValidateOptions()
+GLANCE = ("mean pulse", "current_amplitude", "single pulse")  # figures of a quick look
+QUICK_LOOK = (
+    "This is a quick look: with so few events the response is not well learned, and scores "
+    "scatter by several points. The whole demonstration has more events and all figures."
+)
 
 
 def validate_run(
@@ -82,6 +87,8 @@ def validated(
     with folder_written_aside(out, REPORT, *read, force=force) as folder:
         found = evaluate(run, sim, data, how)
         to_draw = drawings(found)
+        if how.quick:
+            to_draw = {name: to_draw[name] for name in _at_a_glance(found, to_draw)}
         found.forget_noisy()
         from cpunet.analysis.report import write_report
 
@@ -94,7 +101,7 @@ def validated(
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         with stage("Drawing", len(to_draw)) as bar:
-            notes = _notes(run, found.metrics, how.truth)
+            notes = _notes(run, found.metrics, how)
             figures = {name: partial(_drawn, one, bar) for name, one in to_draw.items()}
             write_report(folder, found.metrics, WhenAsked(figures), notes)
     return found, to_draw
@@ -106,6 +113,13 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     from cpunet.jobs.validation import drawings as figures
 
     return figures.drawings(found)
+
+
+def _at_a_glance(found: Evaluation, names: Container[str]) -> list[str]:
+    """Figures of a quick look, of the first peak that took no part in the training."""
+    scored = [peak for peak in found.values if found.values[peak]]
+    peak = next((peak for peak in scored if peak != found.run.peak), scored[0])
+    return [name for what in GLANCE if (name := f"{peak} {what}") in names]
 
 
 def _of_remains(metrics: Mapping[str, Any]) -> list[str]:
@@ -132,14 +146,15 @@ def _drawn(drawing: Drawing, bar: Stage) -> Figure:
     return figure
 
 
-def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
-    notes = [
+def _notes(run: Run, metrics: Mapping[str, Any], how: ValidateOptions) -> list[str]:
+    notes = [QUICK_LOOK] if how.quick else []
+    notes += [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
     ]
     notes += _of_remains(metrics)
-    if truth is None:
+    if how.truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
     return notes
