@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 import cpunet
-from cpunet.analysis.spectrum_figure import Spectrum, spectrum_figure
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.hits_info import Units, describe_hits
@@ -32,6 +31,7 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
+from cpunet.validation.spectrum_figure import Spectrum, spectrum_figure
 
 _RUN_FILE = "run.json"
 # what other folders are, by a file that they hold
