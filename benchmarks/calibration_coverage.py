@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.analysis.style import styled
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
@@ -35,6 +34,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.training.pulse_sets import PulseSets
+from cpunet.validation.style import styled
 
 
 @styled

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from cpunet.analysis.paired import align_half_maximum
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
+from cpunet.validation.paired import align_half_maximum
 
 Values = npt.NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cpunet.analysis.remains_figure import Slopes, remains_figure
 from cpunet.electronics.remains import Remains
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
+from cpunet.validation.remains_figure import Slopes, remains_figure
 
 
 def main() -> None:

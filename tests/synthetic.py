@@ -20,8 +20,6 @@ import scipy.signal
 import torch
 from matplotlib.figure import Figure
 
-from cpunet.analysis.paired import PairedScores, pair_squares, scores_of_squares
-from cpunet.analysis.truth import Responses
 from cpunet.electronics.finishing import finish
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
@@ -29,6 +27,8 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.run import Run
+from cpunet.validation.paired import PairedScores, pair_squares, scores_of_squares
+from cpunet.validation.truth import Responses
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0

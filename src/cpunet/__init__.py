@@ -2,7 +2,7 @@
 
 Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
 ``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
-``analysis`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
+``validation`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
 """
 
 from __future__ import annotations

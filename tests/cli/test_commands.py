@@ -14,13 +14,13 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
-from cpunet.analysis.report_folder import REPORT
 from cpunet.cli.main import main
 from cpunet.jobs.validation import validate
 from cpunet.jobs.validation.drawings import drawings
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import mark
 from cpunet.training.run import RUN
+from cpunet.validation.report_folder import REPORT
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 

@@ -66,7 +66,7 @@ def test_scores(screen, capsys, missing):
 
 
 def test_other_tables(screen, capsys):
-    from cpunet.analysis.side_by_side import side_by_side
+    from cpunet.validation.side_by_side import side_by_side
 
     names = [f"run_{i}_of_a_long_name" for i in range(5)]
     full = metrics()

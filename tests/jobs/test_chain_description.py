@@ -13,7 +13,6 @@ import torch
 import yaml
 from torch import nn
 
-from cpunet.analysis.response_figure import response_figure
 from cpunet.cli.main import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
@@ -28,6 +27,7 @@ from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
+from cpunet.validation.response_figure import response_figure
 from synthetic import write_run
 
 DT_NS = 16.0

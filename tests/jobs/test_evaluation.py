@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.analysis.drift_slices import slice_edges
-from cpunet.analysis.paired import pair_squares, scores_of_squares
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
@@ -24,6 +22,8 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
+from cpunet.validation.drift_slices import slice_edges
+from cpunet.validation.paired import pair_squares, scores_of_squares
 from synthetic import after_pole, decay, phased_edges
 
 RECIPE = load_recipe(

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cpunet.analysis.truth import Responses
 from cpunet.errors import CpunetError
+from cpunet.validation.truth import Responses
 
 
 def prepared(index, n_read):

@@ -10,8 +10,6 @@ import pytest
 import torch
 from torch import nn
 
-from cpunet.analysis.comparisons import compare
-from cpunet.analysis.report import write_report
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.jobs.translation.export import export_run
@@ -23,6 +21,8 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.translation.exports import FORMATS, export
 from cpunet.translation.translator import IREN, REN
+from cpunet.validation.comparisons import compare
+from cpunet.validation.report import write_report
 from synthetic import write_run
 
 

@@ -11,8 +11,6 @@ from typing import Any, Self
 from matplotlib.figure import Figure
 from pydantic import Field
 
-from cpunet.analysis.calibration_figures import calibration_figures
-from cpunet.analysis.html_pages import part
 from cpunet.calibration.titles import titled
 from cpunet.errors import CpunetError
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
@@ -26,6 +24,8 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run
+from cpunet.validation.calibration_figures import calibration_figures
+from cpunet.validation.html_pages import part
 
 
 class CalibratedRun(Run):

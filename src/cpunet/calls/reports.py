@@ -12,9 +12,6 @@ import hist
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.analysis.comparisons import data_axis
-from cpunet.analysis.html_pages import part
-from cpunet.analysis.report_folder import METRICS, VALUES
 from cpunet.calls.translations import MAX_BINS, named, named_axis
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.compare import read_metrics
@@ -25,6 +22,9 @@ from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.training.run import RunLike
+from cpunet.validation.comparisons import data_axis
+from cpunet.validation.html_pages import part
+from cpunet.validation.report_folder import METRICS, VALUES
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
 

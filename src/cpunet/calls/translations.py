@@ -15,9 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.analysis.comparisons import data_axis
-from cpunet.analysis.html_pages import notebook_picture, part
-from cpunet.analysis.style import COLOURS, styled
 from cpunet.errors import CpunetError
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
@@ -31,6 +28,9 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.run import RunLike
 from cpunet.translation.learned_remains import NONE
 from cpunet.translation.output_form import Formed
+from cpunet.validation.comparisons import data_axis
+from cpunet.validation.html_pages import notebook_picture, part
+from cpunet.validation.style import COLOURS, styled
 
 log = logging.getLogger(__name__)
 

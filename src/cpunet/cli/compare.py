@@ -14,7 +14,7 @@ from cpunet.cli import options
 from cpunet.cli.messages import tell
 
 if TYPE_CHECKING:
-    from cpunet.analysis.side_by_side import SideBySide
+    from cpunet.validation.side_by_side import SideBySide
 
 Reports = Annotated[
     list[Path], typer.Argument(help="Folders of cpunet validate or demo, or metrics.json.")
@@ -44,8 +44,8 @@ def compare(
 
     Example: cpunet compare results/*/*/report --out results/index.html
     """
-    from cpunet.analysis.side_by_side_page import FEW
     from cpunet.jobs.validation.compare import compare_reports
+    from cpunet.validation.side_by_side_page import FEW
 
     table, missing = compare_reports(
         reports, method=method, out=out_file, missing_ok=missing_ok, force=force
@@ -69,7 +69,7 @@ def comparison_table(compared: SideBySide, title: str) -> Table:
     Parameters
     ----------
     compared
-        See `cpunet.analysis.side_by_side.side_by_side`.
+        See `cpunet.validation.side_by_side.side_by_side`.
     title
         Title of the table.
     """

@@ -82,7 +82,7 @@ def validate(
 
 
 def _in_words(metrics: dict[str, Any]) -> str:
-    from cpunet.analysis.verdicts import judged_scores
+    from cpunet.validation.verdicts import judged_scores
 
     off, judged = judged_scores(metrics, "ren")
     return f"{off} of {judged} scores off" if judged else "not judged"

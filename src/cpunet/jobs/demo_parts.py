@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from cpunet.analysis.report_folder import METRICS, REPORT
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation.stand import MARKER, STAND
 from cpunet.jobs.simulation.stand_plan import StandPlan
@@ -16,6 +15,7 @@ from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json
 from cpunet.training.run import INFO, RUN, Run
+from cpunet.validation.report_folder import METRICS, REPORT
 
 # parts in the order of creation, each with a file that exists when it is complete
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}

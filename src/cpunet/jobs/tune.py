@@ -17,8 +17,6 @@ import numpy as np
 import yaml
 from torch import nn
 
-from cpunet.analysis.distances import null_distances, wasserstein
-from cpunet.analysis.resampling import resampled_twice
 from cpunet.errors import CpunetError
 from cpunet.jobs.training.chain_and_inverse import Sides, match
 from cpunet.jobs.training.cyclegan_trainer import outside_noise
@@ -44,6 +42,8 @@ from cpunet.training.run import Run
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
+from cpunet.validation.distances import null_distances, wasserstein
+from cpunet.validation.resampling import resampled_twice
 
 if TYPE_CHECKING:
     from optuna import Study, Trial

@@ -305,9 +305,9 @@ class Run(Part):
         CpunetError
             If a run of networks contains no losses.
         """
-        from cpunet.analysis.response_figure import response_figure
-        from cpunet.analysis.run_figures import loss_curves
         from cpunet.jobs.inspection.chain_description import chain_of
+        from cpunet.validation.response_figure import response_figure
+        from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)
@@ -345,7 +345,7 @@ class Run(Part):
         return f"<{type(self).__name__} {self.name}: {self.recipe.name}, {self.peak}{fit}>"
 
     def _repr_html_(self) -> str:
-        from cpunet.analysis.html_pages import notebook_picture, part
+        from cpunet.validation.html_pages import notebook_picture, part
 
         there = self.recipe.generator.name == "response" or self.records
         picture = notebook_picture(self.plot()) if there else ""

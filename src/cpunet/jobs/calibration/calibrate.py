@@ -16,7 +16,6 @@ import numpy as np
 import yaml
 
 import cpunet
-from cpunet.analysis.calibration_figures import calibration_figures, directions_figure
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, known_before
@@ -49,6 +48,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
+from cpunet.validation.calibration_figures import calibration_figures, directions_figure
 
 log = logging.getLogger(__name__)
 

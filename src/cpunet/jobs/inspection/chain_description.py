@@ -12,14 +12,6 @@ from typing import Any
 import numpy as np
 
 import cpunet
-from cpunet.analysis.response_figure import (
-    Chain,
-    Numbers,
-    align_ns,
-    chain_numbers,
-    noise_numbers,
-    response_figure,
-)
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.closed_forms import (
@@ -38,6 +30,14 @@ from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import checked, read_json
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run import FitInfo, Run, RunLike, as_run
+from cpunet.validation.response_figure import (
+    Chain,
+    Numbers,
+    align_ns,
+    chain_numbers,
+    noise_numbers,
+    response_figure,
+)
 
 MARKER = "response.json"
 RESPONSE = FolderKind(

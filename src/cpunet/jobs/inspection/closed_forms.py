@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cpunet.analysis.response_figure import Chain, Numbers, align_ns
 from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.noise_traces import noise_power
@@ -14,6 +13,7 @@ from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.validation.response_figure import Chain, Numbers, align_ns
 
 _MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
 _FOREVER_US = 1e9  # decay time of a chain without decay

@@ -30,6 +30,7 @@ from cpunet.pulses.spectrum import Spectrum, Values, suggested_calibration
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
+from cpunet.validation.spectrum_figure import Spectrum
 
 _RUN_FILE = "run.json"
 # what other folders are, by a file that they hold
@@ -146,7 +147,7 @@ def describe(
                 f"{path}: no spectrum to draw; give the --table of one detector's pulses, or "
                 "leave out --out"
             )
-        from cpunet.analysis.spectrum_figure import spectrum_figure  # loads matplotlib
+        from cpunet.validation.spectrum_figure import spectrum_figure  # loads matplotlib
 
         figure = spectrum_figure(spectrum)
         with written_aside(out) as aside:

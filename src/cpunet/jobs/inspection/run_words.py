@@ -6,12 +6,12 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 
-from cpunet.analysis.nested_tables import with_std
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import noise_kev
 from cpunet.jobs.inspection.info_words import Lines, counted, percent, remains_lines, short
 from cpunet.pulses.loading import SideInfo
 from cpunet.training.run import FitInfo, Run
+from cpunet.validation.nested_tables import with_std
 
 PARTS = 8  # maximum number of deviating parts of a fit
 UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}

@@ -63,7 +63,7 @@ def describe_fields(
     told = _told(detector, fields)
     if picture is not None:
         # matplotlib and the compiled drift are needed only for the picture
-        from cpunet.analysis.detector_figure import detector_figure
+        from cpunet.validation.detector_figure import detector_figure
 
         with stage("Picture"):
             figure = detector_figure(detector, fields, paths=paths)

@@ -136,7 +136,7 @@ def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
     CpunetError
         If the picture exists or has an unknown format.
     """
-    from cpunet.analysis.sides_figure import sides_figure
+    from cpunet.validation.sides_figure import sides_figure
 
     if picture.suffix.lower() not in PICTURE_FORMATS:
         raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from cpunet.analysis.report_folder import METRICS
-from cpunet.analysis.side_by_side import SideBySide, side_by_side
-from cpunet.analysis.side_by_side_page import side_by_side_page
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.settings import read_json
+from cpunet.validation.report_folder import METRICS
+from cpunet.validation.side_by_side import SideBySide, side_by_side
+from cpunet.validation.side_by_side_page import side_by_side_page
 
 REPORT = "report"  # folder of a demonstration that contains the metrics
 PAGE = "report.html"

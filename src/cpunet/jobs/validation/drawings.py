@@ -10,15 +10,21 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from cpunet.analysis.ae_energy_figure import FIGURE as AE_ENERGY
-from cpunet.analysis.ae_energy_figure import ae_energy_figure
-from cpunet.analysis.ae_figures import ae_figure, roc_figure, two_dimensional_figure
-from cpunet.analysis.baseline_spectra import spectrum_of_noise
-from cpunet.analysis.comparisons import Comparison, data_axis
-from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
-from cpunet.analysis.remains_figure import sizes_figure
-from cpunet.analysis.run_figures import (
+from cpunet.jobs.validation.evaluation import Evaluation
+from cpunet.jobs.validation.peak_details import PeakDetails
+from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.networks.learned_response import DriftUNet
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.translation.translator import IREN, REN
+from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
+from cpunet.validation.ae_energy_figure import ae_energy_figure
+from cpunet.validation.ae_figures import ae_figure, roc_figure, two_dimensional_figure
+from cpunet.validation.baseline_spectra import spectrum_of_noise
+from cpunet.validation.comparisons import Comparison, data_axis
+from cpunet.validation.paired import align_half_maximum
+from cpunet.validation.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
+from cpunet.validation.remains_figure import sizes_figure
+from cpunet.validation.run_figures import (
     cycle_figure,
     drift_figure,
     further_histograms,
@@ -26,13 +32,7 @@ from cpunet.analysis.run_figures import (
     mean_pulses,
     parameter_histograms,
 )
-from cpunet.analysis.slice_figure import slice_figure
-from cpunet.jobs.validation.evaluation import Evaluation
-from cpunet.jobs.validation.peak_details import PeakDetails
-from cpunet.jobs.validation.peak_sets import PeakSets
-from cpunet.networks.learned_response import DriftUNet
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.translation.translator import IREN, REN
+from cpunet.validation.slice_figure import slice_figure
 
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")

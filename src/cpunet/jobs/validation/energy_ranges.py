@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.analysis.ae_energy import against_energy
-from cpunet.analysis.range_survival import survival_by_range
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.validation.ae_energy import against_energy
+from cpunet.validation.range_survival import survival_by_range
 
 Range = tuple[float, float]
 
@@ -77,7 +77,7 @@ def ae_against_energy(
 ) -> dict[str, Any]:
     """Position and width of the single-site A/E peak against energy, for data and translation.
 
-    All energies that were read are used, see `cpunet.analysis.ae_energy.against_energy`.
+    All energies that were read are used, see `cpunet.validation.ae_energy.against_energy`.
     """
     return against_energy(
         {method: amplitudes[method] for method in ("data", "ren")},

@@ -11,9 +11,6 @@ from typing import Any
 import numpy as np
 
 import cpunet
-from cpunet.analysis.linearity import linearity_residual
-from cpunet.analysis.truth import Responses
-from cpunet.analysis.verdicts import summaries, verdict_table
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
 from cpunet.jobs.validation.energy_ranges import (
@@ -41,6 +38,9 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
+from cpunet.validation.linearity import linearity_residual
+from cpunet.validation.truth import Responses
+from cpunet.validation.verdicts import summaries, verdict_table
 
 PAIRS = 200  # pairs of pulses in the test of linearity
 MOST_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points

@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from cpunet.analysis.ae_details import ae_against_drift_time, two_dimensional
-from cpunet.analysis.drift_slices import (
+from cpunet.errors import CpunetError
+from cpunet.jobs.validation.peak_sets import PeakSets
+from cpunet.jobs.validation.scoring import ByMethod
+from cpunet.pulses.parameters import Values
+from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
+from cpunet.validation.drift_slices import (
     Slices,
     slice_edges,
     slice_table,
     sliced,
 )
-from cpunet.analysis.mean_pulse import MeanPulse
-from cpunet.analysis.paired import align_half_maximum
-from cpunet.analysis.style import NO_NOISE
-from cpunet.errors import CpunetError
-from cpunet.jobs.validation.peak_sets import PeakSets
-from cpunet.jobs.validation.scoring import ByMethod
-from cpunet.pulses.parameters import Values
+from cpunet.validation.mean_pulse import MeanPulse
+from cpunet.validation.paired import align_half_maximum
+from cpunet.validation.style import NO_NOISE
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150

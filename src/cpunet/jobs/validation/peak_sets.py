@@ -9,8 +9,6 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.paired import PairedScores, scores_of_squares
-from cpunet.analysis.style import NO_NOISE
 from cpunet.jobs.validation.translations import Translations
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.pulses.container import FloatArray, Pulses
@@ -18,6 +16,8 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.validation.paired import PairedScores, scores_of_squares
+from cpunet.validation.style import NO_NOISE
 
 MIN_N = 10  # minimum number of pulses of a distribution
 

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from cpunet.analysis.a_over_e import survival_table
-from cpunet.analysis.two_sample import classifier_auc
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import Values
+from cpunet.validation.a_over_e import survival_table
+from cpunet.validation.two_sample import classifier_auc
 
 TESTED = 1000  # pulses per side: resolves an AUC to 0.013
 
@@ -32,7 +32,7 @@ def told_apart(pulses: Mapping[str, Pulses], values: ByMethod, seed: int) -> dic
     Returns
     -------
     dict
-        Fields of `cpunet.analysis.two_sample.TwoSample` by method, or ``missing`` with the
+        Fields of `cpunet.validation.two_sample.TwoSample` by method, or ``missing`` with the
         reason.
     """
     tested: dict[str, Any] = {}
@@ -69,7 +69,7 @@ def survivals(values: Mapping[str, ByMethod], seed: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        Result of `cpunet.analysis.a_over_e.survival_table`, or ``missing`` with the reason.
+        Result of `cpunet.validation.a_over_e.survival_table`, or ``missing`` with the reason.
     """
     amplitudes = {
         peak: {method: v["current_amplitude"] for method, v in by_method.items()}

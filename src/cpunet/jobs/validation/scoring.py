@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from cpunet.analysis.baseline_spectra import baseline_spectra
-from cpunet.analysis.comparisons import compare
-from cpunet.analysis.style import NO_NOISE
 from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.jobs.validation.pulse_tests import told_apart
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
+from cpunet.validation.baseline_spectra import baseline_spectra
+from cpunet.validation.comparisons import compare
+from cpunet.validation.style import NO_NOISE
 
 ByMethod = dict[str, dict[str, Values]]
 

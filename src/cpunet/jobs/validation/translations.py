@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.analysis.paired import pair_squares
-from cpunet.analysis.truth import Responses
 from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.drawn_remains import SameNoise
 from cpunet.electronics.finishing import blocks, finish, finish_both
@@ -27,6 +25,8 @@ from cpunet.recipes.schema import Recipe
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
+from cpunet.validation.paired import pair_squares
+from cpunet.validation.truth import Responses
 
 Flags = npt.NDArray[np.bool_]
 

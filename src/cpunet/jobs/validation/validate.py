@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cpunet.analysis.report_folder import REPORT, VALUES
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, evaluate
 from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.outputs import folder_written_aside
@@ -17,6 +16,7 @@ from cpunet.progress import Stage, stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, RunLike, as_run
+from cpunet.validation.report_folder import REPORT, VALUES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,7 +90,7 @@ def validated(
         if how.quick:
             to_draw = {name: to_draw[name] for name in _at_a_glance(found, to_draw)}
         found.forget_noisy()
-        from cpunet.analysis.report import write_report
+        from cpunet.validation.report import write_report
 
         parameters = {
             f"{peak}/{method}/{name}": of_method[name]

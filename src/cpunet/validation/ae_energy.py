@@ -1,0 +1,297 @@
+"""A/E against energy: position and width of the single-site peak, and fits to both.
+
+In each energy range the single-site events form a peak, with a tail of multi-site events below.
+Its position decreases with energy, since larger charge clouds are collected more slowly.  Its
+width decreases too, since noise matters less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.optimize
+from scipy.special import expit, log_ndtr, ndtr
+
+from cpunet.errors import CpunetError
+from cpunet.validation.a_over_e import DEP
+
+Values = npt.NDArray[np.float64]
+Range = tuple[float, float]
+
+LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
+BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
+MIN_N = 60  # minimum number of events in a fit
+BELOW, ABOVE = 6.0, 4.0  # range of the fit in widths of the peak
+REFERENCE_KEV = 1592.5  # where A/E is 1: the double-escape peak
+
+
+@dataclass(frozen=True)
+class SiteFit:
+    """The peak of single-site events in one range of energy.
+
+    Attributes
+    ----------
+    low_kev, high_kev, energy_kev
+        Ends of the range, and mean energy of its events.
+    mean, mean_error, sigma, sigma_error
+        Mean and sigma of the Gaussian with their errors, in units of A/E.
+    n
+        Number of fitted events.
+    """
+
+    low_kev: float
+    high_kev: float
+    energy_kev: float
+    mean: float
+    mean_error: float
+    sigma: float
+    sigma_error: float
+    n: int
+
+
+def energy_bands(lines_kev: Mapping[str, Range]) -> list[Range]:
+    """Ranges of 50 keV, and first that of the double-escape peak, if it is among the lines."""
+    bands = [lines_kev[DEP]] if DEP in lines_kev else []
+    lows = np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist()
+    return bands + [(low, low + WIDTH_KEV) for low in lows]
+
+
+def against_energy(
+    amplitude: Mapping[str, Values],
+    energy_kev: Mapping[str, Values],
+    lines_kev: Mapping[str, Range],
+) -> dict[str, Any]:
+    """Position and width of the single-site peak against energy, by method, with fits to both.
+
+    Parameters
+    ----------
+    amplitude, energy_kev
+        A/E and energy of each event, by method, ``data`` among them.
+    lines_kev
+        Range of each gamma line.  Events within 8 keV of one are left out of the continuum.
+        If fewer than three ranges can be fitted for all methods, the other lines are fitted
+        too, although few of their events have one site.
+
+    Returns
+    -------
+    dict
+        JSON-ready: ``methods`` and ``multi_site``, whether lines with mostly multi-site events
+        were fitted too; or ``missing`` with the reason.  For each method: ``points``
+        (`SiteFit` of each range); ``mean`` with ``a`` (per keV) and ``b`` of ``a E + b``, which
+        is 1 at 1592.5 keV, ``per_mev_percent`` with its error, and ``chi_square`` for
+        ``degrees`` of freedom; ``scale``, the A/E at 1592.5 keV; ``resolution`` with ``a``,
+        ``b`` and ``c`` of ``sqrt(a + (b/E)**c)``.
+
+    Raises
+    ------
+    CpunetError
+        If the arrays of a method differ in length.
+    """
+    lines = list(lines_kev.values())
+    single_site = energy_bands(lines_kev)
+    all_bands = single_site + [span for span in lines if span not in single_site]
+    for bands in (single_site, all_bands):
+        points = {
+            method: _points(values, energy_kev[method], bands, lines)
+            for method, values in amplitude.items()
+        }
+        ranges = [{(p.low_kev, p.high_kev) for p in found} for found in points.values()]
+        common = set.intersection(*ranges)
+        if len(common) >= 3:
+            break
+    if len(common) < 2:
+        return {
+            "missing": f"A/E can be fitted in {len(common)} ranges of energy only; "
+            "it takes two that both sides have: give events of more energies"
+        }
+    methods = {
+        method: _lines([p for p in found if (p.low_kev, p.high_kev) in common])
+        for method, found in points.items()
+    }
+    return {"multi_site": bands is all_bands, "methods": methods}
+
+
+def site_fit(
+    amplitude: Values, about: tuple[float, float] | None = None
+) -> tuple[float, float, float, float, int] | None:
+    """Gaussian with an exponential tail below, fitted to the peak of A/E by likelihood.
+
+    Parameters
+    ----------
+    amplitude
+        A/E of all events of a range.
+    about
+        Position and width of the single-site peak at another energy.  It is needed where most
+        events have several sites, since the highest peak is then not that of single sites.  If
+        None, both are estimated from the highest peak.
+
+    Returns
+    -------
+    tuple
+        Mean and its error, sigma and its error, and the number of fitted events; None if
+        there are too few events or no peak.
+    """
+    values = np.sort(amplitude[np.isfinite(amplitude)])
+    about = _seen(values) if about is None else about
+    if about is None:
+        return None
+    centre, width = about
+    x = (values - centre) / width
+    x = x[(x > -BELOW) & (x < ABOVE)]
+    if len(x) < MIN_N:
+        return None
+    start = np.array([0.0, 0.0, -0.5, 1.0])
+    found = scipy.optimize.minimize(_nll, start, args=(x,), method="BFGS")
+    errors = _errors(found.x, x)
+    if errors is None:
+        return None
+    mean, log_sigma = found.x[:2]
+    sigma = float(np.exp(log_sigma))
+    return (
+        float(centre + width * mean),
+        float(width * errors[0]),
+        width * sigma,
+        float(width * sigma * errors[1]),
+        len(x),
+    )
+
+
+def _points(
+    amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
+) -> list[SiteFit]:
+    if amplitude.shape != energy_kev.shape:
+        raise CpunetError(
+            f"{len(amplitude)} amplitudes beside {len(energy_kev)} energies; give one for each"
+        )
+    beside = np.ones(len(energy_kev), bool)
+    for low, high in lines:
+        beside &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
+    found = []
+    about = None
+    for low, high in bands:  # the double-escape peak first, if there is one
+        inside = (energy_kev >= low) & (energy_kev < high)
+        if (low, high) not in lines:
+            inside &= beside
+        fitted = site_fit(amplitude[inside], about)
+        if fitted is not None:
+            about = about or (fitted[0], fitted[2])
+            centre = float(energy_kev[inside].mean())
+            found.append(SiteFit(low, high, centre, *fitted))
+    return sorted(found, key=lambda point: point.energy_kev)
+
+
+def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:
+    """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
+    energy, mean, error, sigma, sigma_error = (
+        np.array([getattr(p, name) for p in points])
+        for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
+    )
+    design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
+    slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
+    covariance = np.linalg.inv(design.T @ design) / scale**2
+    chi_square = float(np.sum(((mean - scale - slope * (energy - REFERENCE_KEV)) / error) ** 2))
+    a = slope / scale
+    a_error = float(np.sqrt(covariance[0, 0]))
+    return {
+        "points": [asdict(p) for p in points],
+        "scale": float(scale),
+        "scale_error": float(scale * np.sqrt(covariance[1, 1])),
+        "mean": {
+            "a": float(a),
+            "b": float(1 - a * REFERENCE_KEV),
+            "a_error": a_error,
+            "per_mev_percent": float(1e5 * a),
+            "per_mev_error_percent": 1e5 * a_error,
+            "chi_square": chi_square,
+            "degrees": len(points) - 2,
+        },
+        "resolution": _resolution(energy, sigma / mean, sigma_error / mean),
+    }
+
+
+def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, Any]:
+    """Fit ``a`` and ``b`` of sqrt(a + (b/E)^2), neither below 0, to the squared widths."""
+    terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
+    squares = relative**2
+    for _ in range(3):
+        # errors are scaled to the fitted widths; otherwise widths that fluctuate low weigh most
+        weight = relative / (2 * squares * error)
+        a, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
+        squares = terms @ np.array([a, b2])
+    return {
+        "a": float(a),
+        "b": float(1e3 * np.sqrt(b2)),
+        "c": 2.0,
+        "at_reference_percent": float(100 * np.sqrt(a + b2 * 1e6 / REFERENCE_KEV**2)),
+    }
+
+
+def _seen(values: Values) -> tuple[float, float] | None:
+    """Position of the highest peak, and its width from its upper side."""
+    if len(values) < MIN_N:
+        return None
+    centre = _densest(values)
+    above = values[values > centre] - centre
+    width = float(np.quantile(above, 0.68)) if len(above) >= 10 else 0.0
+    return (centre, width) if width > 0 else None
+
+
+def _densest(values: Values) -> float:
+    """Middle of the shortest interval with a fifth of the sorted values."""
+    n = max(20, len(values) // 5)
+    first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
+    return float(np.median(values[first : first + n]))
+
+
+def _nll(parameters: Values, x: Values) -> float:
+    mean, log_sigma, share, log_tail = parameters
+    log_sigma, log_tail = np.clip(log_sigma, -3, 3), np.clip(log_tail, -2, 4)
+    sigma, p, tail = np.exp(log_sigma), expit(share), np.exp(log_tail)
+    u = (x - mean) / sigma
+    shift = sigma / tail
+    gauss = np.exp(-0.5 * u**2) / (sigma * np.sqrt(2 * np.pi))
+    tailed = np.exp(0.5 * shift**2 + u * shift + log_ndtr(-u - shift)) / tail
+    inside = [
+        ndtr(v) + p * np.exp(0.5 * shift**2 + v * shift + log_ndtr(-v - shift))
+        for v in ((ABOVE - mean) / sigma, (-BELOW - mean) / sigma)
+    ]
+    norm = max(float(inside[0] - inside[1]), 1e-12)
+    density = ((1 - p) * gauss + p * tailed) / norm
+    # weak priors: a tail of a few widths, a tail fraction of about a third, and a width near
+    # the given one, since otherwise a chance cluster of a few events can be taken for the peak
+    held = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
+    held += 0.5 * (log_sigma / 0.4) ** 2
+    return float(-np.log(np.maximum(density, 1e-300)).sum() + held)
+
+
+def _errors(best: Values, x: Values) -> Values | None:
+    """Errors of mean and log sigma from second differences of the likelihood."""
+    n, step = len(best), 1e-3 * np.ones(len(best))
+    eye = np.diag(step)
+    hessian = np.array(
+        [
+            [
+                (
+                    _nll(best + eye[i] + eye[j], x)
+                    - _nll(best + eye[i] - eye[j], x)
+                    - _nll(best - eye[i] + eye[j], x)
+                    + _nll(best - eye[i] - eye[j], x)
+                )
+                / (4 * step[i] * step[j])
+                for j in range(n)
+            ]
+            for i in range(n)
+        ]
+    )
+    try:
+        covariance = np.linalg.inv(hessian)
+    except np.linalg.LinAlgError:
+        return None
+    variances = np.diag(covariance)[:2]
+    if not (np.isfinite(variances).all() and (variances > 0).all()):
+        return None
+    return np.asarray(np.sqrt(variances))

@@ -1,0 +1,225 @@
+"""Noise of measured and translated pulses: RMS and spectrum of the baseline.
+
+Baselines of prepared windows are normalised to the pulse height, so noise of a given RMS
+in keV appears larger at lower energies: compare only pulses of one peak.  The slowest
+part of the noise is absent, since the preparation subtracts the mean of the baseline.
+
+A window is placed by the end of the rise, so a slow pulse can begin within the recipe's
+baseline; a few such edges would outweigh all noise.  The compared stretch therefore ends
+well before the start of nine out of ten measured pulses, and the others are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erfc
+from scipy.stats import norm
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.validation.style import colours, group, label, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Values = npt.NDArray[np.float64]
+
+MIN_N = 10  # baselines for a spectrum with an error
+BANDS_PER_OCTAVE = 2
+# A pulse rises slowly before it crosses 1 %, its nominal start; margin in samples before that.
+MARGIN = 60
+EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are left out
+MIN_SAMPLES = 32  # of the stretch
+
+
+def baseline_spectra(
+    windows: Mapping[str, FloatArray],
+    begins: Mapping[str, Values],
+    samples: int,
+    dt_ns: float,
+) -> dict[str, Any]:
+    """Compare the baseline noise of each method with that of the data.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses of one peak by method, including ``"data"``, shape (n, length).
+    begins
+        Sample at which each pulse begins, by method, shape (n,); NaN if unknown.
+    samples
+        Maximum number of samples that are compared, from the start of the window.
+    dt_ns
+        Sampling period in ns.
+
+    Returns
+    -------
+    dict
+        JSON-ready: ``frequency_mhz`` (centre of each band), and by method the number ``n`` of
+        pulses, the ``samples`` compared of each, ``power`` and ``power_std`` (mean square in
+        each band, in squared pulse heights), ``rms`` and ``rms_std``.  For methods other than
+        the data also ``rms_ratio``, its ``sigma`` from 1, ``worst_band_sigma``, and
+        ``spectrum_sigma``, which corrects the latter for the number of bands; or ``missing``
+        with the reason.
+
+    Raises
+    ------
+    CpunetError
+        If the data are missing, or the numbers of pulses and start samples differ.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> sets = {m: rng.normal(0, s, (400, 64)) for m, s in (("data", 1), ("ren", 1.1))}
+    >>> begins = dict.fromkeys(sets, np.full(400, 200.0))
+    >>> found = baseline_spectra(sets, begins, samples=64, dt_ns=16)
+    >>> round(found["ren"]["rms_ratio"], 1), found["ren"]["sigma"] > 5
+    (1.1, True)
+    """
+    if "data" not in windows:
+        raise CpunetError("the measured pulses are missing; their noise is the reference")
+    free = {method: _free(pulses, begins, method) for method, pulses in windows.items()}
+    samples = min(samples, _stretch(free["data"]))
+    if samples < MIN_SAMPLES:
+        few = f"{max(samples, 0)} samples before measured pulses begin"
+        early = f"{few}; {MIN_SAMPLES} are needed"
+        return {"frequency_mhz": []} | {method: {"missing": early} for method in windows}
+    edges = _band_edges(samples)
+    frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
+    found: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
+    for method, pulses in windows.items():
+        power = _band_powers(pulses[free[method] >= samples, :samples], edges)
+        if len(power) < MIN_N:
+            found[method] = {"missing": f"{len(power)} baselines; {MIN_N} are needed"}
+            continue
+        found[method] = {"samples": samples} | _summary(power)
+    data = found["data"]
+    for method in windows:
+        if method != "data" and "missing" not in data | found[method]:
+            found[method] |= _against(found[method], data)
+    return found
+
+
+@styled
+def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
+    """Draw the noise power by band and method, and its ratio to that of the data.
+
+    Parameters
+    ----------
+    found
+        Result of `baseline_spectra`.
+    peak
+        Name of the gamma line, for the title.
+    """
+    from matplotlib.figure import Figure
+
+    methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
+    palette = colours(methods)
+    frequency = np.asarray(found["frequency_mhz"])
+    figure = Figure(figsize=(5.6, 4.4))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    data = np.asarray(found["data"]["power"])
+    for method in methods:
+        power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))
+        look = {"color": palette[method], "marker": "o", "markersize": 3}
+        group(above.errorbar(frequency, power, error, label=label(method), **look), method)
+        if method != "data":
+            # bands without noise in the data have no ratio
+            ratio, spread = (
+                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
+                for values in (power, error)
+            )
+            group(below.errorbar(frequency, ratio, spread, **look), method)
+    below.axhline(1, color="black", linewidth=0.8)
+    silent = not any(np.any(found[method]["power"]) for method in methods)
+    above.set(
+        title=f"{peak}: noise before the pulse",
+        ylabel="Mean square per band\n[pulse height²]",
+        xscale="log",
+        yscale="linear" if silent else "log",
+    )
+    above.legend()
+    below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
+    return figure
+
+
+def _free(windows: FloatArray, begins: Mapping[str, Values], method: str) -> Values:
+    """Number of samples of each window before its pulse; NaN if unknown."""
+    known = begins.get(method, np.empty(0))
+    if known.shape != (len(windows),):
+        raise CpunetError(
+            f"{method}: {len(windows)} pulses beside {known.size} beginnings; give one for each"
+        )
+    return known - MARGIN
+
+
+def _stretch(free: Values) -> int:
+    """Number of samples before the pulse in all measured pulses but the earliest."""
+    known = free[np.isfinite(free)]
+    return int(np.quantile(known, EARLY_SHARE)) if known.size else 0
+
+
+def _band_edges(samples: int) -> Values:
+    """Edges, in bins of a spectrum, of half-octave bands, without frequency 0."""
+    octaves = np.log2(samples // 2 + 1)
+    steps = 2 ** np.arange(0, octaves, 1 / BANDS_PER_OCTAVE)
+    edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1))
+    return edges.astype(float)
+
+
+def _band_powers(baselines: FloatArray, edges: Values) -> Values:
+    """Mean square of each baseline in each band, shape (baselines, bands)."""
+    known = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
+    samples = baselines.shape[1]
+    window = np.hanning(samples + 1)[:-1]
+    centred = (known - known.mean(axis=1, keepdims=True)) * window
+    power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (window @ window))
+    if samples % 2 == 0:
+        power[:, -1] /= 2  # the highest frequency occurs only once
+    starts = edges[:-1].astype(int)
+    return (
+        np.asarray(np.add.reduceat(power, starts, axis=1)) if len(known) else power[:, starts]
+    )
+
+
+def _summary(power: Values) -> dict[str, Any]:
+    n, mean = len(power), power.mean(axis=0)
+    total = power.sum(axis=1)
+    rms = float(np.sqrt(total.mean()))
+    return {
+        "n": n,
+        "power": mean.tolist(),
+        "power_std": (power.std(axis=0, ddof=1) / np.sqrt(n)).tolist(),
+        "rms": rms,
+        "rms_std": float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
+    }
+
+
+def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:
+    """Deviation of the noise from that of the data; None where it is undefined."""
+    error = np.hypot(own["rms_std"], data["rms_std"])
+    difference = np.subtract(own["power"], data["power"])
+    errors = np.hypot(own["power_std"], data["power_std"])
+    bands = np.abs(difference[errors > 0] / errors[errors > 0])
+    return {
+        "rms_ratio": own["rms"] / data["rms"] if data["rms"] else None,
+        "sigma": float((own["rms"] - data["rms"]) / error) if error else None,
+        "worst_band_sigma": float(bands.max()) if bands.size else None,
+        "spectrum_sigma": _of_so_many(float(bands.max(initial=0)), bands.size),
+    }
+
+
+def _of_so_many(worst: float, n: int) -> float | None:
+    """One-sided deviation as unlikely as the largest of `n` two-sided ones (Šidák).
+
+    None if the spectra are equal, which no one-sided deviation expresses.
+    """
+    of_one = erfc(worst / np.sqrt(2))
+    if of_one == 1:
+        return None
+    chance = -np.expm1(n * np.log1p(-of_one))
+    # beyond 37 standard deviations the probability underflows, and it does not matter
+    return float(norm.isf(chance)) if chance > 0 else worst

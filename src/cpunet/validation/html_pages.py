@@ -1,0 +1,132 @@
+"""Pages from the templates in ``page/``: self-contained, escaped, and without requests.
+
+Values that are put into a template are escaped, unless they are `Markup`.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Iterable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.backend_bases import FigureCanvasBase
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from cpunet.validation.style import GROUP
+
+DPI = 150
+NOTEBOOK_DPI = 80
+COMPRESSION = 1  # of PNG, 0 … 9: files a tenth larger than with the usual 6, in half the time
+# in SVG: blanks, L between points, fonts, which the style sheet has, and rotations by nothing
+_NEEDLESS = (
+    r"""\n *(?=<)| \n(?="|z)|\nL |font-family: [^;"]*(; )?| transform="rotate\(-0 [^"]*\""""
+)
+WIDE = 2.0  # aspect ratio from which a figure takes the full width of the page
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("cpunet.validation", "page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def rendered(template: str, **values: Any) -> str:
+    """Return a page of ``page/`` with its values."""
+    return _environment().get_template(template).render(css=Markup(asset("page.css")), **values)
+
+
+def asset(name: str) -> str:
+    """Content of a file of ``page/``."""
+    return files("cpunet.validation").joinpath("page", name).read_text("utf-8")
+
+
+def part(name: str, *values: Any, **named: Any) -> Markup:
+    """Return a piece of a page, made by a macro of ``page/parts.html``.
+
+    Examples
+    --------
+    >>> part("gap", "1 < 2")
+    Markup('<p class="gap">None recorded: 1 &lt; 2.</p>')
+    """
+    macro = getattr(_environment().get_template("parts.html").module, name)
+    return Markup(macro(*values, **named))
+
+
+def joined(parts: Iterable[str]) -> Markup:
+    """Join pieces of a page, one per line."""
+    return Markup("\n").join(parts)
+
+
+def figure_html(caption: str, figure: Figure) -> Markup:
+    """Return a figure with its caption, as SVG."""
+    svg = Markup(figure_svg(figure, salt=caption))
+    width, height = figure.get_size_inches()
+    return part("figure", caption, svg, width, width >= WIDE * height)
+
+
+def notebook_picture(figure: Figure) -> Markup:
+    """Return a figure as a small PNG in base64."""
+    return Markup(base64.b64encode(figure_png(figure, NOTEBOOK_DPI)).decode("ascii"))
+
+
+def figure_png(figure: Figure, dpi: int = DPI) -> bytes:
+    """Draw a figure; equal figures give equal bytes."""
+    stream = io.BytesIO()
+    figure.set_dpi(dpi)
+    # ``Figure.savefig`` would process every figure twice, once without drawing;
+    # without the program's name and version, equal figures give equal files
+    FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
+        stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
+    )
+    FigureCanvasBase(figure)  # releases the pixel buffer, which the figure would keep
+    figure.set_layout_engine("none")  # SVG of the same figure has its panels where they are
+    return stream.getvalue()
+
+
+def figure_svg(figure: Figure, salt: str) -> str:
+    """Draw a figure as an element of a page; equal figures give equal text.
+
+    What is drawn of a method has its name as ``data-method``.
+
+    Parameters
+    ----------
+    figure
+        The figure.
+    salt
+        Text that differs between the figures of a page, so that their ids differ.
+    """
+    stream = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        FigureCanvasSVG(figure).print_svg(  # type: ignore[no-untyped-call]
+            stream, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        )
+    FigureCanvasBase(figure)
+    text = stream.getvalue()
+    width, height, content = re.search(  # type: ignore[union-attr]
+        r'<svg[^>]* viewBox="0 0 (\S+) (\S+)"[^>]*>(.*)</svg>', text, re.DOTALL
+    ).groups()
+    content = re.sub(r"<(style|metadata).*?</\1>|<!--.*?-->", "", content, flags=re.S)
+    content = re.sub(_NEEDLESS, "", content)
+    content = re.sub(rf'<g id="{GROUP}', '<g data-method="', content)
+    content = re.sub(r'<g id="[^"]*"', "<g", content)
+    content = re.sub(r"<[^>]*>", _shortened, content)
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{content}</svg>'
+
+
+def _shortened(tag: re.Match[str]) -> str:
+    """Digits of an element that are seen: to 0.01 points, or 0.1 beyond 100."""
+    return re.sub(r"(\d{3}\.\d|\.\d\d)\d+", r"\1", tag[0])

@@ -1,0 +1,363 @@
+"""Figures of a training and of its validation; each function returns a `Figure`.
+
+Only matplotlib's object-oriented interface is used.  Without global state, figures can be
+made in worker processes and notebooks alike.  The caller saves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import hist
+import numpy as np
+import numpy.typing as npt
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.validation.comparisons import Comparison, data_axis, histogram
+from cpunet.validation.mean_pulse import MeanPulse
+from cpunet.validation.style import (
+    COLOURS,
+    DATA_FILL,
+    GROUP,
+    colours,
+    label,
+    line_look,
+    linear_within,
+    styled,
+)
+
+Values = npt.NDArray[np.float64]
+
+CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
+AVERAGED = 10  # records in the moving average
+DRIFT_BINS = 12  # of drift time, with as many pulses each
+COLUMNS = 4  # panels of further parameters in a row
+# Panels of the loss figure: losses with their label and colour.
+LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "Cycle and identity": {
+        "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
+        "cycle_backward": ("cycle, data → sim → data", COLOURS["iren"]),
+        "identity_data": ("identity, data", COLOURS["data"]),
+        "identity_sim": ("identity, simulation", COLOURS["raw"]),
+    },
+    "Generators, adversarial": {
+        "adversarial_ren": ("REN", COLOURS["ren"]),
+        "adversarial_iren": ("IREN", COLOURS["iren"]),
+    },
+    "Discriminators": {
+        "discriminator_data": ("data", COLOURS["data"]),
+        "discriminator_sim": ("simulation", COLOURS["raw"]),
+    },
+}
+
+
+@styled
+def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Losses during the training: each record faint, the moving average on top.
+
+    Parameters
+    ----------
+    records
+        Records of the training log: ``{"iteration": i, "losses": {name: value, …}}``, in
+        order.
+
+    Raises
+    ------
+    CpunetError
+        If there are no records.
+    """
+    if not records:
+        raise CpunetError("the training log is empty: there are no losses to draw; train first")
+    if CHI_SQUARE in records[0]["losses"]:
+        return _chi_square_curve(records)
+    iteration = np.array([record["iteration"] for record in records], dtype=float)
+    figure = Figure(figsize=(10.5, 3.4))
+    panels = figure.subplots(1, len(LOSS_PANELS))
+    for axes, (title, losses) in zip(panels, LOSS_PANELS.items(), strict=True):
+        for name, (text, colour) in losses.items():
+            series = np.array([record["losses"].get(name, np.nan) for record in records], float)
+            there = ~np.isnan(series)  # discriminators are not updated in every iteration
+            if not there.any():
+                continue
+            at, series = iteration[there], series[there]
+            axes.plot(at, series, color=colour, alpha=0.25, linewidth=0.7)
+            width = min(AVERAGED, len(series))
+            average = np.convolve(series, np.full(width, 1 / width), mode="valid")
+            axes.plot(at[len(at) - len(average) :], average, colour, label=text)
+        axes.set(title=title, xlabel="Iteration")
+        if axes.lines:
+            axes.legend()
+    panels[0].set(ylabel="Loss", yscale="log")
+    figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
+    return figure
+
+
+def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Chi-square of a fitted chain after each step of the fit."""
+    figure = Figure(figsize=(4.6, 3.4))
+    axes = figure.subplots()
+    axes.plot(
+        [record["iteration"] for record in records],
+        [record["losses"].get(CHI_SQUARE, np.nan) for record in records],
+        color="black",
+        marker="o",
+        markersize=3,
+    )
+    axes.set(xlabel="Step", ylabel=r"$\chi^2$ of the moments", yscale="log")
+    axes.set_title("Response matched to data")
+    return figure
+
+
+@styled
+def cycle_figure(
+    start: FloatArray,
+    middle: FloatArray,
+    end: FloatArray,
+    titles: tuple[str, str, str],
+    dt_ns: float,
+) -> Figure:
+    """Pulses through one cycle, in three panels (paper, figures of the cycles).
+
+    Parameters
+    ----------
+    start, middle, end
+        Pulses before, half-way through and after the cycle, shape ``(n, length)``; each
+        row is the same event in all three.
+    titles
+        Titles of the three panels.
+    dt_ns
+        Sampling period in ns.
+    """
+    figure = Figure(figsize=(10.5, 3.2))
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    time_us = np.arange(start.shape[1]) * dt_ns * 1e-3
+    shades = colormaps["viridis"](np.linspace(0, 0.9, len(start)))
+    for axes, waveforms, title in zip(panels, (start, middle, end), titles, strict=True):
+        for waveform, shade in zip(waveforms, shades, strict=True):
+            axes.plot(time_us, waveform, color=shade, linewidth=1.0, rasterized=True)
+        axes.set(title=title, xlabel="Time [µs]")
+    panels[0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
+    return figure
+
+
+@styled
+def parameter_histograms(
+    values: Mapping[str, Values],
+    axis: hist.axis.Regular,
+    parameter: str,
+    peak: str,
+    comparison: Comparison,
+) -> Figure:
+    """Distributions of one parameter: the data filled, each method as a line.
+
+    All histograms sum to one.  The outermost bars are underflow and overflow.  The legend
+    gives each method's IoU and the ceiling.
+
+    Parameters
+    ----------
+    values
+        Values of the parameter by method, the measured ones under ``"data"``.
+    axis
+        Binning, see `comparisons.data_axis`.
+    parameter
+        Name of the parameter in `PARAMETERS`.
+    peak
+        Name of the gamma line, for the title.
+    comparison
+        Result of `comparisons.compare` for the parameter.
+    """
+    palette = colours(values)
+    edges = _edges_with_flow(axis)
+    fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
+    figure = Figure(figsize=(5.6, 4.2))
+    axes = figure.subplots()
+    for method, heights in fractions.items():
+        text = f"{label(method)}{_score(method, comparison)}, {_size(values[method])}"
+        _steps(axes, heights, edges, method, palette[method], text)
+    # the outermost bars can be as high as 1 and would flatten everything in between
+    top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
+    axes.set(
+        xlabel=PARAMETERS[parameter].axis_label,
+        ylabel="Fraction of events per bin",
+        xlim=(edges[0], edges[-1]),
+        ylim=(0, top),
+    )
+    _mark_flow(axes, edges, fractions, palette)
+    title = f"{peak}: bars beyond the dotted lines hold all events outside"
+    figure.legend(loc="outside upper left", title=title, alignment="left")
+    return figure
+
+
+@styled
+def further_histograms(
+    values: Mapping[str, Mapping[str, Values]], max_bins: int, peak: str
+) -> Figure:
+    """Distributions of the further parameters, a small panel for each.
+
+    Parameters
+    ----------
+    values
+        Values by parameter and method, the measured ones under ``"data"``; of each parameter
+        some measured values are finite.
+    max_bins
+        Maximum number of bins, see `comparisons.data_axis`.
+    peak
+        Name of the gamma line, for the title.
+    """
+    rows = -(-len(values) // COLUMNS)
+    figure = Figure(figsize=(10.5, 2.1 * rows + 0.5))
+    panels = figure.subplots(rows, COLUMNS, squeeze=False).flat
+    for name, by_method in values.items():
+        axes, axis = next(panels), data_axis(by_method["data"], max_bins)
+        palette = colours(by_method)
+        for method, own in by_method.items():
+            shares = histogram(own, axis)[1:-2] / max(len(own), 1)
+            _steps(axes, shares, axis.edges, method, palette[method], label(method))
+        axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[], ylim=(0, None))
+        axes.locator_params(axis="x", nbins=4)
+        axes.grid(visible=False)
+    for empty in panels:
+        empty.set_axis_off()
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=len(by_method),
+        title=f"{peak}: further parameters, fraction of events per bin, in the data's range",
+        alignment="left",
+    )
+    return figure
+
+
+@styled
+def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figure:
+    """Mean pulses aligned at half maximum, and their differences from the data.
+
+    Parameters
+    ----------
+    sets
+        Mean pulses by method, the measured one under ``"data"``; methods are drawn in this
+        order, later ones on top.
+    dt_ns
+        Sampling period in ns.
+    peak
+        Name of the gamma line, for the title.
+    """
+    palette = colours(sets)
+    means = {method: averaged.mean for method, averaged in sets.items()}
+    data = sets["data"]
+    time_ns = (np.arange(len(data.mean)) - data.before) * dt_ns
+    figure = Figure(figsize=(5.6, 4.8))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    # the translation last, so that it is on top
+    for method in sorted(means, key=lambda name: name == "ren"):
+        mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
+        look = line_look(method, palette[method])
+        above.plot(time_ns, mean, label=text, **look)
+        if method == "raw":
+            # its different height would dominate the difference
+            mean, look["linestyle"] = mean * data.mean[-1] / mean[-1], "dashed"
+            above.plot(time_ns, mean, label=f"{label(method)}, at the data's height", **look)
+        if method != "data":
+            below.plot(time_ns, 100 * (mean - means["data"]), **look)
+    below.axhline(0, color="black", linewidth=0.8)
+    above.set(title=f"{peak}, mean pulse aligned at half maximum", ylabel="Pulse height")
+    above.legend(loc="lower right")
+    below.set(
+        xlabel="Time from half maximum [ns]",
+        ylabel="Method − data\n[% of full charge,\nlinear within ± 1]",
+        xlim=(time_ns[0], time_ns[-1]),
+    )
+    linear_within(below, 1.0)
+    return figure
+
+
+@styled
+def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
+    """What the U-Net before a readout does, against the drift time of the simulated pulse.
+
+    Parameters
+    ----------
+    before_ns, longer, blur_ns2
+        As `cpunet.networks.learned_response.DriftUNet.effect` returns them, shapes (pulses,).
+    """
+    figure = Figure(figsize=(8.4, 3.4))
+    panels = figure.subplots(1, 2)
+    edges = np.unique(np.quantile(before_ns, np.linspace(0, 1, DRIFT_BINS + 1)))
+    in_bin = np.clip(np.searchsorted(edges, before_ns, "right") - 1, 0, len(edges) - 2)
+    blur_ns = np.sign(blur_ns2) * np.sqrt(np.abs(blur_ns2))
+    filled = np.unique(in_bin)
+    for axes, values in zip(panels, (100 * longer, blur_ns), strict=True):
+        axes.plot(before_ns, values, ".", color=COLOURS["raw"], markersize=1.5, alpha=0.3)
+        middle = [np.median(values[in_bin == number]) for number in filled]
+        at = [np.median(before_ns[in_bin == number]) for number in filled]
+        axes.plot(at, middle, color=COLOURS["ren"], marker="o", markersize=3, label="median")
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set(xlabel="Simulated time from 2 to 98 % of the charge [ns]")
+    panels[0].set(ylabel="Longer by [%]", title="Clock of the U-Net")
+    panels[1].set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
+    panels[0].legend()
+    return figure
+
+
+def _steps(
+    axes: Axes, heights: Values, edges: Values, method: str, colour: str, text: str
+) -> None:
+    is_data = method == "data"
+    axes.stairs(
+        heights,
+        edges,
+        fill=is_data,
+        facecolor=DATA_FILL if is_data else None,
+        edgecolor=colour,
+        linewidth=0.8 if is_data else 1.5,
+        label=text,
+        zorder=1 if is_data else 2,
+        gid=GROUP + method,
+    )
+
+
+def _edges_with_flow(axis: hist.axis.Regular) -> Values:
+    """Edges of the bins, and of a bar at either end for underflow and overflow."""
+    edges: Values = axis.edges
+    bar = max(edges[-1] - edges[0], np.spacing(edges[-1])) / 25
+    return np.concatenate([[edges[0] - bar], edges, [edges[-1] + bar]])
+
+
+def _score(method: str, comparison: Comparison) -> str:
+    name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
+    score = comparison["iou"].get(name)
+    return "" if score is None else f" ({kind} {score:.1f} %)"
+
+
+def _size(sample: Values) -> str:
+    missing = int(np.isnan(sample).sum())
+    return f"n = {len(sample)}" + (f", {missing} undefined" if missing else "")
+
+
+def _mark_flow(
+    axes: Axes, edges: Values, fractions: Mapping[str, Values], palette: Mapping[str, str]
+) -> None:
+    """Separate the outermost bars, and label those that exceed the axis."""
+    top = axes.get_ylim()[1]
+    for bar, edge, side in ((0, edges[1], "left"), (-1, edges[-2], "right")):
+        axes.axvline(edge, color="0.55", linewidth=0.8, linestyle=":")
+        high = [method for method, heights in fractions.items() if heights[bar] > top]
+        for line, method in enumerate(high):
+            axes.annotate(
+                f"{100 * fractions[method][bar]:.0f} %",
+                (edge, top),
+                xytext=(6 if side == "left" else -6, -4 - 12 * line),
+                textcoords="offset points",
+                ha=side,
+                va="top",
+                color=palette[method],
+                fontsize=8.5,
+                gid=GROUP + method,
+            )

@@ -1,0 +1,294 @@
+"""Scores of several validations as rows of one table, and whether they are comparable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cpunet.errors import CpunetError
+from cpunet.validation.verdicts import number, part
+
+Metrics = Mapping[str, Any]
+
+NO_VALUE = "–"
+CEILING = " (ceiling)"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Score of one run with its error, and its expectation by chance with the spread.
+
+    Attributes
+    ----------
+    text
+        Score as displayed, with error and ceiling.
+    value
+        Score; None where a run has none.
+    digits
+        Format of the score.
+    """
+
+    text: str = NO_VALUE
+    value: float | None = None
+    error: float | None = None
+    expected: float | None = None
+    expected_std: float | None = None
+    digits: str = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One score of every run.
+
+    Attributes
+    ----------
+    peak, score
+        Name of the peak and of the score.
+    cells
+        Scores in the order of the runs.
+    best
+        Indices of the runs with the best score; empty if fewer than two have a score.
+    """
+
+    peak: str
+    score: str
+    cells: tuple[Cell, ...]
+    best: frozenset[int]
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Scores of several runs, side by side.
+
+    Attributes
+    ----------
+    names
+        Names of the runs.
+    method
+        Method that is scored.
+    rows
+        Scores, ordered by peak.
+    notes
+        Reasons to doubt the comparison, one sentence each.
+    compared
+        Inputs and origin of the runs (files, detector, period, quality of the fit) by name;
+        texts in the order of the runs.
+    over_runs
+        If several runs differ in the seed only: their median, standard deviation, lowest and
+        highest score, with a name and a cell for all of them.
+    """
+
+    names: tuple[str, ...]
+    method: str
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+    compared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    over_runs: SideBySide | None = None
+
+
+def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide:
+    """Put the scores of several runs side by side.
+
+    Parameters
+    ----------
+    runs
+        Content of ``metrics.json`` by the name of the run.  Scores missing in older files
+        have no value.
+    method
+        Method that is scored: ``ren``, ``raw``, a baseline method or ``truth``.
+
+    Returns
+    -------
+    SideBySide
+        The best is the highest IoU, the AUC closest to that of shuffled labels, the lowest
+        RMSE of the edge, and the smallest difference of A/E survival.
+
+    Raises
+    ------
+    CpunetError
+        If no run has a score of the method.
+
+    Examples
+    --------
+    >>> iou = lambda value: {"iou": {"ren": value, "ceiling": 90.0}}
+    >>> metrics = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
+    >>> table = side_by_side({"old": metrics(80.0), "new": metrics(85.0)})
+    >>> [cell.text for cell in table.rows[0].cells], table.rows[0].best
+    (['80.0 (90.0)', '85.0 (90.0)'], frozenset({1}))
+    """
+    rows = [
+        row
+        for peak in _union(part(metrics, "peaks") for metrics in runs.values())
+        for row in _peak_rows(peak, list(runs.values()), method)
+    ]
+    if not rows:
+        known = _union(_methods(metrics) for metrics in runs.values())
+        raise CpunetError(
+            f"{', '.join(runs)}: no score of the method {method}; "
+            + (f"there are {', '.join(known)}" if known else "nothing is scored there")
+        )
+    told = [part(metrics, "compared") for metrics in runs.values()]
+    compared = {n: tuple(str(one.get(n, NO_VALUE)) for one in told) for n in _union(told)}
+    over_runs = _over_runs(list(runs.values()), method, rows)
+    return SideBySide(
+        tuple(runs), method, tuple(rows), tuple(_notes(runs)), compared, over_runs
+    )
+
+
+def _over_runs(runs: Sequence[Metrics], method: str, rows: Sequence[Row]) -> SideBySide | None:
+    """Scores over the runs of the same recipe, energies and files; None without such runs."""
+    alike: dict[str, list[int]] = {}
+    for i, metrics in enumerate(runs):
+        training, compared = part(metrics, "training"), part(metrics, "compared")
+        origin = [training.get(key) for key in ("recipe", "peak")]
+        origin += [compared.get(key) for key in ("simulation", "data")]
+        if training:
+            alike.setdefault(", ".join(map(str, filter(None, origin))), []).append(i)
+    alike = {origin: members for origin, members in alike.items() if len(members) > 1}
+    if not alike:
+        return None
+    names = tuple(f"{len(members)} runs of {origin}" for origin, members in alike.items())
+    over = []
+    for row in rows:
+        cells = [_over([row.cells[i] for i in members]) for members in alike.values()]
+        name = row.score.removesuffix(CEILING)
+        over.append(Row(row.peak, name, tuple(cells), frozenset()))
+    return SideBySide(names, method, tuple(over), ())
+
+
+def _over(cells: Sequence[Cell]) -> Cell:
+    """Median, standard deviation, lowest and highest of a score, and how many runs lack it."""
+    known = [cell for cell in cells if cell.value is not None]
+    if len(known) < 2:
+        return Cell()
+    values, digits = np.array([cell.value for cell in known], float), known[0].digits
+    median, spread = float(np.median(values)), float(np.std(values, ddof=1))
+    text = f"{median:{digits}} ± {spread:{digits.lstrip('+')}}"
+    text += f" ({values.min():{digits}} – {values.max():{digits}})"
+    if missing := len(cells) - len(known):
+        text += f", {missing} missing"
+    return Cell(text, median, spread, digits=digits)
+
+
+def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
+    """Rows of one peak in which any run has a value."""
+    scores = [part(metrics, "peaks", peak) for metrics in runs]
+    rows = []
+    for name in _union(part(s, "parameters") for s in scores):
+        cells = [_overlap(part(s, "parameters", name), method) for s in scores]
+        title = f"{name.replace('_', ' ')}: IoU [%]{CEILING}"
+        rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
+    cells = [_auc(part(s, "two_sample", method)) for s in scores]
+    rows.append(_row(peak, "classifier: AUC", cells, _off))
+    cells = [_edge(part(s, "paired", method)) for s in scores]
+    rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
+    cells = [_survival(part(metrics, "ae_survival", peak), method) for metrics in runs]
+    rows.append(_row(peak, "A/E survival minus data [points]", cells, _off))
+    return [row for row in rows if any(cell.value is not None for cell in row.cells)]
+
+
+def _row(peak: str, score: str, cells: Sequence[Cell], badness: Callable[[Cell], float]) -> Row:
+    known = {i: badness(cell) for i, cell in enumerate(cells) if cell.value is not None}
+    best = min(known.values(), default=0.0)
+    winners = frozenset(i for i, bad in known.items() if bad == best)
+    return Row(peak, score, tuple(cells), winners if len(known) > 1 else frozenset())
+
+
+def _off(cell: Cell) -> float:
+    return abs((cell.value or 0.0) - (cell.expected or 0.0))
+
+
+def _overlap(parameter: Metrics, method: str) -> Cell:
+    value, error = (number(parameter, key, method) for key in ("iou", "iou_std"))
+    ceiling, spread = (number(parameter, key, "ceiling") for key in ("iou", "iou_std"))
+    shown = f" ({ceiling:.1f})" if ceiling is not None else ""
+    return _cell(value, error, ceiling, spread, ".1f", shown)
+
+
+def _auc(tested: Metrics) -> Cell:
+    keys = ("auc", "auc_std", "null_mean", "null_std")
+    value, error, mean, spread = (number(tested, key) for key in keys)
+    return _cell(value, error, 0.5 if mean is None else mean, spread, ".3f")
+
+
+def _edge(paired: Metrics) -> Cell:
+    rmse = number(paired, "edge_rmse")
+    return _cell(None if rmse is None else 1e3 * rmse, None, None, None, "#.3g")
+
+
+def _survival(survival: Metrics, method: str) -> Cell:
+    value, error = (number(survival, key, method) for key in ("difference", "difference_std"))
+    return _cell(value, error, 0.0, None, "+.2f")
+
+
+def _cell(
+    value: float | None,
+    error: float | None,
+    expected: float | None,
+    expected_std: float | None,
+    digits: str,
+    appended: str = "",
+) -> Cell:
+    if value is None:
+        return Cell()
+    of_error = f" ± {error:{digits.lstrip('+')}}" if error is not None else ""
+    text = f"{value:{digits}}{of_error}{appended}"
+    return Cell(text, value, error, expected, expected_std, digits)
+
+
+def _notes(runs: Mapping[str, Metrics]) -> list[str]:
+    """Signs that the runs were not scored on the same pulses."""
+    first, *others = runs
+    found: dict[str, list[str]] = {}
+    for other in others:
+        if crystals := _crystals(runs[first], runs[other]):
+            found.setdefault(f"are of different detectors, {crystals}.", []).append(other)
+        if apart := _differences(runs[first], runs[other]):
+            words = f"were scored on different pulses ({', '.join(apart)}): their scores "
+            found.setdefault(f"{words}differ for that reason, too.", []).append(other)
+    return [
+        f"{first} and {names[0]} {words}"
+        if len(names) == 1
+        else f"{first} on one side, {', '.join(names)} on the other {words}"
+        for words, names in found.items()
+    ]
+
+
+def _crystals(one: Metrics, other: Metrics) -> str:
+    """The two detectors, if the runs are of different ones."""
+    names = [part(metrics, "compared").get("detector") for metrics in (one, other)]
+    return f"{names[0]} and {names[1]}" if all(names) and names[0] != names[1] else ""
+
+
+def _differences(one: Metrics, other: Metrics) -> list[str]:
+    peaks = [part(metrics, "peaks") for metrics in (one, other)]
+    apart = ["peaks"] if peaks[0].keys() != peaks[1].keys() else []
+    for key, called in (("n_data", "measured"), ("n_sim", "simulated")):
+        for peak in peaks[0].keys() & peaks[1].keys():
+            counts = [part(p, peak).get(key) for p in peaks]
+            if counts[0] != counts[1]:
+                apart.append(f"number of {called} pulses")
+                break
+    for side, called in (("data", "measured"), ("sim", "simulated")):
+        lost = [part(metrics, "rejections").get(side) for metrics in (one, other)]
+        if lost[0] != lost[1]:
+            apart.append(f"rejections of {called} pulses")
+    return apart
+
+
+def _methods(metrics: Metrics) -> list[str]:
+    found = [
+        parameter_methods
+        for peak in part(metrics, "peaks")
+        for name in part(metrics, "peaks", peak, "parameters")
+        for parameter_methods in part(metrics, "peaks", peak, "parameters", name, "iou")
+    ]
+    return [method for method in dict.fromkeys(found) if method != "ceiling"]
+
+
+def _union(names: Any) -> list[str]:
+    """All names in the order of their first occurrence."""
+    return list(dict.fromkeys(name for some in names for name in some))

@@ -1,0 +1,195 @@
+"""The A/E cut against analytic survivals, and its errors against repeated draws."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtr, ndtri
+
+from cpunet.errors import CpunetError
+from cpunet.validation.a_over_e import ae_survival, sideband_survival, survival_table
+
+SEP_MEAN = -1.0  # in widths of the DEP, whose cut at 90 % lies at -1.28
+SEP_SURVIVAL = 100 * ndtr(SEP_MEAN - ndtri(0.1))
+
+
+def peaks(rng, n_dep=800, n_sep=1000, scale=1.0):
+    return {
+        "DEP": scale * rng.normal(10, 1, n_dep),
+        "SEP": scale * rng.normal(10 + SEP_MEAN, 1, n_sep),
+    }
+
+
+def test_known_numbers():
+    dep = np.arange(1.0, 100.0)  # 99 events: the tenth is the quantile of 10 %
+    result = ae_survival(dep, {"SEP": np.array([5.0, 10.1, 10.5, 70.0])})
+    assert result.cut == pytest.approx(10)
+    assert result.peaks["SEP"].survival == 75
+
+
+def test_survival_is_the_analytic_one():
+    sample = peaks(np.random.default_rng(0), 200_000, 200_000)
+    result = ae_survival(sample.pop("DEP"), sample, bootstraps=20)
+    assert result.cut == pytest.approx(10 + ndtri(0.1), abs=0.02)
+    assert result.peaks["SEP"].survival == pytest.approx(SEP_SURVIVAL, abs=0.8)
+
+
+@pytest.mark.parametrize("n_dep", [20, 24, 61])
+def test_new_events_survive_with_the_acceptance_however_few_set_the_cut(n_dep):
+    rng = np.random.default_rng(1)
+    cuts = [ae_survival(rng.random(n_dep), {}, bootstraps=2).cut for _ in range(1500)]
+    assert 1 - np.mean(cuts) == pytest.approx(0.9, abs=0.006)
+
+
+@pytest.mark.parametrize(("n_dep", "n_sep"), [(100, 2000), (2000, 60), (400, 400)])
+def test_errors_cover_the_truth(n_dep, n_sep):
+    """The error of the cut dominates in the first case, the counts in the second."""
+    rng = np.random.default_rng(2)
+    survivals, stds, cuts, cut_stds = [], [], [], []
+    for _ in range(250):
+        sample = peaks(rng, n_dep, n_sep)
+        result = ae_survival(sample.pop("DEP"), sample, bootstraps=40, seed=rng)
+        survivals.append(result.peaks["SEP"].survival)
+        stds.append(result.peaks["SEP"].std)
+        cuts.append(result.cut)
+        cut_stds.append(result.cut_std)
+    assert np.std(survivals) == pytest.approx(np.mean(stds), rel=0.15)
+    assert np.std(cuts) == pytest.approx(np.mean(cut_stds), rel=0.15)
+    within = np.abs(np.array(survivals) - SEP_SURVIVAL) < 2 * np.array(stds)
+    assert 0.91 < within.mean() < 0.99
+
+
+def test_events_without_an_amplitude_are_left_out():
+    sample = peaks(np.random.default_rng(3))
+    clean = ae_survival(sample["DEP"], {"SEP": sample["SEP"]}, seed=1)
+    spoiled = ae_survival(
+        np.r_[np.nan, sample["DEP"], np.inf],
+        {"SEP": np.r_[sample["SEP"], [np.nan] * 3]},
+        seed=1,
+    )
+    assert spoiled == clean
+
+
+@pytest.mark.parametrize("values", [np.array([]), np.array([np.nan])])
+def test_a_peak_without_events_has_no_survival(values):
+    result = ae_survival(np.arange(50.0), {"SEP": values}).peaks["SEP"]
+    assert np.isnan([result.survival, result.std]).all()
+
+
+@pytest.mark.parametrize(("value", "survival"), [(-1.0, 0), (99.0, 100)])
+def test_a_single_event_has_a_large_error(value, survival):
+    result = ae_survival(np.arange(50.0), {"SEP": np.array([value])}).peaks["SEP"]
+    assert result.survival == survival
+    assert 20 < result.std < 50
+
+
+def test_bad_input_is_named():
+    with pytest.raises(CpunetError, match="19 events of the double-escape peak"):
+        ae_survival(np.r_[np.arange(19.0), np.nan], {})
+    with pytest.raises(CpunetError, match="bootstraps is 1"):
+        ae_survival(np.arange(50.0), {}, bootstraps=1)
+
+
+def test_table_of_a_method_that_agrees_and_one_that_does_not():
+    rng = np.random.default_rng(4)
+    # the scale of A/E is another: each set has its own cut, and it must not matter
+    good = peaks(rng, 3000, 3000, scale=0.9)
+    bad = peaks(rng, 3000, 3000) | {"SEP": rng.normal(10, 1, 3000)}
+    table = survival_table(peaks(rng, 3000, 3000), {"good": good, "bad": bad})
+    sep = table["SEP"]
+    assert sep["survival"]["data"] == pytest.approx(SEP_SURVIVAL, abs=4)
+    assert abs(sep["sigma"]["good"]) < 3
+    assert sep["difference"]["bad"] == pytest.approx(90 - SEP_SURVIVAL, abs=5)
+    assert sep["sigma"]["bad"] > 10
+    for method in ("good", "bad"):
+        difference = sep["survival"][method] - sep["survival"]["data"]
+        std = np.hypot(sep["survival_std"][method], sep["survival_std"]["data"])
+        assert sep["difference"][method] == pytest.approx(difference)
+        assert sep["difference_std"][method] == pytest.approx(std)
+        assert sep["sigma"][method] == pytest.approx(difference / std)
+    assert table["DEP"].keys() == {"events", "missing", "cut", "cut_std"}
+    assert table["DEP"]["cut"]["good"] == pytest.approx(0.9 * (10 + ndtri(0.1)), abs=0.1)
+
+
+def test_sigma_of_agreeing_sets_is_standard_normal():
+    rng = np.random.default_rng(5)
+    sigmas = [
+        survival_table(
+            peaks(rng, 300, 300), {"ren": peaks(rng, 500, 700)}, bootstraps=40, seed=rng
+        )["SEP"]["sigma"]["ren"]
+        for _ in range(200)
+    ]
+    assert np.mean(sigmas) == pytest.approx(0, abs=0.25)
+    assert np.std(sigmas) == pytest.approx(1, abs=0.15)
+
+
+def test_table_is_json_and_says_what_does_not_exist():
+    rng = np.random.default_rng(6)
+    data = peaks(rng) | {"FEP": np.array([])}
+    data["DEP"] = np.r_[data["DEP"], np.inf, np.nan]
+    few = peaks(rng, n_dep=5) | {"FEP": np.array([9.0, np.nan])}
+    table = json.loads(json.dumps(survival_table(data, {"few": few}), allow_nan=False))
+    assert table["DEP"]["events"] == {"data": 800, "few": 5}
+    assert table["DEP"]["missing"] == {"data": 2, "few": 0}
+    assert table["DEP"]["cut"]["few"] is None
+    assert table["SEP"]["survival"]["few"] is None
+    assert table["SEP"]["sigma"] == {"few": None}
+    assert table["SEP"]["survival"]["data"] > 0
+    assert table["FEP"]["events"] == {"data": 0, "few": 1}
+    assert table["FEP"]["missing"] == {"data": 0, "few": 1}
+    assert table["FEP"]["survival"] == {"data": None, "few": None}
+
+
+def test_table_is_the_same_for_the_same_seed():
+    sample = peaks(np.random.default_rng(7))
+    first, second = (survival_table(sample, {"raw": sample}, seed=3) for _ in range(2))
+    assert first == second
+
+
+def test_table_names_what_is_missing():
+    sample = peaks(np.random.default_rng(8))
+    with pytest.raises(CpunetError, match="the data lack peak DEP"):
+        survival_table({"SEP": sample["SEP"]}, {})
+    with pytest.raises(CpunetError, match="ren: peak SEP is missing"):
+        survival_table(sample, {"ren": {"DEP": sample["DEP"]}})
+
+
+def test_sideband_removes_the_background():
+    # 300 events of which 60 % survive, on 100 of which 20 % do; three times that beside
+    survival, _ = sideband_survival(180 + 20, 400, 60, 300, scale=1 / 3)
+    assert survival == pytest.approx(60)
+
+
+def test_without_a_background_the_error_is_binomial():
+    survival, std = sideband_survival(30, 120, 0, 0, scale=1.0)
+    assert survival == pytest.approx(25)
+    assert std == pytest.approx(100 * np.sqrt(0.25 * 0.75 / 120))
+
+
+def test_sideband_error_is_the_spread_over_repeated_experiments():
+    rng = np.random.default_rng(9)
+    results = []
+    for _ in range(4000):
+        signal, below, beside = rng.poisson([400, 150, 450])
+        passing = rng.binomial(signal, 0.6) + rng.binomial(below, 0.2)
+        side_pass = rng.binomial(beside, 0.2)
+        results.append(sideband_survival(passing, signal + below, side_pass, beside, 1 / 3))
+    survivals, stds = np.array(results).T
+    assert survivals.mean() == pytest.approx(60, abs=0.3)
+    assert survivals.std() == pytest.approx(stds.mean(), rel=0.05)
+
+
+def test_sideband_without_events_of_the_peak_has_no_survival():
+    assert np.isnan(sideband_survival(0, 0, 0, 0, scale=1.0)).all()
+    assert np.isnan(sideband_survival(5, 10, 10, 30, scale=1.0)).all()
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [(11, 10, 0, 0, 1.0), (5, 10, 3, 2, 1.0), (-1, 10, 0, 0, 1.0), (5, 10, 1, 2, -1.0)],
+)
+def test_impossible_counts_are_named(counts):
+    with pytest.raises(CpunetError, match="cannot survive"):
+        sideband_survival(*counts)

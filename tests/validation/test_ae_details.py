@@ -1,0 +1,244 @@
+"""A/E against and with the drift time, and by ranges of energy, against plain counting."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtri
+
+from cpunet.errors import CpunetError
+from cpunet.validation.a_over_e import sideband_survival
+from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
+from cpunet.validation.ae_figures import ae_figure, roc_figure, two_dimensional_figure
+from cpunet.validation.range_survival import peak_survival, survival_by_range
+from synthetic import require_drawn
+
+
+def events(rng, n, slope=-1e-5):
+    """A/E that falls with the drift time, with a Gaussian spread."""
+    time = rng.uniform(500, 1500, n)
+    return 0.07 + slope * (time - 1000) + rng.normal(0, 0.002, n), time
+
+
+def by_method(rng, sizes, **kwargs):
+    drawn = {m: events(rng, n, **kwargs) for m, n in sizes.items()}
+    return {m: a for m, (a, _) in drawn.items()}, {m: t for m, (_, t) in drawn.items()}
+
+
+def test_quantiles_are_the_analytic_ones():
+    amplitude, time = by_method(
+        np.random.default_rng(0), {"data": 80_000, "ren": 80_000}, slope=0
+    )
+    table = ae_against_drift_time(amplitude, time, bins=4)
+    assert table["edges_ns"][1:-1] == pytest.approx([750, 1000, 1250], abs=8)
+    for row in table["methods"]["ren"]:
+        for name, p in (("q16", 0.16), ("median", 0.5), ("q84", 0.84)):
+            assert row[name] == pytest.approx(0.07 + 0.002 * ndtri(p), abs=6e-5)
+        # the error of a median of normal values
+        assert row["median_error"] == pytest.approx(
+            0.002 * np.sqrt(np.pi / 2 / row["n"]), rel=0.2
+        )
+    json.dumps(table, allow_nan=False)
+
+
+@pytest.mark.parametrize("n", [15, 200])
+def test_errors_are_the_spread_over_repeated_draws(n):
+    rng = np.random.default_rng(1)
+    rows = []
+    for _ in range(400):
+        amplitude, time = by_method(rng, {"data": n}, slope=0)
+        rows.append(ae_against_drift_time(amplitude, time, bins=1)["methods"]["data"][0])
+    for name in ("q16", "median", "q84"):
+        spread = np.std([row[name] for row in rows])
+        assert np.mean([row[f"{name}_error"] for row in rows]) == pytest.approx(spread, rel=0.2)
+
+
+def test_bins_are_those_of_a_plain_loop_and_what_is_outside_is_counted():
+    amplitude, time = by_method(np.random.default_rng(2), {"data": 300, "raw": 60})
+    time["raw"][:2] = [1e4, np.nan]
+    amplitude["raw"][2] = np.nan
+    table = ae_against_drift_time(amplitude, time, bins=3)
+    edges = table["edges_ns"]
+    assert table["left_out"]["data"] == 0
+    assert table["left_out"]["raw"] >= 3
+    rows = table["methods"]["raw"]
+    assert sum(row["n"] for row in rows) + table["left_out"]["raw"] == 60
+    inside = [
+        a
+        for a, t in zip(amplitude["raw"], time["raw"], strict=True)
+        if edges[1] <= t < edges[2] and np.isfinite(a)
+    ]
+    assert rows[1]["n"] == len(inside)
+    assert rows[1]["median"] == np.median(inside)
+
+
+def test_a_bin_with_few_events_is_missing():
+    amplitude, time = by_method(np.random.default_rng(3), {"data": 100, "raw": 9})
+    table = ae_against_drift_time(amplitude, time, bins=1)
+    assert "(at least 10 are needed)" in table["methods"]["raw"][0]["missing"]
+    require_drawn(ae_figure(table, "SEP"))
+
+
+def test_data_without_events_have_no_bins():
+    nothing = {"data": np.full(5, np.nan)}
+    assert (
+        "no measured pulse has an amplitude"
+        in ae_against_drift_time(nothing, nothing)["missing"]
+    )
+    with pytest.raises(CpunetError, match="data: 5 amplitudes beside 4 drift times"):
+        two_dimensional(nothing, {"data": np.ones(4)})
+
+
+def test_overlap_in_two_dimensions_is_that_of_a_plain_histogram():
+    amplitude, time = by_method(np.random.default_rng(4), {"data": 900, "ren": 1100})
+    amplitude["ren"] += 0.0005
+    time["ren"][:5] = np.nan
+    table = two_dimensional(amplitude, time, bootstraps=20)
+    edges = [np.r_[-np.inf, table[key], np.inf] for key in ("amplitude_edges", "time_edges_ns")]
+    shares = []
+    for method, n in (("data", 900), ("ren", 1100)):
+        known = np.isfinite(time[method])
+        counts = np.histogram2d(amplitude[method][known], time[method][known], edges)[0]
+        assert counts[1:-1, 1:-1].astype(int).tolist() == table["counts"][method]
+        shares.append(np.append(counts.ravel(), (~known).sum()) / n)
+    expected = 100 * np.minimum(*shares).sum() / np.maximum(*shares).sum()
+    assert table["iou"]["ren"] == pytest.approx(expected)
+    assert table["undefined"] == {"data": 0, "ren": 5}
+    json.dumps(table, allow_nan=False)
+
+
+def test_a_wrong_dependence_shows_in_two_dimensions_only():
+    rng = np.random.default_rng(5)
+    right = by_method(rng, {"data": 4000, "ren": 4000}, slope=-6e-6)
+    wrong = by_method(rng, {"raw": 4000}, slope=6e-6)
+    table = two_dimensional(right[0] | wrong[0], right[1] | wrong[1], bootstraps=20)
+    assert table["iou"]["raw"] < table["iou"]["ren"] - 20
+
+
+@pytest.mark.parametrize("n", [400, 4000])
+def test_the_ceiling_is_what_new_data_score(n):
+    rng = np.random.default_rng(6)
+    scores, ceilings = [], []
+    for _ in range(40):
+        table = two_dimensional(*by_method(rng, {"data": n, "ren": n}), bootstraps=20, seed=rng)
+        scores.append(table["iou"]["ren"])
+        ceilings.append(table["iou"]["ceiling"])
+    assert 0 < np.mean(ceilings) - np.mean(scores) < 4  # as is documented
+
+
+def test_few_events_have_no_overlap():
+    amplitude, time = by_method(np.random.default_rng(7), {"data": 900, "ren": 39})
+    assert two_dimensional(amplitude, time) == {
+        "missing": "ren has 39 events (at least 40 are needed for two bins an axis)"
+    }
+
+
+def test_survival_of_a_line_is_that_of_its_own_events():
+    rng = np.random.default_rng(8)
+    n_line, n_flat = 40_000, 60_000
+    energy = np.r_[rng.normal(2103.5, 1, n_line), rng.uniform(2050, 2150, n_flat)]
+    amplitude = np.r_[rng.random(n_line) + 0.2, rng.random(n_flat)]
+    amplitude[:10] = np.nan
+    found = peak_survival(
+        amplitude, energy, 0.7, (2098.5, 2108.5), [(2060, 2090), (2117, 2147)]
+    )
+    assert found["survival"] == pytest.approx(50, abs=1)
+    assert found["scale"] == pytest.approx(10 / 60)
+    assert found["undefined"] == 10
+    in_peak = (energy >= 2098.5) & (energy < 2108.5) & np.isfinite(amplitude)
+    assert found["peak"] == in_peak.sum()
+    assert found["peak_pass"] == (amplitude[in_peak] >= 0.7).sum()
+    survival, std = sideband_survival(
+        found["peak_pass"], found["peak"], found["sideband_pass"], found["sideband"], 1 / 6
+    )
+    assert found["survival"] == pytest.approx(survival)
+    assert found["survival_std"] == pytest.approx(std)
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_continuum_has_nothing_subtracted():
+    found = peak_survival(
+        np.array([0.1, 0.5, 0.6, 0.9]), np.array([2039.0, 2039, 2004, 2074]), 0.5, (2004, 2074)
+    )
+    assert (found["peak"], found["peak_pass"], found["scale"]) == (3, 2, 0)
+    assert found["survival"] == pytest.approx(200 / 3)
+
+
+def test_no_error_is_zero_where_all_or_none_survive():
+    energies = np.full(8, 2039.0)
+    for cut in (0.0, 2.0):
+        for sidebands in ([], [(1990, 2000)]):  # without events
+            found = peak_survival(np.ones(8), energies, cut, (2004, 2074), sidebands)
+            assert 5 < found["survival_std"] < 15
+
+
+@pytest.mark.parametrize(
+    ("cut", "peak", "sidebands", "reason"),
+    [
+        (0.5, (100, 110), [], "no events from 100 to 110 keV"),
+        (np.nan, (2000, 2010), [], "there is no cut"),
+        (0.5, (2000, 2010), [(2010, 2012)], "the sidebands leave no events of 3"),
+    ],
+)
+def test_without_events_there_is_a_reason(cut, peak, sidebands, reason):
+    energies = np.array([2005.0, 2005, 2005, 2011])
+    found = peak_survival(np.ones(4), energies, cut, peak, sidebands)
+    assert reason in found["missing"]
+    assert "survival" not in found
+
+
+@pytest.mark.parametrize(
+    ("peak", "sidebands"), [((5, 5), []), ((0, 10), [(8, 20)]), ((0, 10), [(30, 20)])]
+)
+def test_ranges_that_mean_nothing_are_refused(peak, sidebands):
+    with pytest.raises(CpunetError, match="range"):
+        peak_survival(np.ones(3), np.ones(3), 0.5, peak, sidebands)
+
+
+def test_every_range_and_method_with_its_own_cut():
+    amplitude = {"data": np.array([0.4, 0.6]), "ren": np.array([0.4, 0.6])}
+    energy = dict.fromkeys(amplitude, np.array([10.0, 10.0]))
+    table = survival_by_range(
+        amplitude,
+        energy,
+        {"data": 0.5, "ren": 0.3},
+        {"line": ((9, 11), [(20, 30)])},
+        {"continuum": (5, 15)},
+    )
+    assert list(table) == ["line", "continuum"]
+    assert table["line"]["data"]["survival"] == 50
+    assert table["continuum"]["ren"]["survival"] == 100
+
+
+def test_figures_draw_what_is_in_the_tables():
+    amplitude, time = by_method(np.random.default_rng(9), {"data": 900, "raw": 900, "ren": 900})
+    table = ae_against_drift_time(amplitude, time)
+    figure = ae_figure(table, "SEP")
+    require_drawn(figure)
+    drawn = figure.axes[0].lines[0].get_ydata()
+    assert drawn.tolist() == [row["median"] for row in table["methods"]["data"]]
+
+    amplitude["raw"] = amplitude["raw"] + 100
+    both = two_dimensional(amplitude, time, bootstraps=10)
+    figure = two_dimensional_figure(both, "SEP")
+    require_drawn(figure)
+    said = [[text.get_text() for text in axes.texts] for axes in figure.axes[:3]]
+    assert said == [[], ["no event in the\nrange of the data"], []]
+    mesh = figure.axes[0].collections[0].get_array()
+    assert mesh.sum() == pytest.approx(100 * np.sum(both["counts"]["data"]) / 900)
+
+
+def test_curves_of_survival_are_the_analytic_ones():
+    """Of uniform amplitudes a cut that leaves a part p of one leaves 2 p - 1 of the other."""
+    single, other = np.linspace(1, 3, 2001), np.linspace(0, 2, 2001)
+    unknown = np.append(other, np.nan)
+    drawn = roc_figure(
+        {"SEP": {"data": unknown, "ren": other}, "DEP": dict.fromkeys(("data", "ren"), single)}
+    )
+    (axes,) = drawn.axes
+    assert [line.get_label() for line in axes.lines] == ["Data", "REN translation"]
+    for line in axes.lines:
+        accepted, left = line.get_data()
+        assert left == pytest.approx(np.clip(2 * accepted - 100, 0, 100) / 2, abs=0.2)

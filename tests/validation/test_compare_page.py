@@ -1,0 +1,110 @@
+"""The page over many reports: what is off, who is missing, where the links lead."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.jobs.validation.compare import compare_reports
+from cpunet.validation.forest_plot import span, ticks
+from cpunet.validation.side_by_side import Cell
+
+
+def metrics(*ious: float) -> dict[str, Any]:
+    """Scores of as many parameters as there are IoU; their ceiling is 88 ± 2."""
+    parameters = {
+        f"parameter_{i}": {
+            "iou": {"ren": iou, "ceiling": 88.0},
+            "iou_std": {"ren": 2.5, "ceiling": 2.0},
+        }
+        for i, iou in enumerate(ious)
+    }
+    tested = {"ren": {"auc": 0.51, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}}
+    return {
+        "peaks": {"SEP": {"parameters": parameters, "two_sample": tested}},
+        "training": {"recipe": "fast", "peak": "FEP", "device": "cpu"},
+    }
+
+
+def page_of(folder: Path, runs: dict[str, tuple[float, ...]], **more: Any) -> str:
+    """The page ``pages/index.html`` of reports with these IoU; without one there is none."""
+    for name, ious in runs.items():
+        (folder / name / "report").mkdir(parents=True)
+        if ious:
+            text = json.dumps(metrics(*ious))
+            (folder / name / "report" / "metrics.json").write_text(text)
+            (folder / name / "report" / "report.html").write_text("<p>here</p>")
+    out = folder / "pages" / "index.html"
+    compare_reports([folder / name / "report" for name in runs], out=out, **more)
+    return out.read_text("utf-8")
+
+
+def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
+    # three of four IoU lie more than two of the ceiling's sigmas below it, the AUC does not
+    runs = {
+        "V01/p03": (87.0, 83.9, 70.0, 60.0),
+        "V01/p04": (87.0, 84.1),
+        "B 2#?<&/p04": (50.0,),
+    }
+    page = page_of(tmp_path, runs)
+    assert '<td class="off">3 of 5 off</td>' in page
+    assert "<td>0 of 3 off</td>" in page
+    assert "off by 19.0 sigma (IoU 50.0 of 88.0)" in page
+    assert "recipe fast, trained on FEP, on cpu" in page
+    links = re.findall(r'href="(.*?)"', page)
+    targets = {(tmp_path / "pages" / unquote(link)).resolve() for link in links}
+    assert targets == {tmp_path / name / "report" / "report.html" for name in runs}
+    assert "B 2#?&lt;&amp;/p04" in page
+    assert not re.search(r"(src=|url\(|https?:|@import)", page)
+
+
+def test_missing_reports_are_listed_if_allowed(tmp_path):
+    runs: dict[str, tuple[float, ...]] = {"V01/p03": (87.0,), "V01/p04": ()}
+    with pytest.raises(
+        CpunetError, match=r"p04/report: no metrics.json in it; .* --missing-ok"
+    ):
+        page_of(tmp_path / "a", runs)
+    page = page_of(tmp_path / "b", runs, missing_ok=True)
+    assert "<strong>No report:</strong> p04." in page
+    assert "1 of 2 reports" in page
+    with pytest.raises(CpunetError, match="none of the 1 reports is there yet"):
+        page_of(tmp_path / "c", {"V01/p04": ()}, missing_ok=True)
+
+
+def test_many_reports_have_no_columns(tmp_path):
+    few = page_of(tmp_path / "few", {f"V{i}/p03": (80.0,) for i in range(8)})
+    assert "<h2>Side by side</h2>" in few
+    many = page_of(tmp_path / "many", {f"V{i}/p03": (80.0,) for i in range(9)})
+    assert "<h2>Side by side</h2>" not in many
+    assert many.count("<circle") == 18  # IoU and AUC
+
+
+def test_a_missing_score_is_said_in_its_line(tmp_path):
+    page = page_of(tmp_path, {"a": (80.0, 81.0), "b": (70.0,)})
+    second = ET.fromstring(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)[1])
+    assert len(list(second.iter("circle"))) == 1
+    assert [text.text for text in second.iter("text")].count("no score") == 1
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [(0.0, 100.0), (-3.0, 3.0), (0.49, 0.52), (1e-9, 2e-9), (0.0, math.nextafter(2000.0, 0))],
+)
+def test_ticks_are_few_and_inside(ends):
+    found = ticks(*ends)
+    assert 2 <= len(found) <= 5
+    assert all(ends[0] <= tick <= ends[1] for tick in found)
+
+
+def test_span_of_equal_values_is_not_empty():
+    for value in (0.0, 5.0):
+        low, high = span([Cell("", value), Cell("", value), Cell()])
+        assert low < value < high

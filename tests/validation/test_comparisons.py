@@ -1,0 +1,373 @@
+"""Overlap of distributions: nothing is dropped, and the ceiling is what it says."""
+
+from __future__ import annotations
+
+import json
+
+import hist
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from cpunet.errors import CpunetError
+from cpunet.recipes import load_recipe
+from cpunet.validation import distances
+from cpunet.validation.comparisons import (
+    ceiling,
+    compare,
+    data_axis,
+    histogram,
+    iou,
+    iou_error,
+)
+from cpunet.validation.distances import (
+    distance_errors,
+    kolmogorov_smirnov,
+    null_distances,
+    wasserstein,
+)
+from cpunet.validation.resampling import Draws, Resampled, resampled_twice
+
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 50})
+UNIT = hist.axis.Regular(10, 0.0, 1.0)
+
+any_floats = arrays(
+    float,
+    st.integers(1, 60),
+    elements=st.one_of(st.floats(-1e6, 1e6), st.just(np.nan), st.just(np.inf)),
+)
+
+
+def both_resampled(n_a: int, n_b: int, draws: int, seed: int) -> Draws:
+    """Bootstraps of two sets, each of its own size."""
+    rng = np.random.default_rng(seed)
+    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
+
+
+def test_range_comes_from_the_bulk_of_the_data():
+    rng = np.random.default_rng(0)
+    clean = rng.normal(5, 1, 5000)
+    axis = data_axis(clean, 49)
+    spoiled = data_axis(np.r_[clean, [1e12] * 20, -1e12, np.inf, np.nan], 49)
+    assert spoiled.size == pytest.approx(axis.size, abs=6)
+    assert -1 < spoiled.edges[0] < clean.min() + 0.1
+    assert clean.max() - 0.1 < spoiled.edges[-1] < 11
+
+
+@pytest.mark.parametrize("n", [100, 1000, 3000])
+def test_bin_width_is_that_of_freedman_and_diaconis(n):
+    data = np.linspace(0, 1, n)
+    width = np.diff(data_axis(data, 49).edges)[0]
+    assert width == pytest.approx(2 * 0.5 / np.cbrt(n), rel=0.1)
+
+
+def test_number_of_bins_is_limited():
+    assert data_axis(np.random.default_rng(0).normal(size=100_000), 49).size == 49
+
+
+@given(data=any_floats.filter(lambda d: np.isfinite(d).any()))
+@settings(max_examples=100, deadline=None)
+def test_any_data_can_be_binned_and_every_event_is_counted(data):
+    axis = data_axis(data, 49)
+    assert 1 <= axis.size <= 49
+    assert histogram(data, axis).sum() == len(data)
+    assert iou(data, data, axis) == pytest.approx(100)
+
+
+def test_equal_values_share_one_bin():
+    axis = data_axis(np.full(20, 7.0), 49)
+    assert histogram(np.array([7.0, 6.9, 7.1]), axis).tolist() == [1, 1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 1), (-20, -0.1), (-1, 1e-9), (-3, 0), (-12, 5), (1e9, 1e9 + 1)]
+)
+def test_the_largest_value_is_no_overflow(low, high):
+    rng = np.random.default_rng(0)
+    for data in (np.linspace(low, high, 11), *rng.uniform(low, high, (200, 100))):
+        assert histogram(data, data_axis(data, 49))[-2:].tolist() == [0, 0]
+
+
+def test_without_finite_data_there_is_no_axis():
+    with pytest.raises(CpunetError, match="no finite value"):
+        data_axis(np.array([np.nan, np.inf]), 49)
+
+
+@given(a=any_floats, b=any_floats)
+@settings(max_examples=100, deadline=None)
+def test_iou_is_symmetric_and_between_0_and_100(a, b):
+    score = iou(a, b, UNIT)
+    assert 0 <= score <= 100 + 1e-9
+    assert score == pytest.approx(iou(b, a, UNIT))
+
+
+def test_events_outside_the_range_lower_the_iou():
+    inside = np.full(10, 0.55)
+    mostly_outside = np.r_[0.55, np.full(9, 5.0)]
+    # with density histograms these would score 100 %
+    assert iou(inside, mostly_outside, UNIT) == pytest.approx(100 * 0.1 / 1.9)
+    assert iou(inside, np.full(3, -5.0), UNIT) == 0
+    assert iou(np.full(3, -5.0), np.full(3, 5.0), UNIT) == 0
+
+
+def test_nans_are_no_match_for_numbers_nor_for_the_overflow():
+    numbers, nans = np.full(10, 0.5), np.full(10, np.nan)
+    assert iou(numbers, nans, UNIT) == 0
+    assert iou(np.full(10, 99.0), nans, UNIT) == 0
+    assert iou(numbers, np.r_[numbers, nans], UNIT) == pytest.approx(100 * 0.5 / 1.5)
+
+
+def test_empty_bins_and_unequal_sizes_do_not_matter():
+    a = np.array([0.05, 0.95])
+    assert iou(a, np.repeat(a, 7), UNIT) == pytest.approx(100)
+
+
+def test_one_event_against_one_event():
+    assert iou(np.array([0.5]), np.array([0.5]), UNIT) == 100
+    assert iou(np.array([0.5]), np.array([0.9]), UNIT) == 0
+
+
+def test_an_empty_set_has_no_score():
+    assert np.isnan(iou(np.array([]), np.array([0.5]), UNIT))
+    assert np.isnan(wasserstein(np.array([]), np.array([0.5])))
+    assert np.isnan(kolmogorov_smirnov(np.array([np.nan]), np.array([0.5])))
+    assert np.isnan(iou_error(np.array([]), np.array([0.5]), UNIT, both_resampled(0, 1, 5, 0)))
+
+
+def test_two_samples_of_one_distribution_score_near_the_ceiling():
+    """Over many draws, the IoU of real samples has the ceiling's mean and spread."""
+    rng = np.random.default_rng(3)
+    n_data, n_sim = 800, 900
+    real, ceilings, errors = [], [], []
+    for draw in range(400):
+        data, sim = rng.normal(size=n_data), rng.normal(size=n_sim)
+        axis = data_axis(data, 49)
+        real.append(iou(data, sim, axis))
+        mean, error = ceiling(data, axis, resampled_twice(n_data, n_sim, n_data, 50, draw))
+        ceilings.append(mean)
+        errors.append(error)
+    assert np.mean(real) == pytest.approx(np.mean(ceilings), abs=1.0)
+    assert np.std(real) == pytest.approx(np.mean(errors), rel=0.3)
+    within = np.abs(np.subtract(real, ceilings)) < 2 * np.array(errors)
+    assert within.mean() > 0.9
+
+
+def test_the_ceiling_rises_with_the_number_of_events():
+    data = np.random.default_rng(0).normal(size=1000)
+    axis = data_axis(data, 49)
+    sizes = (100, 1000, 100_000)
+    means = [ceiling(data, axis, resampled_twice(1000, n, n, 50, 1))[0] for n in sizes]
+    assert means == sorted(means)
+    assert means[-1] > 98
+
+
+def test_iou_error_is_the_spread_over_repeated_samples():
+    rng = np.random.default_rng(4)
+    axis = hist.axis.Regular(20, -4, 4)
+    scores, errors = [], []
+    for draw in range(150):
+        a, b = rng.normal(0, 1, 500), rng.normal(1, 1, 600)
+        scores.append(iou(a, b, axis))
+        errors.append(iou_error(a, b, axis, both_resampled(500, 600, 50, draw)))
+    assert np.std(scores) == pytest.approx(np.mean(errors), rel=0.3)
+
+
+def test_iou_error_near_the_ceiling_is_a_sixth_too_large():
+    rng = np.random.default_rng(5)
+    axis = hist.axis.Regular(20, -4, 4)
+    scores, errors = [], []
+    for draw in range(200):
+        a, b = rng.normal(size=500), rng.normal(size=600)
+        scores.append(iou(a, b, axis))
+        errors.append(iou_error(a, b, axis, both_resampled(500, 600, 50, draw)))
+    assert np.mean(errors) / np.std(scores) == pytest.approx(1.15, abs=0.2)
+
+
+def peak_with_tail(rng: np.random.Generator, n: int) -> np.ndarray:
+    """A line with a tail below, as the current amplitude of an escape peak has it."""
+    in_peak = rng.random(n) < 0.6
+    return np.where(in_peak, rng.normal(0, 0.3, n), -3 * rng.exponential(size=n))
+
+
+SHAPES = {
+    "normal": lambda rng, n: rng.normal(size=n),
+    "exponential": lambda rng, n: rng.exponential(size=n),
+    "peak-with-tail": peak_with_tail,
+}
+
+
+@pytest.mark.parametrize("draws", [150, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape, draws):
+    """Over many draws: 2.3 % of a normal law, more of skewed ones; 0.5 … 9 % here."""
+    rng = np.random.default_rng(6)
+    n_data, n_sim = 300, 350
+    z = {"iou": [], "w1": [], "ks": []}
+    for _ in range(draws):
+        data, sim = SHAPES[shape](rng, n_data), SHAPES[shape](rng, n_sim)
+        axis = data_axis(data, 49)
+        pairs = resampled_twice(n_data, n_sim, n_data, 80, rng)
+        mean, std = ceiling(data, axis, pairs)
+        null = null_distances(data, pairs)
+        apart = {
+            "iou": (mean - iou(data, sim, axis), std),
+            "w1": (wasserstein(data, sim) - null.wasserstein, null.wasserstein_std),
+            "ks": (kolmogorov_smirnov(data, sim) - null.ks, null.ks_std),
+        }
+        for name, (off, spread) in apart.items():
+            z[name].append(off / spread)
+    for name, values in z.items():
+        values = np.array(values)
+        assert 0.005 <= (values > 2).mean() <= 0.09, name
+        assert (values < -3).mean() == 0, name
+        # the expectation is that of fresh samples within a third of the spread
+        assert abs(values.mean()) < 0.33, name
+        assert values.std() == pytest.approx(1, abs=0.2), name
+
+
+def test_errors_of_distances_are_the_scatter_of_fresh_samples():
+    rng = np.random.default_rng(7)
+    found, errors = [], []
+    for draw in range(150):
+        a, b = rng.normal(size=500), rng.normal(0.5, 1.2, 600)
+        found.append((wasserstein(a, b), kolmogorov_smirnov(a, b)))
+        errors.append(distance_errors(a, b, both_resampled(500, 600, 50, draw)))
+    assert np.mean(errors, axis=0) == pytest.approx(np.std(found, axis=0), rel=0.2)
+
+
+def on_grid(values: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Histogram of finite values as one draw."""
+    bins = distances._bins(values, upper)
+    return np.bincount(bins, minlength=len(upper)).astype(np.float32)[:, np.newaxis]
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_on_the_grid_against_scipy(shape, shift):
+    """W1 on 256 bins within 5 % of its null, KS within 0.004."""
+    rng = np.random.default_rng(8)
+    a, b = SHAPES[shape](rng, 4000), SHAPES[shape](rng, 5000) + shift
+    a[:2], b[0] = (1e5, -1e4), 3e5
+    null = null_distances(SHAPES[shape](rng, 4000), resampled_twice(4000, 4000, 5000, 20, 0))
+    drawn = [np.random.default_rng(i).choice(v, len(v)) for i, v in enumerate((a, b))]
+    upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
+    assert len(upper) <= distances.NODES
+    counts = [on_grid(v, upper) for v in drawn]
+    assert [c.sum() for c in counts] == [4000, 5000]
+    w1, ks = distances._distances(counts[0], counts[1], positions)
+    exact = scipy.stats.wasserstein_distance(*drawn)
+    assert w1 == pytest.approx(exact, abs=0.05 * null.wasserstein)
+    assert ks == pytest.approx(scipy.stats.ks_2samp(*drawn).statistic, abs=0.004)
+
+
+@given(a=any_floats, b=any_floats)
+@settings(max_examples=100, deadline=None)
+def test_distances_of_few_values_on_the_grid_are_exact(a, b):
+    a, b = a[np.isfinite(a)], b[np.isfinite(b)]
+    if not (a.size and b.size):
+        return
+    upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
+    w1, ks = distances._distances(on_grid(a, upper), on_grid(b, upper), positions)
+    assert w1 == pytest.approx(scipy.stats.wasserstein_distance(a, b), rel=1e-9, abs=1e-9)
+    assert ks == pytest.approx(kolmogorov_smirnov(a, b), abs=1e-9)
+    if a.size > 1 and b.size > 1:  # of single values SciPy's p-value divides by zero
+        assert ks == pytest.approx(scipy.stats.ks_2samp(a, b, method="asymp").statistic)
+
+
+def test_the_null_of_a_uniform_distribution_is_known():
+    """The KS distance follows Kolmogorov's law, and W1 is the area under a bridge."""
+    data = np.random.default_rng(9).uniform(size=5000)
+    null = null_distances(data, resampled_twice(5000, 5000, 5000, 400, 1))
+    law = scipy.stats.kstwobign
+    scale = np.sqrt(2 / 5000)
+    assert null.ks == pytest.approx(law.mean() * scale, rel=0.06)
+    assert null.ks_std == pytest.approx(law.std() * scale, rel=0.15)
+    area = np.sqrt(2 / np.pi) * np.pi / 8  # of E|B(x)| = √(2 x (1 - x) / π)
+    assert null.wasserstein == pytest.approx(area * scale, rel=0.08)
+
+
+def test_null_distances_shrink_with_the_number_of_events():
+    data = np.random.default_rng(10).normal(size=1000)
+    sizes = (100, 1000, 10_000)
+    nulls = [null_distances(data, resampled_twice(1000, n, n, 50, 1)) for n in sizes]
+    for values in zip(*nulls, strict=True):
+        assert list(values) == sorted(values, reverse=True)
+
+
+def test_distances_without_values_have_no_error_and_no_null():
+    nothing, some = np.array([np.nan]), np.array([1.0, 2.0])
+    assert np.isnan(distance_errors(nothing, some, both_resampled(1, 2, 5, 0))).all()
+    assert np.isnan(null_distances(nothing, resampled_twice(1, 5, 5, 5, 0))).all()
+    assert np.isnan(null_distances(some, resampled_twice(2, 0, 5, 5, 0))).all()
+
+
+def test_one_event_and_equal_values():
+    one, same = np.array([3.0]), np.full(50, 3.0)
+    for data in (one, same):
+        pairs = resampled_twice(len(data), 10, 10, 5, 0)
+        assert null_distances(data, pairs) == (0, 0, 0, 0)
+        assert distance_errors(data, same, both_resampled(len(data), 50, 5, 0)) == (0, 0)
+        assert ceiling(data, data_axis(data, 49), pairs) == (100, 0)
+
+
+def test_distances_against_known_shifts():
+    a = np.linspace(0, 1, 1000)
+    assert wasserstein(a, a + 0.25) == pytest.approx(0.25)
+    assert kolmogorov_smirnov(a, a + 0.25) == pytest.approx(0.25, abs=2e-3)
+    assert wasserstein(a, np.r_[a, np.nan, np.inf]) == pytest.approx(0)
+
+
+def parameters(seed: int, shift: float = 0.0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {
+        "drift_time": rng.normal(1000 + shift, 100, 500),
+        "tail_slope": rng.normal(-18 + shift, 0.1, 500),
+    }
+
+
+def test_compare_takes_any_methods_and_is_json_ready():
+    data = parameters(0)
+    methods = {"raw": parameters(1, 300.0), "ren": parameters(2), "rival": parameters(3, 50.0)}
+    methods["raw"]["tail_slope"][:] = np.nan
+    result = compare(data, methods, SCORES, seed=1)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert result.keys() == data.keys()
+    drift = result["drift_time"]
+    assert drift["iou"].keys() == {"raw", "ren", "rival", "ceiling"}
+    assert drift["iou"]["raw"] < drift["iou"]["rival"] < drift["iou"]["ren"]
+    assert drift["iou"]["ren"] == pytest.approx(drift["iou"]["ceiling"], abs=10)
+    assert drift["wasserstein"]["raw"] == pytest.approx(300, rel=0.1)
+    assert drift["ks"]["raw"] > drift["ks"]["ren"]
+    tail = result["tail_slope"]
+    assert tail["missing"] == {"data": 0, "raw": 500, "ren": 0, "rival": 0}
+    assert tail["iou"]["raw"] == 0
+    for key in ("wasserstein", "wasserstein_std", "ks", "ks_std"):
+        assert tail[key].keys() == {"raw", "ren", "rival"}
+        assert tail[key]["raw"] is None
+    assert drift["wasserstein_null"] == pytest.approx(9, rel=0.25)  # of a width of 100
+    assert drift["wasserstein"]["ren"] < drift["wasserstein_null"] + 3 * 3
+    assert 0 < drift["wasserstein_null_std"] < drift["wasserstein_null"]
+    assert drift["ks_null"] == pytest.approx(0.87 * np.sqrt(2 / 500), rel=0.15)
+    assert drift["wasserstein_std"]["raw"] == pytest.approx(100 * np.sqrt(2 / 500), rel=0.4)
+
+
+def test_compare_gives_the_same_numbers_for_the_same_seed():
+    data, methods = parameters(0), {"ren": parameters(1)}
+    assert compare(data, methods, SCORES, seed=5) == compare(data, methods, SCORES, seed=5)
+
+
+@pytest.mark.parametrize("values", [np.array([]), np.array([np.nan, np.nan])])
+def test_compare_without_usable_data_gives_none(values):
+    result = compare({"drift_time": values}, {"ren": parameters(1)}, SCORES, seed=1)
+    assert set(result["drift_time"]["iou"].values()) == {None}
+    for key in ("wasserstein_null", "wasserstein_null_std", "ks_null", "ks_null_std"):
+        assert result["drift_time"][key] is None
+    assert result["drift_time"]["missing"]["data"] == len(values)
+
+
+def test_compare_names_the_method_that_lacks_a_parameter():
+    with pytest.raises(CpunetError, match="ren: parameter tail_slope is missing"):
+        compare(parameters(0), {"ren": {"drift_time": np.ones(3)}}, SCORES, seed=1)

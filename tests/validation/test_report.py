@@ -1,0 +1,299 @@
+"""The report's files: strict JSON, a page that stands alone, honest gaps."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from cpunet.recipes import load_recipe
+from cpunet.validation.comparisons import compare
+from cpunet.validation.html_pages import DPI, figure_png
+from cpunet.validation.nested_tables import nested_html
+from cpunet.validation.report import write_report
+
+SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
+VOID = {"meta", "img", "link", "br"}
+
+
+class Checker(HTMLParser):
+    """Collects the addresses a page refers to, and checks that its tags close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [v for k, v in attrs if k in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def figure() -> Figure:
+    drawn = Figure(figsize=(2, 1))
+    drawn.subplots().plot([0, 1], [0, 1])
+    return drawn
+
+
+def metrics() -> dict:
+    rng = np.random.default_rng(0)
+    values = {m: {"drift_time": rng.normal(1000, 10, 200)} for m in ("data", "raw", "ren")}
+    data = values.pop("data")
+    return {
+        "peaks": {
+            "SEP": {
+                "n_sim": 200,
+                "n_data": np.int64(200),
+                "parameters": compare(data, values, SCORES, seed=1),
+                "paired": {
+                    "raw": {"rmse": 0.1, "edge_rmse": 0.08, "unaligned": 0},
+                    "ren": {"rmse": np.float32(0.25), "edge_rmse": np.nan, "unaligned": 1},
+                },
+            },
+            "DEP": {"n_sim": 0, "n_data": 0, "parameters": {}},
+        },
+        "training": {"recipe": "paper", "seconds": 12.5, "device": "cpu"},
+        "rejections": {"data": {"saturated": 3}, "simulation": {"no <edge>": 4}},
+    }
+
+
+@pytest.fixture
+def report(tmp_path):
+    drawn = {"SEP_drift_time": figure(), "Co-60/1 losses": figure()}
+    write_report(tmp_path, metrics(), drawn, ["Trained on FEP; 1 < 2 & 3."])
+    return tmp_path
+
+
+def test_files_of_the_report(report):
+    assert sorted(p.name for p in report.iterdir()) == [
+        "Co-60_1_losses.png",
+        "SEP_drift_time.png",
+        "metrics.json",
+        "report.html",
+    ]
+
+
+def test_metrics_are_strict_sorted_json(report):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    text = (report / "metrics.json").read_text()
+    read = json.loads(text, parse_constant=refuse)
+    assert text == json.dumps(read, indent=2, sort_keys=True) + "\n"
+    paired = read["peaks"]["SEP"]["paired"]["ren"]
+    assert paired == {"rmse": 0.25, "edge_rmse": None, "unaligned": 1}
+    assert read["peaks"]["SEP"]["parameters"]["drift_time"]["iou"]["ceiling"] > 50
+
+
+def test_page_stands_alone(report):
+    html = (report / "report.html").read_text()
+    assert not re.search(r"https?:|//[a-z]|url\((?!#)|@import", html.replace(" // ", ""))
+    assert "default-src 'none'" in html
+    checker = Checker()
+    checker.feed(html)
+    assert checker.open == []
+    assert all(address.startswith("#") for address in checker.addresses)
+    ids = re.findall(r' id="([^"]*)"', html)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'(?:url\(|xlink:href=")#([^)"]*)', html)) <= set(ids)
+
+
+def test_page_shows_scores_counts_and_provenance(report):
+    html = (report / "report.html").read_text()
+    for text in (
+        "SEP: 200 simulated, 200 measured pulses",
+        '<th scope="col">IoU [%]</th>',
+        ">Ceiling</td>",
+        "Drift time",
+        "<td>REN translation</td><td>250</td><td>–</td>",
+        "<td>data: saturated</td><td>3</td>",
+        "simulation: no &lt;edge&gt;",
+        "1 &lt; 2 &amp; 3.",
+        "<td>device</td><td>cpu</td>",
+    ):
+        assert text in html
+
+
+def test_names_of_methods_are_aligned_as_words(report):
+    html = (report / "report.html").read_text()
+    left = re.findall(r'<t[hd][^>]*class="text">([^<]*)</t[hd]>', html)
+    assert left == ["Method", "Simulation", "REN translation", "Ceiling"]
+
+
+def test_scores_are_panels_of_dots_beside_their_ceilings(report):
+    html = (report / "report.html").read_text()
+    panels = re.search(r'<div class="panels">(.*?)</div>', html, re.DOTALL)
+    assert panels is not None
+    assert "SEP, IoU of the drift time [%]; grey: the ceiling" in panels[1]
+    assert panels[1].count("<circle") == 2
+    assert panels[1].count('fill="#ddd"') == 2
+    # tables are there for those who ask
+    assert "<details><summary>Scores as a table</summary>" in html
+
+
+def test_a_page_begins_with_what_was_compared_and_a_picture(tmp_path):
+    compared = {"simulation": "my <sim>.lh5", "fit": "chi-square is 1.1 per moment"}
+    names = ("spectrum", "FEP mean pulse", "SEP mean pulse", "SEP noise", "A over E survival")
+    found = metrics() | {"compared": compared, "training": {"peak": "FEP"}}
+    write_report(tmp_path, found, {name: figure() for name in names}, [])
+    html = (tmp_path / "report.html").read_text()
+    places = [
+        html.index(text)
+        for text in (
+            "my &lt;sim&gt;.lh5",
+            'aria-label="SEP mean pulse"',
+            'id="scores"',
+            'aria-label="A over E survival"',
+            'aria-label="SEP noise"',
+            'aria-label="FEP mean pulse"',
+        )
+    ]
+    assert places == sorted(places)
+    assert all(html.count(f'aria-label="{name}"') == 1 for name in names)
+
+
+def test_a_report_of_nothing_can_be_written(tmp_path):
+    write_report(tmp_path, {}, {}, [])
+    assert json.loads((tmp_path / "metrics.json").read_text()) == {}
+    assert "None recorded." in (tmp_path / "report.html").read_text()
+
+
+def test_the_same_report_gives_the_same_bytes(report, tmp_path_factory):
+    again = tmp_path_factory.mktemp("again")
+    drawn = {"SEP_drift_time": figure(), "Co-60/1 losses": figure()}
+    write_report(again, metrics(), drawn, ["Trained on FEP; 1 < 2 & 3."])
+    for path in report.iterdir():
+        assert path.read_bytes() == (again / path.name).read_bytes()
+
+
+def test_pulses_that_cannot_be_prepared_are_counted_on_the_page(tmp_path):
+    peaks = {"SEP": {"n_sim": 9, "n_data": 9, "parameters": {}, "not_prepared": {"ren": 7}}}
+    write_report(tmp_path, {"peaks": peaks}, {}, [])
+    assert "REN translation: 7." in (tmp_path / "report.html").read_text()
+
+
+def test_distances_have_errors_and_what_chance_leaves(tmp_path):
+    found = {
+        "iou": {"ren": 80.0, "ceiling": 85.0},
+        "iou_std": {"ren": 2.0, "ceiling": 1.5},
+        "wasserstein": {"ren": 12.345},
+        "wasserstein_std": {"ren": 1.2},
+        "wasserstein_null": 9.0,
+        "wasserstein_null_std": 2.1,
+        "ks": {"ren": 0.0512},
+        "ks_std": {"ren": 0.011},
+        "ks_null": 0.04,
+        "ks_null_std": None,
+    }
+    peak = {"n_sim": 9, "n_data": 9, "parameters": {"drift_time": found, "rise_10_90": found}}
+    write_report(tmp_path, {"peaks": {"SEP": peak}}, {}, [])
+    html = (tmp_path / "report.html").read_text()
+    for text in (">12.3 ± 1.2<", ">0.051 ± 0.011<", ">9.0 ± 2.1<", ">0.04<"):
+        assert html.count(text) == 2
+    assert "<td>Drift time [ns]</td>" in html
+    assert "<summary>Further parameters: 1</summary>" in html
+
+
+def test_verdicts_in_words(tmp_path):
+    one = {"SEP": {"ren": {"drift_time": {"sigma": 3.14, "words": "off by 3.1 sigma"}}}}
+    verdicts = {"summary": ["REN, SEP: <all> agree"], "table": one}
+    write_report(tmp_path, {"verdicts": verdicts}, {}, [])
+    html = (tmp_path / "report.html").read_text()
+    assert "<li>REN, SEP: &lt;all&gt; agree</li>" in html
+    row = r"<td>SEP</td><td[^>]*>REN translation</td><td[^>]*>drift time</td><td>\+3\.1</td>"
+    assert re.search(row, html)
+
+
+def test_many_figures_are_folded(tmp_path):
+    write_report(tmp_path, {}, {f"figure {i}": figure() for i in range(5)}, [])
+    html = (tmp_path / "report.html").read_text()
+    assert "5 figures, also as PNG beside this page</summary>" in html
+
+
+def test_paper_carries_figures_of_all_peaks_and_no_long_tables(tmp_path):
+    names = ["SEP drift_time", "SEP superpulses", "SEP A over E and drift time", "losses"]
+    metrics = {"noise": {"a": 1.0}, "training": {"peak": "FEP"}}
+    write_report(tmp_path, metrics, {name: figure() for name in names}, [])
+    html = (tmp_path / "report.html").read_text()
+    shapes = html[html.index('id="shapes"') : html.index('id="ae"')]
+    assert re.findall(r'<figure [^>]*aria-label="([^"]*)"', shapes) == [
+        "SEP drift time",
+        "SEP superpulses",
+    ]
+    assert '<details class="screen"><summary>Noise' in html
+    details = html[html.index('id="details"') :]
+    assert 'aria-label="losses"' in details[details.index('<div class="screen">') :]
+
+
+def test_any_nesting_becomes_tables():
+    html = nested_html(
+        {
+            "edges_ns": [100.0, 200.0],
+            "power": list(range(30)),
+            "SEP": {
+                "ren": {"rms": 0.0123, "rms_std": 0.001, "fits": True},
+                "raw": {"rms": 0.5, "rms_std": 0.1, "more": None},
+            },
+            "slices": {
+                "ren": [{"n": 4, "rms": 1.5}, *2 * [{"n": 1, "missing": "1 <pulse>"}]],
+                "raw": [{"n": 0, "missing": "no pulse"}],
+            },
+            "FEP": {"missing": "no pulses"},
+        }
+    )
+    for text in (
+        "<td>100, 200</td>",
+        "<td>30 values from 0 to 29</td>",
+        "<h4>SEP</h4>",
+        "<td>REN translation</td><td>0.0123 ± 0.0010</td><td>yes</td><td>–</td>",
+        "<td>Simulation</td><td>0.50 ± 0.10</td><td>–</td><td>–</td>",
+        "<td>1</td><td>4</td><td>1.5</td></tr>",
+        "<p>Missing: 2–3: 1 &lt;pulse&gt;.</p>",
+        "<p>Missing: 1: no pulse.</p>",
+        "<p>Missing: no pulses.</p>",
+    ):
+        assert text in html
+    checker = Checker()
+    checker.feed(html)
+    assert checker.open == []
+
+
+def test_peaks_named_after_their_energy_may_be_missing_together():
+    few = {"missing": "few pulses"}
+    html = nested_html({"FEP": few, "583": few, "584": few, "DEP": few})
+    assert "<p>Missing: FEP, 583–584, DEP: few pulses.</p>" in html
+
+
+def test_no_peak_of_a_combined_training_is_shown_first(tmp_path):
+    names = [f"{peak} mean pulse" for peak in ("FEP", "SEP", "DEP", "FEP,1000-1580")]
+    found = {"training": {"peak": "FEP,1000-1580"}}
+    write_report(tmp_path, found, {name: figure() for name in names}, [])
+    html = (tmp_path / "report.html").read_text()
+    first = re.findall(r'<figure [^>]*aria-label="([^"]*)"', html[: html.index('id="scores"')])
+    assert first == ["SEP mean pulse", "DEP mean pulse"]
+
+
+def test_a_figure_has_the_pixels_that_it_would_be_saved_with():
+    def made() -> Figure:
+        drawn = Figure(figsize=(4, 3), layout="constrained")
+        left, right = drawn.subplots(1, 2)
+        left.plot([1, 1000], [1, 1000], label="a line")
+        left.set(xscale="log", xlabel="Energy [keV]", title="two panels")
+        drawn.colorbar(right.imshow([[0, 1], [2, 3]]))
+        drawn.legend(loc="outside upper left")
+        return drawn
+
+    saved = io.BytesIO()
+    made().savefig(saved, format="png", dpi=DPI)
+    drawn, wanted = (Image.open(png) for png in (io.BytesIO(figure_png(made())), saved))
+    np.testing.assert_array_equal(drawn, wanted)

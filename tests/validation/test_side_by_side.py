@@ -1,0 +1,202 @@
+"""Runs beside each other: the best is marked, and unlike data are noted."""
+
+from __future__ import annotations
+
+import copy
+import re
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.validation.side_by_side import side_by_side
+from cpunet.validation.side_by_side_page import side_by_side_page
+
+
+def metrics(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:
+    def parameter() -> dict[str, Any]:
+        return {
+            "iou": {"ren": iou, "rc": 3.0, "ceiling": 88.0},
+            "iou_std": {"ren": 2.5, "rc": 1.0, "ceiling": 1.5},
+        }
+
+    def tested(value: float) -> dict[str, float]:
+        return {"auc": value, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}
+
+    return {
+        "peaks": {
+            "SEP": {
+                "n_data": 900,
+                "n_sim": 950,
+                "parameters": {"drift_time": parameter(), "tail_slope": parameter()},
+                "two_sample": {"ren": tested(auc), "rc": tested(0.99)},
+                "paired": {"ren": {"edge_rmse": 0.0006}, "rc": {"edge_rmse": 0.007}},
+            }
+        },
+        "ae_survival": {
+            "SEP": {"difference": {"ren": off}, "difference_std": {"ren": 2.0}},
+        },
+        "rejections": {"data": {"saturated": 3}, "sim": {}},
+    }
+
+
+def test_rows_and_what_they_show():
+    table = side_by_side({"a": metrics(), "b": metrics(85.0, 0.45, -0.5)})
+    assert [(row.peak, row.score.split(":")[0].split(" [")[0]) for row in table.rows] == [
+        ("SEP", "drift time"),
+        ("SEP", "tail slope"),
+        ("SEP", "classifier"),
+        ("SEP", "edge RMSE"),
+        ("SEP", "A/E survival minus data"),
+    ]
+    shown = [[cell.text for cell in row.cells] for row in table.rows]
+    assert shown[0] == ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)"]
+    assert shown[2] == ["0.520 ± 0.020", "0.450 ± 0.020"]
+    assert shown[3] == ["0.600", "0.600"]
+    assert shown[4] == ["+1.00 ± 2.00", "-0.50 ± 2.00"]
+    # an AUC of 0.52 is closer to chance than one of 0.45
+    assert [set(row.best) for row in table.rows] == [{1}, {1}, {0}, {0, 1}, {1}]
+    assert table.notes == ()
+
+
+def test_another_method():
+    table = side_by_side({"a": metrics(), "b": metrics()}, method="rc")
+    assert [row.cells[0].text for row in table.rows] == [
+        "3.0 ± 1.0 (88.0)",
+        "3.0 ± 1.0 (88.0)",
+        "0.990 ± 0.020",
+        "7.00",
+    ]
+
+
+def test_one_run_has_no_best():
+    assert {row.best for row in side_by_side({"a": metrics()}).rows} == {frozenset()}
+
+
+def test_what_a_run_lacks_is_a_dash():
+    old = metrics()
+    sep = old["peaks"]["SEP"]
+    del sep["two_sample"], sep["paired"], old["ae_survival"]
+    del sep["parameters"]["tail_slope"]
+    sep["parameters"]["drift_time"]["iou"].pop("ceiling")
+    sep["parameters"]["drift_time"].pop("iou_std")
+    table = side_by_side({"old": old, "new": metrics()})
+    assert [row.cells[0].text for row in table.rows] == ["80.0", "–", "–", "–", "–"]
+    assert [set(row.best) for row in table.rows] == [{0, 1}, set(), set(), set(), set()]
+
+
+def test_peaks_of_any_run_are_shown():
+    other = metrics()
+    other["peaks"] = {"DEP": other["peaks"]["SEP"]}
+    table = side_by_side({"a": metrics(), "b": other})
+    assert list(dict.fromkeys(row.peak for row in table.rows)) == ["SEP", "DEP"]
+    assert table.rows[0].cells[1].value is None
+    assert "(peaks)" in table.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m["peaks"]["SEP"].update(n_data=901), "number of measured pulses"),
+        (lambda m: m["peaks"]["SEP"].update(n_sim=1), "number of simulated pulses"),
+        (lambda m: m["rejections"]["data"].update(saturated=4), "rejections of measured"),
+        (lambda m: m["rejections"].pop("sim"), "rejections of simulated"),
+        (lambda m: m["peaks"].update(DEP={}), "peaks"),
+    ],
+)
+def test_other_data_are_noted(change, words):
+    other = copy.deepcopy(metrics())
+    change(other)
+    notes = side_by_side({"a": metrics(), "b": other, "c": metrics()}).notes
+    assert len(notes) == 1
+    assert notes[0].startswith("a and b were scored on different pulses (")
+    assert words in notes[0]
+
+
+def test_a_method_that_nobody_scored_names_those_there_are():
+    with pytest.raises(
+        CpunetError, match=r"^a, b: no score of the method xx; there are ren, rc$"
+    ):
+        side_by_side({"a": metrics(), "b": metrics()}, method="xx")
+    with pytest.raises(CpunetError, match="nothing is scored there"):
+        side_by_side({"a": {"peaks": {}}})
+
+
+@pytest.mark.parametrize("peaks", [{"SEP": 3}, {"SEP": {"parameters": {"x": {"iou": "high"}}}}])
+def test_nonsense_is_no_score(peaks):
+    with pytest.raises(CpunetError, match="no score of the method"):
+        side_by_side({"a": {"peaks": peaks, "ae_survival": [1], "rejections": 3}})
+
+
+def page_of(runs: dict[str, Any]) -> str:
+    return side_by_side_page(side_by_side(runs), runs)
+
+
+def circles(panel: ET.Element) -> list[float]:
+    return [float(c.get("cx", "nan")) for c in panel.iter("circle")]
+
+
+def seed(iou: float, **training: Any) -> dict[str, Any]:
+    return metrics(iou) | {"training": {"recipe": "fast", "peak": "FEP"} | training}
+
+
+def test_scores_scatter_over_runs_of_one_recipe():
+    runs = {"0": seed(80.0), "1": seed(84.0), "2": seed(81.0), "other": seed(9, recipe="paper")}
+    del runs["2"]["peaks"]["SEP"]["two_sample"]
+    over = side_by_side(runs).over_runs
+    assert over.names == ("3 runs of fast, FEP",)
+    assert [row.cells[0].text for row in over.rows] == [
+        "81.0 ± 2.1 (80.0 – 84.0)",
+        "81.0 ± 2.1 (80.0 – 84.0)",
+        "0.520 ± 0.000 (0.520 – 0.520), 1 missing",
+        "0.600 ± 0.00 (0.600 – 0.600)",
+        "+1.00 ± 0.00 (+1.00 – +1.00)",
+    ]
+    assert "<td>81.0\u00a0±\u00a02.1 (80.0 – 84.0)</td>" in page_of(runs)
+    apart = {"0": seed(80.0), "1": seed(80.0, peak="SEP")}
+    assert side_by_side(apart).over_runs is None
+
+
+def test_the_page_is_whole_and_alone():
+    name = 'a<b>&"c"'
+    page = page_of({name: metrics(), "other": metrics(85.0)})
+    assert "<b>&" not in page
+    assert re.search(r"https?:|src=|href=|url\(|<script", page) is None
+    assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in page
+    assert "<td>80.0\u00a0±\u00a02.5 (88.0)</td>" in page
+    panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    assert len(panels) == 5
+    for panel in panels:
+        width = float(panel.get("viewBox", "").split()[2])
+        assert len(circles(panel)) == 2
+        assert all(150 <= x <= width for x in circles(panel))
+
+
+def test_dots_and_bars_stand_where_their_scores_are():
+    page = page_of({"a": metrics(80.0), "b": metrics(84.0)})
+    panel = ET.fromstring(re.findall(r"<svg.*?</svg>", page, re.DOTALL)[0])
+    left, right = circles(panel)
+    per_percent = (right - left) / 4
+    ceilings = list(panel.iter("rect"))
+    middle = float(ceilings[0].get("x")) + float(ceilings[0].get("width")) / 2
+    assert middle - left == pytest.approx(8 * per_percent, abs=0.3)
+    ticks = {
+        float(t.text): float(t.get("x"))
+        for t in panel.iter("text")
+        if t.get("text-anchor") == "middle"
+    }
+    assert ticks[80.0] == pytest.approx(left, abs=0.1)
+    bar = re.fullmatch(
+        r"M(\S+) \S+H(\S+)",
+        next(p.get("d") for p in panel.iter("path") if p.get("stroke") == "#0072B2"),
+    )
+    assert float(bar[2]) - float(bar[1]) == pytest.approx(5 * per_percent, abs=0.3)
+
+
+def test_a_run_without_a_score_has_an_empty_line():
+    old = metrics()
+    del old["peaks"]["SEP"]["two_sample"]
+    page = page_of({"old": old, "new": metrics()})
+    panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    assert [len(circles(panel)) for panel in panels] == [2, 2, 1, 2, 2]

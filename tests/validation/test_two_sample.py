@@ -1,0 +1,221 @@
+"""The two-sample test: calibrated where nothing differs, and not blind where it does."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from cpunet.errors import CpunetError
+from cpunet.validation.two_sample import auc_and_variance, classifier_auc
+
+TIME = np.arange(80.0)
+SHAPE = np.exp(-0.5 * ((TIME - 40) / 5) ** 2)
+
+
+def windows(rng, n, mean=0.0, spread=1.0, noise=0.01):
+    """A bump of random height in white noise; its height is what may differ."""
+    heights = rng.normal(mean, spread, n)
+    return np.float32(heights[:, np.newaxis] * SHAPE + noise * rng.normal(size=(n, len(TIME))))
+
+
+def edges(rng, n, width=4.0, noise=0.004):
+    """Edges with a random amount of drift before them."""
+    drift = rng.uniform(5, 25, (n, 1))
+    share = rng.uniform(0.2, 1, (n, 1))
+    late = ndtr((TIME - 45) / width)
+    early = ndtr((TIME - 45 + drift) / width)
+    pulses = share * late + (1 - share) * early
+    return np.float32(pulses + noise * rng.normal(size=pulses.shape))
+
+
+def significance(result):
+    return (result.auc - result.null_mean) / result.null_std
+
+
+@pytest.mark.parametrize("draws", [30, pytest.param(80, marks=pytest.mark.slow)])
+def test_equal_distributions_cannot_be_told_apart(draws):
+    """Over many draws the AUC is 0.5 within its errors, and so is the null."""
+    rng = np.random.default_rng(0)
+    results = [
+        classifier_auc(edges(rng, 120), edges(rng, 120), seed=draw) for draw in range(draws)
+    ]
+    aucs = np.array([r.auc for r in results])
+    assert aucs.mean() == pytest.approx(0.5, abs=0.015)
+    assert np.mean([r.null_mean for r in results]) == pytest.approx(0.5, abs=0.01)
+    null_std = np.mean([r.null_std for r in results])
+    assert aucs.std() == pytest.approx(null_std, rel=0.3)
+    assert np.mean([abs(significance(r)) < 2 for r in results]) > 0.85
+    within = [abs(r.auc - 0.5) < 2 * r.auc_std for r in results]
+    assert np.mean(within) > 0.85
+
+
+@pytest.mark.parametrize("draws", [30, pytest.param(60, marks=pytest.mark.slow)])
+def test_error_is_the_spread_over_repeated_samples(draws):
+    rng = np.random.default_rng(17)
+    results = [
+        classifier_auc(windows(rng, 100), windows(rng, 100, mean=1.0), seed=draw)
+        for draw in range(draws)
+    ]
+    spread = np.std([r.auc for r in results])
+    assert spread == pytest.approx(np.mean([r.auc_std for r in results]), rel=0.3)
+
+
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
+def test_a_shift_has_the_analytic_auc(shift):
+    rng = np.random.default_rng(1)
+    result = classifier_auc(windows(rng, 800), windows(rng, 800, mean=shift), seed=0)
+    assert result.auc == pytest.approx(ndtr(shift / np.sqrt(2)), abs=0.03)
+    assert significance(result) > 5
+
+
+def test_another_spread_of_the_same_mean_is_seen():
+    rng = np.random.default_rng(2)
+    result = classifier_auc(windows(rng, 800), windows(rng, 800, spread=2.0), seed=0)
+    # the best score is |height|: P(2 |z1| > |z2|) = 2 atan(2) / pi
+    assert result.auc == pytest.approx(2 * np.arctan(2) / np.pi, abs=0.04)
+
+
+def test_two_peaks_with_the_mean_and_the_spread_of_one_are_seen():
+    rng = np.random.default_rng(3)
+    other = windows(rng, 800, spread=0.3) + np.float32(
+        np.sqrt(1 - 0.3**2) * rng.choice([-1, 1], (800, 1)) * SHAPE
+    )
+    assert significance(classifier_auc(windows(rng, 800), other, seed=0)) > 5
+
+
+@pytest.mark.parametrize("change", [{"width": 4.1}, {"noise": 0.0043}])
+def test_small_changes_of_real_pulses_are_seen(change):
+    rng = np.random.default_rng(4)
+    assert significance(classifier_auc(edges(rng, 600), edges(rng, 600, **change), seed=0)) > 5
+
+
+def test_missing_noise_gives_a_simulation_away():
+    rng = np.random.default_rng(5)
+    result = classifier_auc(edges(rng, 200), edges(rng, 200, noise=0.0), seed=0)
+    assert result.auc > 0.99
+
+
+def test_additional_features_are_used():
+    rng = np.random.default_rng(6)
+    sides = edges(rng, 400), edges(rng, 400)
+    blind = classifier_auc(*sides, seed=0)
+    values = (
+        {"drift_time": rng.normal(1000, 50, 400)},
+        {"drift_time": rng.normal(1100, 50, 400)},
+    )
+    seeing = classifier_auc(*sides, seed=0, features=values)
+    assert abs(significance(blind)) < 3
+    assert seeing.auc > 0.85  # 0.92 with nothing else to look at
+
+
+def test_rows_that_are_not_finite_are_left_out_and_counted():
+    rng = np.random.default_rng(7)
+    data, others = edges(rng, 120), edges(rng, 110)
+    data[3, 5] = np.nan
+    others[:2] = np.inf
+    slopes = rng.normal(size=120), rng.normal(size=110)
+    slopes[0][10:14] = np.nan
+    slopes[0][3] = np.nan  # this row is left out already
+    result = classifier_auc(
+        data, others, seed=0, features=({"tail_slope": slopes[0]}, {"tail_slope": slopes[1]})
+    )
+    assert (result.missing_data, result.missing_sim) == (5, 2)
+    assert result.n_data == result.n_sim == 108  # the smaller side
+    assert 0.3 < result.auc < 0.7
+
+
+def test_missing_rows_do_not_change_what_is_found():
+    rng = np.random.default_rng(8)
+    data, others = windows(rng, 300), windows(rng, 300, mean=1.0)
+    hole = np.full((50, len(TIME)), np.nan, np.float32)
+    clean = classifier_auc(data, others, seed=0)
+    spoiled = classifier_auc(np.concatenate([hole, data]), others, seed=0)
+    assert spoiled.auc == pytest.approx(clean.auc, abs=0.03)
+
+
+def test_spoiled_pulses_do_not_hide_a_difference():
+    rng = np.random.default_rng(9)
+    data, others = windows(rng, 400), windows(rng, 400, mean=1.0)
+    for side in (data, others):
+        side[:6] = 1e4 * rng.normal(size=(6, len(TIME)))
+    assert classifier_auc(data, others, seed=0).auc == pytest.approx(0.76, abs=0.05)
+
+
+def test_unequal_sides_and_the_cap():
+    rng = np.random.default_rng(10)
+    data, others = windows(rng, 500), windows(rng, 100, mean=1.0)
+    assert classifier_auc(data, others, seed=0).n_data == 100
+    capped = classifier_auc(data, others, seed=0, largest=60)
+    assert capped.n_data == capped.n_sim == 60
+    assert capped.auc_std > classifier_auc(data, others, seed=0).auc_std
+
+
+def test_identical_pulses_have_no_features():
+    same = np.ones((50, 10), np.float32)
+    result = classifier_auc(same, same, seed=0)
+    assert (result.auc, result.null_mean) == (0.5, 0.5)
+
+
+def test_rounding_is_no_difference():
+    rng = np.random.default_rng(11)
+    data, others = (windows(rng, 200, noise=0.0) for _ in range(2))
+    assert abs(significance(classifier_auc(data, others, seed=0))) < 3
+
+
+def test_result_is_json_and_repeats_with_its_seed():
+    rng = np.random.default_rng(12)
+    sides = edges(rng, 80), edges(rng, 80)
+    first, second = (classifier_auc(*sides, seed=5) for _ in range(2))
+    assert first == second
+    assert json.loads(json.dumps(asdict(first), allow_nan=False)) == asdict(first)
+    assert classifier_auc(*sides, seed=6) != first
+
+
+def test_too_few_pulses_are_named():
+    rng = np.random.default_rng(13)
+    few = windows(rng, 41)
+    few[:2] = np.nan
+    with pytest.raises(CpunetError, match="39 measured and 60 simulated"):
+        classifier_auc(few, windows(rng, 60), seed=0)
+    with pytest.raises(CpunetError, match="0 simulated"):
+        classifier_auc(windows(rng, 60), np.empty((0, len(TIME)), np.float32), seed=0)
+    assert classifier_auc(windows(rng, 40), windows(rng, 40), seed=0).n_sim == 40
+
+
+def test_bad_shapes_are_named():
+    rng = np.random.default_rng(14)
+    pulses = windows(rng, 50)
+    with pytest.raises(CpunetError, match="equally many samples"):
+        classifier_auc(pulses, pulses[:, :-1], seed=0)
+    with pytest.raises(CpunetError, match="equally many samples"):
+        classifier_auc(pulses[0], pulses[0], seed=0)
+    value = {"drift_time": np.ones(50)}
+    with pytest.raises(CpunetError, match="drift_time is given for one side only"):
+        classifier_auc(pulses, pulses, seed=0, features=(value, {}))
+    with pytest.raises(CpunetError, match=r"drift_time has shape \(49,\)"):
+        classifier_auc(pulses, pulses, seed=0, features=(value, {"drift_time": np.ones(49)}))
+
+
+def test_auc_is_the_fraction_of_ordered_pairs():
+    rng = np.random.default_rng(15)
+    negatives, positives = rng.integers(0, 9, 30).astype(float), rng.integers(2, 12, 40) * 1.0
+    difference = positives[:, np.newaxis] - negatives
+    expected = (difference > 0).mean() + 0.5 * (difference == 0).mean()
+    assert auc_and_variance(negatives, positives)[0] == pytest.approx(expected)
+    swapped = auc_and_variance(positives, negatives)[0]
+    assert swapped == pytest.approx(1 - expected)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0, 2.5])
+def test_variance_is_the_spread_over_repeated_samples(shift):
+    rng = np.random.default_rng(16)
+    # each column is a sample
+    aucs, variances = auc_and_variance(
+        rng.normal(size=(60, 1500)), rng.normal(shift, 1.5, (90, 1500))
+    )
+    assert aucs.mean() == pytest.approx(ndtr(shift / np.hypot(1, 1.5)), abs=0.005)
+    assert aucs.var() == pytest.approx(variances.mean(), rel=0.12)
