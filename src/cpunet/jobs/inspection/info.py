@@ -30,7 +30,6 @@ from cpunet.pulses.spectrum import Spectrum, Values, suggested_calibration
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import holds_hits
-from cpunet.validation.spectrum_figure import Spectrum
 
 _RUN_FILE = "run.json"
 # what other folders are, by a file that they hold
