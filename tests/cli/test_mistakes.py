@@ -121,6 +121,13 @@ MISTAKES = {
     "all pulses cut": Mistake(
         f"{TRAIN} --set cuts.decay_sigmas=1e-9", r".*the quality cuts leave no pulse; widen .*"
     ),
+    "energies of other events": Mistake(
+        f"{TRAIN} --data other.lh5",
+        r"other.lh5: .*amplitudes and energies do not go together.*",
+    ),
+    "traces go down": Mistake(
+        f"{TRAIN} --data down.lh5", r"down.lh5: .*polarity is negative; turn them round.*"
+    ),
     "too few pulses": Mistake(
         f"{TRAIN} --data few.lh5",
         r"24 simulated and 2 measured pulses; 200 of each .* are needed: select more.*",
@@ -242,15 +249,19 @@ def fill(folder: Path, stand) -> None:
         "mev": kev / 1000,
         "nan": kev * np.nan,
         "negative": -kev,
-        "few": np.where(np.arange(len(kev)) < 9, kev, 1000),
+        "other": np.roll(kev, 1),
         "adc": kev,
         "none-at-all": kev,
         "two": kev,
     }.items():
         stand.write(folder / f"{name}.lh5", "geds/raw", waves, energies)
+    few = np.where(np.arange(len(kev)) < 9, kev, 1000)
+    scaled = 8000 + (waves - 8000.0) * (few / kev)[:, np.newaxis]
+    stand.write(folder / "few.lh5", "geds/raw", np.round(scaled).astype(np.uint16), few)
     for name, pulses in {
         "constant": 0 * waves + 8000,
         "saturated": waves.clip(0, 20_000),
+        "down": 60_000 - waves,
     }.items():
         stand.write(folder / f"{name}.lh5", "geds/raw", pulses, kev)
     with h5py.File(folder / "adc.lh5", "r+") as file:

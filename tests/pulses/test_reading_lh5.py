@@ -182,7 +182,7 @@ def test_ragged_waveforms_are_refused_if_they_differ(file):
     np.testing.assert_array_equal(
         open_pulses(file, table="even").read().waveforms[4], [1, 2, 3, 4]
     )
-    with pytest.raises(CpunetError, match=r"event 4: 2 samples, before it 4"):
+    with pytest.raises(CpunetError, match=r"event 4: 2 samples, others have 4"):
         open_pulses(file, table="odd").read()
 
 

@@ -1,1 +1,5 @@
-"""The command line: arguments in, a job, messages out."""
+"""The command line."""
+
+from cpunet.cli.environment import sound_environment
+
+sound_environment()  # before a library that reads it is loaded

@@ -1,4 +1,4 @@
-"""How OpenMP's threads wait for each other."""
+"""Variables of the environment: how OpenMP's threads wait, and what would end a library."""
 
 from __future__ import annotations
 
@@ -7,6 +7,18 @@ import os
 # Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
 # than most gaps between two operations and far shorter than others hold a core.
 SPIN_COUNT = "3000"
+
+
+def sound_environment() -> None:
+    """Mend variables that libraries read when they are loaded, and which may be nonsense here.
+
+    Pictures are written to files, whatever backend a notebook shows its own with; a terminal
+    that says it is no column wide shows text as any other.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for name in ("COLUMNS", "LINES", "NUMBA_NUM_THREADS"):
+        if not os.environ.get(name, "1").isdecimal() or os.environ.get(name) == "0":
+            del os.environ[name]
 
 
 def share_the_machine() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,9 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
+from cpunet.pulses.doubts import apart, second_rate
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.reading.energies import amplitude
@@ -30,6 +33,9 @@ Energies = npt.NDArray[np.float64]
 
 MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
+# Share of pulses whose amplitude and energy do not go together, from which they are refused,
+# and from which a warning tells of it; traces in which a second rate is looked for.
+MAX_APART, FEW_APART, LOOKED_AT = 0.2, 0.1, 512
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
@@ -188,6 +194,40 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
         )
 
 
+class _Watched:
+    """A file of raw traces; keeps what they betray of mistakes while they are read once."""
+
+    def __init__(self, source: PulseSource) -> None:
+        self.path, self.n_pulses, self._source = source.path, source.n_pulses, source
+        self._kev, self._amplitudes = list[Energies](), list[Energies]()
+        self._first: npt.NDArray[np.float32] | None = None
+
+    def blocks(self, size: int, /) -> Iterator[Pulses]:
+        """The file's pulses in order."""
+        for block in self._source.blocks(size):
+            self._kev.append(block.energy_kev)
+            self._amplitudes.append(amplitude(block.waveforms))
+            if self._first is None:
+                self._first = block.waveforms[:LOOKED_AT]
+            yield block
+
+    def require_sense(self, *, insist: bool) -> None:
+        """Refuse energies that are of other pulses; warn of a second rate."""
+        if insist or self._first is None:
+            return
+        share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
+        told = f"{self.path}: {100 * share:.0f} % of amplitudes and energies do not go together"
+        if share > MAX_APART:
+            raise CpunetError(
+                f"{told}: these energies are not those of these traces",
+                "give the energy column of the same channel and events, in their order",
+            )
+        if share > FEW_APART:
+            log.warning(told)
+        if (found := second_rate(self._first)) is not None:
+            log.warning(f"{self.path}: {found}; cut the traces there, or resample them")
+
+
 def _load(
     file: PulseFile,
     side: Kind,
@@ -199,6 +239,7 @@ def _load(
 ) -> InputSet:
     source = file.open()
     require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
+    watched = _Watched(source)
     seen: list[Energies] = []
 
     def select(energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -207,7 +248,7 @@ def _load(
 
     try:
         prepared = load_prepared(
-            source,
+            watched,
             recipe.preparation,
             side,
             select=select,
@@ -221,6 +262,7 @@ def _load(
         raise CpunetError(f"{error}{hint}") from error
     cuts = None
     if side == "measured":
+        watched.require_sense(insist=file.insist)
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):

@@ -17,11 +17,14 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.doubts import go_down
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 # Traces per block: 20 to 130 MB for the record lengths in use.
 BLOCK_SIZE = 4096
+_LOOKED_AT = 256  # traces that show the polarity
+FEW = 10  # pulses of the wanted energies whose rejection is a reason
 
 Select = Callable[[FloatColumn], npt.NDArray[np.bool_]]
 PeakNames = Callable[[FloatColumn], npt.NDArray[np.str_]]
@@ -172,6 +175,12 @@ def _prepare_selected(
 
 
 def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
+    first = next(iter(source.blocks(_LOOKED_AT)), None)
+    if first is not None and go_down(first.waveforms):
+        return CpunetError(
+            f"{source.path}: the traces go down: their polarity is negative",
+            "turn them round, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+        )
     codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
     if not len(codes):
         return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")
@@ -180,4 +189,7 @@ def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
         f"{counts[c]} {Rejection(int(c)).label}" for c in np.flatnonzero(counts)
     )
     text = f"{source.path}: none of {len(codes)} pulses can be used ({reasons})"
-    return CpunetError(text, _REMEDIES[Rejection(int(counts.argmax()))])
+    # of pulses of the wanted energies, if there are any, since these are what is missed
+    wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
+    reason = int((wanted if wanted.sum() >= FEW else counts).argmax())
+    return CpunetError(text, _REMEDIES[Rejection(reason)])

@@ -22,6 +22,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.translation.translator import IREN, REN, Translator
 
+LOW_KEV = 20.0  # below which energies that leave no pulse are likely in MeV
+
 
 def ren(
     run: str,
@@ -82,6 +84,12 @@ def _processor(translator: Translator, period: Any, noise: bool, seed: int) -> G
         energies = None if energy_kev is None else np.resize(np.asarray(energy_kev), len(rows))
         pulses = Pulses.of(rows, dt_ns=translator.dt_ns, energy_kev=energies)
         done = translator.translate_pulses(pulses, noise=noise, generator=generator)
+        if energies is not None and done.codes.all() and np.nanmax(energies) < LOW_KEV:
+            raise CpunetError(
+                f"energies of {np.nanmin(energies):.3g} to {np.nanmax(energies):.3g} keV: no "
+                "pulse is left with the noise of so low energies",
+                "energies are taken in keV; multiply those in MeV by 1000",
+            )
         return done.pulses.waveforms.reshape(*waveforms.shape[:-1], -1)
 
     with_energy = noise and translator.needs_energies

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,10 +16,15 @@ from cpunet.pulses.reading.columns import (
     ENERGY_UNITS,
     TIME_UNITS,
     Column,
+    MemoryColumn,
     require_length,
     shortened,
 )
 
+log = logging.getLogger(__name__)
+
+# Columns by which the rows of two files are joined.
+EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
 _USUAL = ("energy_kev", "energy_keV", "energy")
 # LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units.
 _NAMED_IN_KEV = re.compile(r"(_cal|kev)$", re.IGNORECASE)
@@ -144,9 +150,41 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
             f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
         )
     # Imported late: the LH5 library takes seconds to load, and most files do not need it.
-    from cpunet.pulses.reading.hdf5 import column_of
+    from cpunet.pulses.reading.hdf5 import column_of, columns_beside
 
-    return column_of(Path(file), inner)
+    column = column_of(Path(file), inner)
+    return _joined(path, columns, energy, column, columns_beside(Path(file), inner))
+
+
+def _joined(
+    path: Path,
+    columns: Mapping[str, Column],
+    energy: str,
+    column: Column,
+    beside: Mapping[str, Column],
+) -> Column:
+    """A column of another file in the order of the pulses, if both tell of which events."""
+    key = next((k for k in EVENT_KEYS if k in columns and k in beside), None)
+    if key is None or columns[key].constant or len(beside[key]) != len(column):
+        return column
+    ours, theirs = (np.asarray(c[key].read(0, len(c[key]))) for c in (columns, beside))
+    if np.array_equal(ours, theirs):
+        return column
+    order = np.argsort(theirs, kind="stable")
+    at = order[np.minimum(np.searchsorted(theirs[order], ours), len(theirs) - 1)]
+    found = theirs[at] == ours
+    if not found.any() or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
+        what = f"{(~found).sum()} of {len(ours)} are not there" if not found.all() else "twice"
+        raise CpunetError(
+            f"{path}: {energy} is of other events than these pulses ({key}: {what})",
+            "give the energies of the same events",
+        )
+    log.info(
+        f"{path.name}: {energy} is in another order or of other events; joined by {key}, "
+        f"{(~found).sum()} of {len(ours)} pulses have no energy there"
+    )
+    values = np.where(found, np.asarray(column.read(0, len(column)), float)[at], np.nan)
+    return MemoryColumn(values, column.units)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
 # preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")
+log = logging.getLogger(__name__)
+
+_CONTACT = "chnid"  # contact of each pulse in tables of SolidStateDetectors
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
@@ -39,13 +43,21 @@ class Lh5Source(PulseSource):
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
             n_pulses = _n_rows(file[self._values])
+            columns = columns_of(options.path, file[chosen.table or "/"])
+            _require_one_contact(options.path, columns)
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
+            shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
+            if shortest < longest and first.dtype.kind == "f":
+                log.info(
+                    f"{options.path.name}: pulses of {shortest} to {longest} samples are "
+                    "continued with their last value"
+                )
             layout = Layout(
                 format="LH5",
                 table=chosen.path,
                 n_pulses=n_pulses,
-                length=first.shape[1],
-                columns=columns_of(options.path, file[chosen.table or "/"]),
+                length=longest,
+                columns=columns,
                 period_name=f"{chosen.path}/dt",
                 period=columns_of(options.path, file[chosen.path]).get("dt"),
             )
@@ -72,14 +84,39 @@ class Lh5Source(PulseSource):
             return traces
         lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
         expected = int(lengths[0]) if length is None else length
-        if (other := lengths != expected).any():
-            first = int(other.argmax())
-            raise CpunetError(
-                f"{file.filename}: event {start + first}: {lengths[first]} samples, before it "
-                f"{expected}; split the file by length"
-            )
         flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
-        return flat.reshape(len(lengths), expected)
+        if not (other := lengths != expected).any():
+            return flat.reshape(len(lengths), expected)
+        first = int(other.argmax())
+        if flat.dtype.kind != "f":
+            raise CpunetError(
+                f"{file.filename}: event {start + first}: {lengths[first]} samples, others "
+                f"have {expected}",
+                "split the file by length; only ideal pulses are continued with their last one",
+            )
+        last = np.cumsum(lengths) - 1
+        at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
+        return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+
+
+def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
+    """Samples of the shortest and the longest pulse, where each is as long as its drift."""
+    if not isinstance(values, h5py.Group) or "cumulative_length" not in values:
+        return None
+    lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
+    return (int(lengths.min()), int(lengths.max())) if len(lengths) else None
+
+
+def _require_one_contact(path: Path, columns: dict[str, Hdf5Column]) -> None:
+    """Refuse a table with the pulses of several contacts, one after another."""
+    column = columns.get(_CONTACT)
+    contacts = np.unique(column.read(0, len(column))) if column is not None else ()
+    if len(contacts) > 1:
+        names = ", ".join(map(str, contacts))
+        raise CpunetError(
+            f"{path}: holds the pulses of contacts {names} (column {_CONTACT})",
+            "give a file with the rows of one contact, the one that is read out",
+        )
 
 
 class Hdf5Source(PulseSource):
@@ -146,6 +183,12 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
     return {name: _column(path, m) for name, m in members.items() if is_column(m)}
 
 
+def columns_beside(path: Path, name: str) -> dict[str, Hdf5Column]:
+    """Columns of the group in which a column of an HDF5 file stands."""
+    with opened(path) as file:
+        return columns_of(path, file[name].parent)
+
+
 def column_of(path: Path, name: str) -> Hdf5Column:
     """Return a column of an HDF5 file by its path in the file.
 
@@ -204,10 +247,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     if table is None or not table.strip("/"):
         found = list(_walk(file, set()))
         if not found:
-            raise CpunetError(
-                f"{path}: no waveforms in it; it holds {shortened(_tables(file))}; "
-                "give a file of traces (their energies may be here: --data-energy FILE:COLUMN)"
-            )
+            raise _no_waveforms(path, file)
         return _only(path, found)
     item = file.get(table)
     if item is None:
@@ -223,6 +263,28 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
             f"they are in {shortened(sorted({c.table for c in _walk(file, set())}))}"
         )
     return _only(path, found)
+
+
+def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
+    """Error that names the arrays which could be traces, if there are any."""
+    arrays: list[str] = []
+
+    def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf":
+            arrays.append(name)
+
+    file.visititems(look)
+    if not arrays:
+        return CpunetError(
+            f"{path}: no waveforms in it; it holds {shortened(_tables(file))}",
+            "give a file of traces (their energies may be here: --data-energy FILE:COLUMN)",
+        )
+    many = "an array" if len(arrays) == 1 else f"{len(arrays)} arrays"
+    return CpunetError(
+        f"{path}: no table of waveforms in it, but {many} of two dimensions "
+        f"({shortened(arrays)})",
+        "if it holds traces, name it by --table (--sim-table, --data-table); give --dt-ns",
+    )
 
 
 def waveform_tables(file: h5py.File) -> list[str]:

@@ -13,12 +13,12 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.columns import Column, require_length
-from cpunet.pulses.reading.energies import resolve_energies, resolve_sampling
+from cpunet.pulses.reading.energies import EVENT_KEYS, resolve_energies, resolve_sampling
 from cpunet.pulses.reading.files import PulseFile
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 _MAX_NUMBER = 2.0**62
-_EVENT_NUMBERS = ("event_number", "eventnumber", "evtid", "ievt")
+_EVENT_NUMBERS = EVENT_KEYS[:-1]
 
 
 @dataclass(frozen=True)

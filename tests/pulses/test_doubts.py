@@ -1,0 +1,161 @@
+"""Raw traces of which it is known what is wrong with them."""
+
+from __future__ import annotations
+
+import logging
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from lgdo import Array, Table, VectorOfVectors, WaveformTable
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.doubts import apart, go_down, second_rate
+from cpunet.pulses.loading import load_measured
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+
+RECIPE = load_recipe("fast")
+FEP = parse_selection("FEP", RECIPE.peaks)
+DT_NS, N, BASE, GAIN, DECAY = 16.0, 400, 2000.0, 4.0, 3750.0  # decay in samples
+LINES = np.array([2614.511, 2103.511, 1592.511, 900.0])
+
+
+def kev(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).choice(LINES, N)
+
+
+def traces(energies: np.ndarray, length: int = 1400, sign: int = 1) -> np.ndarray:
+    """A rise of ten samples at sample 600, a decay, noise, and whole numbers."""
+    rng, at = np.random.default_rng(1), np.arange(length) - 600.0
+    shape = np.clip(at / 10, 0, 1) * np.exp(-np.maximum(at, 0) / DECAY)
+    noise = rng.normal(0, 4, (len(energies), length))
+    return np.rint(BASE + sign * GAIN * energies[:, np.newaxis] * shape + noise)
+
+
+def written(path, waveforms, energies, numbers=None) -> PulseFile:
+    write_pulses(
+        path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies, event_number=numbers)
+    )
+    return PulseFile(path)
+
+
+def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
+    energies = kev()
+    assert go_down(traces(energies, sign=-1).astype(np.float32))
+    assert not go_down(traces(energies).astype(np.float32))
+    file = written(tmp_path / "down.lh5", traces(energies, sign=-1), energies)
+    with pytest.raises(CpunetError, match="polarity is negative; turn them round"):
+        load_measured(file, RECIPE, FEP)
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.02])
+def test_amplitudes_go_with_their_energies_and_with_no_others(resolution):
+    rng, energies = np.random.default_rng(3), kev()
+    amplitudes = GAIN * energies * rng.normal(1, resolution, N)
+    assert apart(energies, amplitudes) == 0
+    different = np.mean(energies != np.roll(energies, 1))
+    assert apart(np.roll(energies, 1), amplitudes) == pytest.approx(different, abs=0.1)
+    assert apart(np.roll(energies, 1), np.ones(N)) == 0  # scaled to one height
+
+
+def test_energies_of_other_pulses_are_refused_unless_one_insists(tmp_path):
+    energies = kev()
+    file = written(tmp_path / "other.lh5", traces(energies), np.roll(energies, 1))
+    with pytest.raises(CpunetError, match=r"% of amplitudes and energies do not go together"):
+        load_measured(file, RECIPE, FEP)
+    load_measured(PulseFile(file.path, insist=True), RECIPE, FEP)
+
+
+@pytest.mark.parametrize("averaged", [2, 4])
+def test_a_second_rate_is_found_at_its_sample(averaged):
+    start = 1000
+    fine = traces(kev(), start + 500 * averaged)
+    coarse = fine[:, start:].reshape(N, 500, averaged).mean(axis=2)
+    both = np.rint(np.concatenate([fine[:, :start], coarse], axis=1)).astype(np.float32)
+    found = second_rate(both)
+    assert found is not None
+    assert abs(found.sample - start) <= 8
+    assert found.averaged == pytest.approx(averaged, rel=0.1)
+    assert second_rate(fine[:, :1500].astype(np.float32)) is None
+
+
+def test_a_second_rate_is_told_when_a_file_is_read(tmp_path, caplog):
+    energies, fine = kev(), traces(kev(), 1000 + 4 * 500)
+    both = np.concatenate([fine[:, :1000], fine[:, 1000:].reshape(N, 500, 4).mean(2)], axis=1)
+    load_measured(written(tmp_path / "two.lh5", np.rint(both), energies), RECIPE, FEP)
+    assert any("a second rate" in message for message in caplog.messages)
+
+
+@pytest.mark.parametrize("key", ["event_number", "timestamp"])
+def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key, caplog):
+    """Rows in another order, and fewer of them."""
+    caplog.set_level(logging.INFO)
+    numbers, energies = np.arange(100, 100 + N), kev()
+    raw = {key: Array(numbers), "waveform": waveform(traces(energies))}
+    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
+    order = np.random.default_rng(2).permutation(N)[: N - 10]
+    hit = {key: Array(numbers[order]), "e": Array(energies[order], attrs={"units": "keV"})}
+    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
+    found = open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e").read()
+    wanted = energies.copy()
+    wanted[np.setdiff1d(np.arange(N), order)] = np.nan
+    np.testing.assert_array_equal(found.energy_kev, wanted)
+    assert any(f"joined by {key}, 10 of {N}" in message for message in caplog.messages)
+
+
+def test_energies_of_other_events_are_refused(tmp_path):
+    raw = {"event_number": Array(np.arange(N)), "waveform": waveform(traces(kev()))}
+    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
+    hit = {"event_number": Array(np.arange(N) + N), "e": Array(kev(), attrs={"units": "keV"})}
+    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
+    with pytest.raises(CpunetError, match="of other events"):
+        open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e")
+
+
+def waveform(values) -> WaveformTable:
+    return WaveformTable(values=values, dt=DT_NS, dt_units="ns", t0=0.0, t0_units="ns")
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind, caplog):
+    caplog.set_level(logging.INFO)
+    parts = [np.array([0, 1, 3], kind), np.array([0, 5], kind), np.array([0, 1, 2, 7], kind)]
+    values = VectorOfVectors(
+        cumulative_length=Array(np.cumsum([len(part) for part in parts])),
+        flattened_data=Array(np.concatenate(parts)),
+    )
+    period = Array(np.full(3, DT_NS), attrs={"units": "ns"})
+    columns = {"waveform": WaveformTable(values=values, dt=period, t0=period)}
+    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
+    source = open_pulses(tmp_path / "sim.lh5")
+    if kind is np.uint16:  # as a digitiser has them
+        with pytest.raises(CpunetError, match="3 samples, others have 4; split the file"):
+            source.read()
+        return
+    expected = [[0, 1, 3, 3], [0, 5, 5, 5], [0, 1, 2, 7]]
+    np.testing.assert_array_equal(source.read().waveforms, expected)
+    np.testing.assert_array_equal(next(source.blocks(2)).waveforms, expected[:2])
+    assert any("2 to 4 samples are continued" in message for message in caplog.messages)
+
+
+def test_contacts_of_one_table_are_told_apart(tmp_path):
+    contacts = np.repeat([1, 2], N // 2)
+    columns = {"chnid": Array(contacts), "waveform": waveform(traces(kev()))}
+    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
+    with pytest.raises(CpunetError, match="contacts 1, 2"):
+        open_pulses(tmp_path / "sim.lh5")
+
+
+def test_arrays_that_could_be_traces_are_named(tmp_path):
+    with h5py.File(tmp_path / "dsp.lh5", "w") as file:
+        file["ch1/dsp/blsub"] = np.zeros((3, 50))
+    with pytest.raises(
+        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*--table"
+    ):
+        open_pulses(tmp_path / "dsp.lh5")
