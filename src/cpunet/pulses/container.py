@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 FloatArray = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Pulses:
     """A set of pulses of equal length and sampling, with energy and event number.
 
@@ -44,6 +49,8 @@ class Pulses:
     (3, 8)
     >>> pulses[pulses.energy_kev > 2000].event_number
     array([1, 2])
+    >>> pulses[:2]
+    <2 pulses of 8 samples, 16 ns each, 1592 to 2104 keV>
     """
 
     waveforms: FloatArray
@@ -109,6 +116,31 @@ class Pulses:
             event_number=self.event_number[which],
             peak=self.peak[which],
         )
+
+    def __repr__(self) -> str:
+        known = self.energy_kev[np.isfinite(self.energy_kev)]
+        kev = f", {known.min():.0f} to {known.max():.0f} keV" if len(known) else ""
+        return f"<{len(self)} pulses of {self.length} samples, {self.dt_ns:g} ns each{kev}>"
+
+    def to_dataframe(self) -> DataFrame:
+        """Event number, energy in keV and gamma line of each pulse, as a data frame."""
+        from pandas import DataFrame
+
+        columns = ("event_number", "energy_kev", "peak")
+        return DataFrame({name: getattr(self, name) for name in columns})
+
+    def save(self, path: str | Path, *, force: bool = False) -> Path:
+        """Write the pulses to an LH5 file.
+
+        Raises
+        ------
+        CpunetError
+            If the file exists, unless `force`.
+        """
+        from cpunet.pulses.writing import write_pulses
+
+        write_pulses(Path(path), self, force=force)
+        return Path(path)
 
     def with_waveforms(self, waveforms: FloatArray) -> Pulses:
         """The same events with other waveforms."""
