@@ -14,7 +14,7 @@ from cpunet.cli.stand import Kind, KindOption, Preset
 from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
 
-EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=700,SEP=250,DEP=250"
+EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
 RecipeName = Annotated[
     str, typer.Option("--recipe", help="fast, paper, or a YAML file of your own.")
