@@ -1,4 +1,4 @@
-"""What `describe` says of files and run folders."""
+"""What `info` says of files, detectors and folders, and what `load` opens."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import h5py
 import lh5
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from torch import nn
 
+from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
 from cpunet.cli.main import main
-from cpunet.errors import CpunetError
 from cpunet.jobs.inspection import run_words
-from cpunet.jobs.inspection.info import describe
-from cpunet.jobs.inspection.info_words import in_words
-from cpunet.jobs.inspection.trace_properties import _last_below, trace_properties
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.trace_properties import _last_below, trace_properties, traces_in_words
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_run
 
 RECIPE = load_recipe("fast")
+DT = FileOptions(dt_ns=16)
 INFO = {"peak": "FEP", "seed": 7, "seconds": 12.5, "device": "cpu", "dt_ns": 16.0}
 
 
@@ -38,8 +38,7 @@ def test_a_file_of_pulses(tmp_path):
     energies = [2614.0, 2615.0, 2103.0, 500.0, np.nan, 100.0]
     path = tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=energies))
-    assert describe(path, recipe=RECIPE) == {
-        "kind": "pulses",
+    assert info(path).values == {
         "path": str(path),
         "format": "LH5",
         "table": "geds/sim/waveform",
@@ -57,10 +56,23 @@ def test_a_file_of_pulses(tmp_path):
     }
 
 
+def test_a_file_is_opened(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    write_pulses(path, Pulses.of(np.zeros((3, 20)), dt_ns=16))
+    assert load(path) == PulseFile(path)
+    (tmp_path / "text").write_text("no pulses")
+    with pytest.raises(CpunetError, match="text"):
+        load(tmp_path / "text")
+
+
 def test_nothing_known_is_none(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((2, 20), np.nan))
-    told = describe(tmp_path / "pulses.npy", dt_ns=16)
-    assert (told["energy_kev"], told["samples"], told["peaks"]) == (None, None, {})
+    told = info(tmp_path / "pulses.npy", read=DT).values
+    assert (told["energy_kev"], told["samples"], told["peaks"]) == (
+        None,
+        None,
+        dict.fromkeys(RECIPE.peaks, 0),
+    )
     assert (told["n_not_finite"], told["n_constant"]) == (2, 0)
     json.dumps(told)
 
@@ -70,7 +82,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     write_pulses(tmp_path / "pulses.lh5", (block for _ in range(12)))
     tracemalloc.start()
     try:
-        assert describe(tmp_path / "pulses.lh5")["n_pulses"] == 12 * 4096
+        assert info(tmp_path / "pulses.lh5").values["n_pulses"] == 12 * 4096
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
@@ -80,26 +92,27 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
 def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
     flat = tmp_path / "flat.lh5"
-    told = describe(path, kev_per_adc=calibrated, recipe=RECIPE, without_remains=flat)
+    tails = subtract_tails(PulseFile(path, kev_per_adc=calibrated), flat)
+    told = info(path, read=FileOptions(kev_per_adc=calibrated)).values
+    assert told["remains"] == tails.describe()
     assert told["remains"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
     json.dumps(told)
     left = lh5.read("geds/raw/remains_kev", flat).nda
     assert len(left) == 1000
     assert np.nanmean(left > 10) == pytest.approx(0.3, abs=0.03)
-    again = describe(flat, recipe=RECIPE)["remains"]
+    again = info(flat).values["remains"]
     assert again["rate_khz"] == 0
 
 
 def test_remains_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
-    told = describe(path, recipe=RECIPE)
+    told = info(path).values
     assert told["remains"].startswith("not known: only 0 of 40 traces can be prepared")
     with pytest.raises(CpunetError, match="only 0 of 40 traces"):
-        describe(path, recipe=RECIPE, without_remains=tmp_path / "flat.lh5")
-    write_pulses(tmp_path / "sim.lh5", Pulses.of(np.tile(np.arange(400), (9, 1)), dt_ns=16))
-    with pytest.raises(CpunetError, match="remains are taken off measured traces"):
-        describe(tmp_path / "sim.lh5", without_remains=tmp_path / "flat.lh5")
+        subtract_tails(path, tmp_path / "flat.lh5")
+    with pytest.raises(CpunetError, match="is the input"):
+        subtract_tails(path, path, force=True)
 
 
 def test_a_run_folder(tmp_path):
@@ -107,16 +120,17 @@ def test_a_run_folder(tmp_path):
     remains = {"rate_khz": 0.0}
     fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "remains": remains}
     write_run(tmp_path, nn.ModuleDict(), recipe, INFO | {"fit": fit})
-    lines = dict(in_words(describe(tmp_path)))
+    lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
+    assert load(tmp_path).summary() == info(tmp_path).lines
     assert lines["remains"] == "of earlier pulses: none that are certain"
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "a folder without run.json; give the folder of a run, or a file"),
+        (None, "no folder of this program; give the folder of a run, which holds run.json"),
         ("{", r"run.json: damaged \([^\n]*\); train again"),
         ("[1]", r"run.json: .*no mapping"),
     ],
@@ -125,34 +139,32 @@ def test_folders_that_are_no_runs(tmp_path, text, message):
     if text is not None:
         (tmp_path / "run.json").write_text(text)
     with pytest.raises(CpunetError, match=message):
-        describe(tmp_path)
+        info(tmp_path)
 
 
 def test_reference_pulses(reference_data: Path):
-    told = describe(reference_data / "closure" / "data.lh5", recipe=RECIPE)
+    told = info(reference_data / "closure" / "data.lh5").values
     assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
     assert min(told["peaks"].values()) > 500
     assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
 
 
-def test_every_table_of_a_file(tmp_path, capsys, monkeypatch):
+def test_every_table_of_a_file(tmp_path):
     file = tmp_path / "channels.h5"
     with h5py.File(file, "w") as made:
         for channel in (3, 7):
             group = made.create_group(f"ch{channel}/raw")
             group["waveform"] = np.zeros((channel, 50), np.float32)
             group["waveform"].attrs["dt"] = 16.0
-    told = describe(file, dt_ns=16)
-    assert told["kind"] == "tables"
-    found = {name: (one["n_pulses"], one["length"]) for name, one in told["tables"].items()}
+    told = info(file, read=DT)
+    found = {name: (one["n_pulses"], one["length"]) for name, one in told.values.items()}
     assert found == {"ch3/raw": (3, 50), "ch7/raw": (7, 50)}
-    assert describe(file, dt_ns=16, table="ch7/raw")["n_pulses"] == 7
-    monkeypatch.setattr("sys.argv", ["cpunet", "info", str(file), "--dt", "16"])
-    with pytest.raises(SystemExit):
-        main()
-    printed = capsys.readouterr().out
-    assert "ch3/raw" in printed
-    assert "--table NAME" in printed
+    one = FileOptions(table="ch7/raw", dt_ns=16)
+    assert info(file, read=one).values["n_pulses"] == 7
+    assert "ch3/raw" in str(told)
+    every = info(file, read=FileOptions(table="all", dt_ns=16))
+    assert every.ok
+    assert str(every.tables["ch7"]) == str(info(file, read=one))
 
 
 def test_amplitudes_suggest_a_calibration(tmp_path):
@@ -163,47 +175,45 @@ def test_amplitudes_suggest_a_calibration(tmp_path):
     traces[:, 20:] = 15 * kev[:, np.newaxis]
     file = tmp_path / "raw.npy"
     np.save(file, traces)
-    told = describe(file, dt_ns=16)
+    told = info(file, read=DT).values
     assert "Th-228" in told["amplitudes"]
     assert float(told["amplitudes"].split()[-1]) == pytest.approx(1 / 15, rel=1e-3)
     noise = rng.uniform(100, 2600, (3000, 1)).astype(np.float32) * np.ones((1, 40), np.float32)
     noise[:, :20] = 0
     np.save(file, noise)
-    assert describe(file, dt_ns=16)["amplitudes"] == "no lines that stand out"
+    assert info(file, read=DT).values["amplitudes"] == "no lines that stand out"
 
 
 def test_the_measured_spectrum_suggests_its_calibration(reference_data):
-    told = describe(reference_data / "real" / "th228.fcio")
+    told = info(reference_data / "real" / "th228.fcio").values
     assert "Th-228" in told["amplitudes"]
     # as found from its lines by hand
     assert float(told["amplitudes"].split()[-1]) == pytest.approx(0.06493, rel=0.01)
 
 
-def test_files_of_hits_are_described(tmp_path, capsys, monkeypatch):
+def test_files_of_hits_are_described(tmp_path):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
     np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
-    told = describe(path, recipe=RECIPE)["detectors"][""]
+    told = info(path).values["detectors"][""]
     assert (told["events"], told["hits"]) == (2, 3)
     assert told["energy_kev"] == [50.0, 2614.5]
     assert told["r_mm"] == [0.0, 5.0]
     assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
-    assert describe(path, recipe=RECIPE, table="all")["detectors"] == {"": told}
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(
         f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,2,3,4,5\n"
     )
-    for file, said in ((path, "z 10 … 30, r 0 … 5 mm"), (csv, "names no unit")):
-        monkeypatch.setattr("sys.argv", ["cpunet", "info", str(file)])
-        with pytest.raises(SystemExit):
-            main()
-        assert said in capsys.readouterr().out
+    assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
+    assert "names no unit" in str(info(csv))
+    units = HitOptions(length_unit="cm", energy_unit="keV")
+    assert info(csv, frame=units).values["detectors"][""]["x_mm"] == [30, 30]
 
 
 def test_measured_traces_are_described(reference_data: Path):
     """A bench detector: what its digitiser was set to, and what is seen by eye."""
-    told = describe(reference_data / "real" / "th228.fcio", recipe=RECIPE)["traces"]
+    told = info(reference_data / "real" / "th228.fcio").values["traces"]
     assert told["looked_at"] == 1000
     low, middle, high = told["trigger_sample"]
     assert low <= middle <= high
@@ -242,7 +252,7 @@ def test_a_pulse_that_is_never_below_a_level():
 
 
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
-    told = describe(stand_of_one_detector)
+    told = info(stand_of_one_detector).values
     assert told["provenance"]["made by"].startswith("cpunet simulate")
     assert told["provenance"]["detector"].startswith("ppc, 2500 V, 90 K")
     assert told["provenance"]["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
@@ -267,12 +277,12 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
 def test_a_crystal_without_the_taper_is_not_turned_over(reference_data: Path):
     """Upside down more hits would be inside, but the bore would be at the wrong end."""
     path = reference_data / "geant4" / "g4_h20mm.npz"
-    told = describe(path, detector=read_detector("icpc"))["detectors"][""]["crystal"]
+    told = info(path, detector=read_detector("icpc")).values["detectors"][""]["crystal"]
     assert told["outside_percent"] == pytest.approx(10.5, abs=0.3)
     assert "fits" not in told
 
 
-def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
+def test_hits_are_compared_with_a_crystal(tmp_path):
     """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
     crystal = read_detector("icpc")
     rng = np.random.default_rng(3)
@@ -283,60 +293,42 @@ def test_hits_are_compared_with_a_crystal(tmp_path, capsys, monkeypatch):
     columns = dict(zip(("x_mm", "y_mm", "z_mm"), moved.T, strict=True))
     offsets = np.arange(len(moved) + 1)
     np.savez(path, **columns, edep_keV=np.full(len(moved), 100.0), offsets=offsets)
-    told = describe(path, detector=crystal)["detectors"][""]["crystal"]
+    told = info(path, detector=crystal).values["detectors"][""]["crystal"]
     assert told["outside_percent"] > 90
     assert told["fits"]["flip_z"]
     assert told["fits"]["origin_mm"] == pytest.approx([25, -10, 200], abs=0.5)
     assert told["fits"]["inside_percent"] > 98
-    monkeypatch.setattr("sys.argv", ["cpunet", "info", str(path), "--detector", "icpc"])
-    with pytest.raises(SystemExit):
-        main()
-    assert f"{told['fits']['options']}\n" in capsys.readouterr().out
-    assert re.fullmatch(r"--origin [\d.,-]+ --flip-z", told["fits"]["options"])
+    assert re.fullmatch(r"`origin` [\d. -]+ `flip_z`", told["fits"]["options"])
+    origin = tuple(told["fits"]["origin_mm"])
+    there = info(path, detector=crystal, frame=HitOptions(origin=origin, flip_z=True))
+    inside = there.values["detectors"][""]["crystal"]["inside_percent"]
+    assert inside == told["fits"]["inside_percent"]
 
 
-def test_files_to_write_are_not_each_other_and_not_in_vain(tmp_path, reference_data):
-    raw, run = reference_data / "real" / "th228.fcio", tmp_path / "run"
-    out = tmp_path / "out.png"
-    with pytest.raises(CpunetError, match="for the figure and for the traces"):
-        describe(raw, recipe=RECIPE, without_remains=out, out=tmp_path / "." / "out.png")
-    run.mkdir()
-    (run / "run.json").write_text("{}")
-    with pytest.raises(CpunetError, match="a run has no traces; leave out --without-remains"):
-        describe(run, without_remains=out)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("file", "words"), [("stand.json", "a virtual test stand"), ("report.html", "a report")]
-)
-def test_other_folders_are_named(tmp_path, file, words):
-    (tmp_path / file).write_text("")
-    with pytest.raises(CpunetError, match=f"{words}, .* a folder without run.json"):
-        describe(tmp_path)
+def test_other_folders_are_named(tmp_path):
+    (tmp_path / "stand.json").write_text("")
+    with pytest.raises(CpunetError, match=r"a stand, .* no folder of this program"):
+        info(tmp_path)
 
 
 def test_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
-    assert describe(tmp_path / "pulses.npy", dt_ns=16)["n_not_finite"] == 30
+    assert info(tmp_path / "pulses.npy", read=DT).values["n_not_finite"] == 30
     with pytest.raises(CpunetError, match="no spectrum to draw"):
-        describe(tmp_path / "pulses.npy", dt_ns=16, out=tmp_path / "e.png")
+        info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
 
 
 def test_shares_are_percent_whatever_their_time(tmp_path):
     fit = {"parameters": {"slow_12.5_ns": 0.02, "decay_2.9_us": 0.05, "decay_us": 50.0}}
     write_run(tmp_path, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
-    lines = dict(in_words(describe(tmp_path)))
+    lines = dict(info(tmp_path).lines)
     assert lines["response"] == "slow 12.5 ns 2 %, decay 2.9 µs 5 %, decay 50 µs"
 
 
 def test_all_of_the_traces_are_saturated():
     traces = {"trigger_sample": [1, 1, 1], "noise_adc": 1.0, "baseline_samples": 1}
     traces |= {"saturated_percent": 100.0, "pile_up_percent": 0.25, "rejected": {}}
-    pulses = {"format": "HDF5", "table": "t", "n_pulses": 9, "length": 9, "dt_ns": 16.0}
-    pulses |= {"columns": [], "energy": "", "energy_kev": None, "peaks": {}, "samples": None}
-    pulses |= {"n_not_finite": 0, "n_constant": 0, "traces": traces | {"looked_at": 9}}
-    lines = dict(in_words({"kind": "pulses", "path": "raw.h5"} | pulses))
+    lines = dict(traces_in_words(traces | {"looked_at": 9}))
     assert lines["saturated"] == "100 %"
     assert lines["pile-up"].startswith("0.25 % ")
 
@@ -344,18 +336,20 @@ def test_all_of_the_traces_are_saturated():
 def test_a_figure_replaces_nothing_unasked(tmp_path):
     path, out = tmp_path / "pulses.npy", tmp_path / "pulses.png"
     np.save(path, np.tile(np.arange(300.0), (3, 1)))
+    with pytest.raises(CpunetError, match="is the input"):
+        info(path, read=DT, out=path, force=True)
     with pytest.raises(CpunetError, match="pictures are made as"):
-        describe(path, dt_ns=16, out=path, force=True)
-    describe(path, dt_ns=16, out=out)
+        info(path, read=DT, out=tmp_path / "pulses.gif")
+    info(path, read=DT, out=out)
     with pytest.raises(CpunetError, match="exists already"):
-        describe(path, dt_ns=16, out=out)
+        info(path, read=DT, out=out)
 
 
 def test_a_run_has_no_spectrum(tmp_path):
     (tmp_path / "run").mkdir()
     write_run(tmp_path / "run", nn.ModuleDict(), RECIPE, INFO)
     with pytest.raises(CpunetError, match="no spectrum to draw"):
-        describe(tmp_path / "run", out=tmp_path / "run.png")
+        info(tmp_path / "run", out=tmp_path / "run.png")
 
 
 def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
@@ -364,6 +358,80 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     run.mkdir()
     fit = {"noise": {"rms": 1.6, "baselines": 9}}
     write_run(run, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
-    assert dict(in_words(describe(run)))["noise"] == "of 9 baselines"
+    assert dict(info(run).lines)["noise"] == "of 9 baselines"
     monkeypatch.setattr(run_words, "noise_kev", lambda _: (1.95, 0.05))
-    assert dict(in_words(describe(run)))["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"
+    assert dict(info(run).lines)["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"
+
+
+COARSE = {"grid_mm": 0.5}
+
+
+@pytest.fixture
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch) -> None:
+    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_numbers_of_a_detector():
+    told = dict(info("ppc", settings=COARSE).lines)
+    # at 0.5 mm the contact is coarse; at 0.1 mm it is 2.10 pF and 1854 V
+    assert 1.8 < float(told["capacitance"].split()[0]) < 2.4
+    assert 1700 < float(told["depletion voltage"].split()[0]) < 2000
+    assert told["bias"] == "2500 V"
+    low, high = (float(told[f"{k} field"].split()[0]) for k in ("lowest", "highest"))
+    assert 0 < low < 300 < 1000 < high
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_impurities_from_the_measured_depletion():
+    values = COARSE | {"measured_depletion_V": 2200}
+    found = info("ppc", settings=values | {"impurity_scale": "depletion"})
+    assert found.values["depletion_V"] == pytest.approx(2200, abs=1)
+    # given by hand, the scale leads to the same fields
+    scale = {"impurity_scale": found.values["impurity_scale"]}
+    assert info("ppc", settings=values | scale).lines == found.lines
+
+
+@pytest.mark.thorough
+@pytest.mark.usefixtures("own_cache")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "icpc",
+        pytest.param("bege", marks=pytest.mark.slow),
+        pytest.param("ppc", marks=pytest.mark.slow),
+    ],
+)
+def test_a_figure_of_each_detector(tmp_path: Path, name: str):
+    out = tmp_path / "fields.png"
+    info(name, settings=COARSE, out=out)
+    height, width = imread(out).shape[:2]
+    assert width > 1200
+    assert 0.3 < height / width < 1
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_the_command_line(tmp_path, capsys, monkeypatch):
+    def told(*words: object) -> str:
+        monkeypatch.setattr("sys.argv", ["cpunet", "info", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return f"{end.value.code} {capsys.readouterr().out}"
+
+    assert "bias               2600 V" in told(
+        "ppc", "--set", "grid_mm=0.5", "--set=bias_V=2600"
+    )
+    hits = tmp_path / "hits.npz"
+    place = {name: [100.0, 101.0] for name in ("x_mm", "y_mm", "z_mm")}
+    np.savez(hits, **place, edep_keV=[1.0, 2.0], offsets=np.array([0, 2]))
+    assert "100.00 % would be inside with --origin" in told(hits, "--detector", "icpc")
+    words = ("--origin", 100, 100, "-1.5", "--flip-z")
+    assert "inside   0.00 %" in told(hits, "--detector", "icpc", *words)
+    table = tmp_path / "channels.h5"
+    with h5py.File(table, "w") as made:
+        for name in ("ch3", "ch7"):
+            made[f"{name}/waveform"] = np.zeros((3, 50), np.float32)
+        made["ch7/waveform"].attrs["dt"] = 16.0
+    printed = told(table, "--table", "all")
+    assert printed.startswith("1 ")
+    assert "ch3:\nthe sampling period is not in the file; give --dt-ns" in printed

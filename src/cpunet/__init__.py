@@ -21,6 +21,7 @@ __all__ = [
     "CpunetError",
     "FileOptions",
     "HitFile",
+    "HitOptions",
     "PulseFile",
     "Pulses",
     "ReadOptions",
@@ -29,7 +30,10 @@ __all__ = [
     "Translation",
     "__version__",
     "calibrate",
+    "info",
+    "load",
     "open_pulses",
+    "subtract_tails",
     "train",
     "translate",
     "validate",
@@ -40,11 +44,14 @@ if TYPE_CHECKING:
     from cpunet.calls.reports import Report, validate
     from cpunet.calls.runs import train
     from cpunet.calls.translations import Translation, translate
+    from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
+    from cpunet.inspection import info, load
     from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
+    from cpunet.simulation.hits import HitOptions
     from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
@@ -54,11 +61,14 @@ _HOMES = {
     "calls.reports": ("Report", "validate"),
     "calls.runs": ("train",),
     "calls.translations": ("Translation", "translate"),
+    "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
+    "inspection": ("info", "load"),
     "jobs.simulation.hit_sources": ("HitFile",),
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "simulation.hits": ("HitOptions",),
     "training.run": ("Run",),
     "translation.translator": ("IREN", "REN"),
 }

@@ -1,8 +1,11 @@
-"""Tables as text: what results print."""
+"""Tables and lines of text: what results print."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+Lines: TypeAlias = Sequence[tuple[str, str]]
 
 
 def text_table(
@@ -27,3 +30,38 @@ def text_table(
         for line in lines
     ]
     return "\n".join([title, *aligned] if title else aligned)
+
+
+def aligned(lines: Lines) -> str:
+    """Names and texts, a line each; those without a text are left out.
+
+    Examples
+    --------
+    >>> print(aligned([("fit", "good"), ("causes", ""), ("off", "none")]))
+    fit  good
+    off  none
+    """
+    lines = [(name, text) for name, text in lines if text]
+    width = max((len(name) for name, _ in lines), default=0)
+    return "\n".join(f"{name:<{width}}  {text}" if width else text for name, text in lines)
+
+
+def counted(counts: Mapping[str, object]) -> str:
+    """Counts above 0 with their names, which have spaces for underscores.
+
+    Examples
+    --------
+    >>> counted({"FEP": 3, "no_peak": 2, "DEP": 0})
+    '3 FEP, 2 no peak'
+    """
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)
+
+
+def span(ends: Sequence[float] | None, digits: int = 9) -> str:
+    """Both ends to six digits, and no more than `digits` after the point."""
+    return " … ".join(f"{round(v, digits):.6g}" for v in ends) if ends else "–"
+
+
+def percent(value: float) -> str:
+    """Two digits, and whole numbers from 99.5 on."""
+    return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"

@@ -62,7 +62,7 @@ def without(package: str) -> Patch:
     return lambda patch: patch.setitem(sys.modules, package, None)
 
 
-DESCRIBE = "cpunet.jobs.inspection.info.describe"
+DESCRIBE = "cpunet.inspection._look"
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 MISTAKES = {
     # files
@@ -198,8 +198,10 @@ MISTAKES = {
         without("onnx"),
     ),
     # simulation
-    "unknown detector": Mistake("fields V999", r"V999: neither a file nor one of .*ppc.*"),
-    "metres for millimetres": Mistake("fields metres.yaml", r"metres.yaml: .*"),
+    "unknown detector": Mistake(
+        "stand --preset ornl --detector V9 --out o", r"V9: neither a file nor one of .*ppc.*"
+    ),
+    "metres for millimetres": Mistake("info metres.yaml", r"metres.yaml: .*"),
     "hits outside": Mistake(f"{SIMULATE} --hits far.npz", r"far.npz: .*; .*--origin.*"),
     "hits without energies": Mistake(f"{SIMULATE} --hits noenergy.npz", r"noenergy.npz: .*"),
     # machine

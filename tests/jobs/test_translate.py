@@ -23,7 +23,6 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.provenance import provenance
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_channels import translate_channels
@@ -35,6 +34,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses

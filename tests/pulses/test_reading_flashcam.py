@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
+from cpunet import info
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.info import describe
 from cpunet.pulses.reading import open_pulses, tables_of
 
 LENGTH = 64
@@ -76,9 +76,8 @@ def test_channels_with_traces_are_listed_and_counted(tmp_path):
     records.append(event(1, {3: trace(2)}, sparse=True))
     path = write(tmp_path / "run.fcio", *records)
     assert tables_of(path) == ["0", "3"]
-    told = describe(path)
-    assert told["kind"] == "tables"
-    assert {name: one["n_pulses"] for name, one in told["tables"].items()} == {"0": 1, "3": 2}
+    told = info(path).values
+    assert {name: one["n_pulses"] for name, one in told.items()} == {"0": 1, "3": 2}
     one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
     assert tables_of(one) == ["0"]
     path.write_bytes(path.read_bytes()[:-30])

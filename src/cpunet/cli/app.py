@@ -12,9 +12,10 @@ import cpunet
 from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.files import FileOptions, ReadOptions
+from cpunet.simulation.hits import HitOptions
 
 # Each field of these is an option of its own.
-for _options in (FileOptions, ReadOptions):
+for _options in (FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
 _SHORT = {"settings": "set", "settings_file": "settings"}
@@ -24,15 +25,27 @@ def _option(name: str) -> str:
     return _SHORT.get(name) or default_name_transform(name)
 
 
+def _with_options(text: str) -> str:
+    return re.sub(r"`([a-z_]+)`", lambda name: f"--{_option(name[1])}", text)
+
+
 app = App(
     name="cpunet",
     help="Make simulated germanium-detector pulses look measured.",
     version=cpunet.__version__,
     # of "a path or an object", the command line takes paths
     default_parameter=Parameter(
-        accepts_keys=False, consume_multiple=False, name_transform=_option
+        accepts_keys=False,
+        consume_multiple=False,
+        name_transform=_option,
+        negative_iterable=(),
     ),
     result_action="return_value",
+)
+app.command(
+    "cpunet.inspection:info",
+    name="info",
+    help="Say what is in a file, detector, run or report.",
 )
 
 
@@ -52,8 +65,7 @@ def run(words: Sequence[str]) -> int:
         command = " ".join(["cpunet", *(error.command_chain or ())])
         raise CpunetError(told, f"see {command} --help") from error
     except CpunetError as error:
-        text = re.sub(r"`([a-z_]+)`", lambda name: f"--{_option(name[1])}", str(error))
-        raise CpunetError(text) from error
+        raise CpunetError(_with_options(str(error))) from error
     if result is not None:
-        tell(str(result))
+        tell(_with_options(str(result)))
     return 0 if getattr(result, "ok", True) else 1

@@ -19,9 +19,7 @@ from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
-from cpunet.cli.fields import fields
 from cpunet.cli.import_weights import import_
-from cpunet.cli.info import info
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
@@ -69,7 +67,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 for command in (
     demo,
     simulate,
-    fields,
     stand,
     check,
     train,
@@ -80,7 +77,6 @@ for command in (
     compare,
     response,
     export,
-    info,
 ):
     app.command()(command)
 app.add_typer(library, name="library")

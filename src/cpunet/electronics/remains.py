@@ -10,7 +10,7 @@ their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,6 +235,22 @@ class Remains:
         heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
         less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
         return raw.with_waveforms(less)
+
+
+def remains_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and texts for the result of `Remains.describe`."""
+    if not told["rate_khz"]:
+        return [("remains", "of earlier pulses: none that are certain")]
+    shares = ", ".join(
+        f"{share['measured']:.3g} % above {size.partition('_')[0]} keV"
+        for size, share in told["percent_above"].items()
+    )
+    rate = f"{told['rate_khz']:.3g} ± {told['rate_error_khz']:.2g} kHz"
+    by = f"told by {told['told_by']}, error {told['error_kev']:.2g} keV"
+    return [
+        ("remains", f"of earlier pulses: {rate}, decaying with {told['decay_us']:.3g} µs"),
+        ("", f"{shares} ({by})"),
+    ]
 
 
 def _read(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import DITCH, LI_CONTACT, Detector, FloatArray, RegionArray
-from cpunet.simulation.grid import Grid, point_types
+from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE, Grid, point_types
 from cpunet.simulation.superposition import Superposition, solve
+
+log = logging.getLogger(__name__)
 
 _V_PER_CM = 10.0  # of 1 V / mm
 
@@ -124,10 +128,14 @@ def scaled_to_depletion(detector: Detector) -> Detector:
     if not measured:
         raise CpunetError(
             f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
-            "add it to the file, or give measured_depletion_V=VALUE"
+            "add it to the file, or give `settings` measured_depletion_V=VALUE"
         )
     solution = solve(detector)
     scale = solution.scale_of_depletion(measured, detector.impurity_tilt_1e10_per_cm4)
+    log.info(
+        f"{detector.name}: impurities times {scale:.4g}, so that it depletes at the measured "
+        f"{measured:g} V"
+    )
     return detector.model_copy(update={"impurity_scale": scale})
 
 
@@ -190,3 +198,33 @@ def _slope(potential: FloatArray, steps: FloatArray, region: RegionArray) -> Flo
         slope[nodes] += weight * rise
         total[nodes] += weight
     return slope / total
+
+
+def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, str]]:
+    """Names and texts: capacitance, depletion voltage, bias, extremes of the bulk's field."""
+    strength = np.hypot(fields.e_r_V_per_cm, fields.e_z_V_per_cm)
+    # next to contacts and the ditch the field is only a one-sided difference
+    bulk = fields.point_type > LI_CONTACT
+    bulk &= fields.point_type < DITCH_EDGE
+    bulk &= fields.point_type != CONTACT_EDGE
+    bulk &= detector.active(fields.r_mm[:, None], fields.z_mm[None, :])
+    measured, scale = detector.measured_depletion_V, detector.impurity_scale
+    lines = [
+        ("detector", detector.name),
+        ("capacitance", f"{fields.capacitance_pF:.3f} pF"),
+        ("depletion voltage", f"{fields.depletion_V:.0f} V"),
+        ("measured depletion", f"{measured:g} V" if measured else ""),
+        ("impurity_scale", f"{scale:.6g}" if scale != 1 else ""),
+        ("bias", f"{detector.bias_V:g} V"),
+        ("lowest field", _at(fields, np.where(bulk, strength, np.inf), np.argmin)),
+        ("highest field", _at(fields, np.where(bulk, strength, -np.inf), np.argmax)),
+    ]
+    return [(name, text) for name, text in lines if text]
+
+
+def _at(
+    fields: FieldMaps, strength: FloatArray, extreme: Callable[[FloatArray], np.intp]
+) -> str:
+    i, j = np.unravel_index(extreme(strength), strength.shape)
+    place = f"r {fields.r_mm[i]:.1f}, z {fields.z_mm[j]:.1f} mm"
+    return f"{strength[i, j]:.0f} V/cm at {place}"

@@ -15,6 +15,7 @@ from cpunet.simulation.siggen_config import detector_values as siggen_values
 
 _FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
+_SIGGEN_BYTES = 1 << 16
 _Z0 = "impurity_z0_1e10_per_cm3"
 
 # reasons why a file does not give a field
@@ -39,7 +40,8 @@ def read_detector(
         suffix, a siggen or fieldgen configuration.
     overrides
         Values as ``"bias_V=3500"``. They also supply fields that a file lacks, such as
-        ``temperature_K`` of LEGEND diodes.
+        ``temperature_K`` of LEGEND diodes. ``"impurity_scale=depletion"`` (or in the file)
+        scales the impurities so that the detector depletes at its ``measured_depletion_V``.
     crystal
         LEGEND file of the crystal from which a diode was cut, with its impurities. By
         default ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``.
@@ -66,16 +68,32 @@ def read_detector(
     elif crystal is not None:
         raise CpunetError(
             f"{name}: only LEGEND metadata take their impurities from another file; leave out "
-            "--crystal"
+            "`crystal`"
         )
     values = {"name": Path(name).stem} | values | key_values(overrides)
+    by_depletion = values.get("impurity_scale") == "depletion"
+    if by_depletion:
+        del values["impurity_scale"]
     missing = {
-        key: f"missing ({why}); give "
-        + ("the crystal's file with --crystal, or " if key == _Z0 else "")
-        + f"--set {key}=VALUE"
-        for key, why in hints.items()
+        key: f"missing ({why}); give `settings` {key}=VALUE" for key, why in hints.items()
     }
-    return checked(Detector, values, name, missing)
+    detector = checked(Detector, values, name, missing)
+    if not by_depletion:
+        return detector
+    from cpunet.simulation.fields import scaled_to_depletion  # solves for the fields
+
+    return scaled_to_depletion(detector)
+
+
+def holds_detector(path: str | Path) -> bool:
+    """Whether `read_detector` reads it: a preset's name, YAML, JSON, or siggen's file."""
+    place = Path(path)
+    if str(path) in detector_names() or place.suffix.lower() in _MAPPINGS:
+        return True
+    if not _is_file(place):
+        return False
+    with place.open("rb") as file:
+        return b"xtal_length" in file.read(_SIGGEN_BYTES)
 
 
 def _legend(

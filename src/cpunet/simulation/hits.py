@@ -18,6 +18,31 @@ IntArray = npt.NDArray[np.int64]
 FARTHEST_MM, MAX_KEV = 1e7, 1e9
 
 
+@dataclass(frozen=True)
+class HitOptions:
+    """How a file of hits is read, if it does not tell itself.
+
+    Parameters
+    ----------
+    hits_detector
+        Which of the file's detectors.
+    origin
+        X, Y and Z in mm: the point contact's centre in the file's frame.
+    flip_z
+        The file's point contact is on top.
+    length_unit
+        Unit of lengths, if the file names none: mm, cm, m or um.
+    energy_unit
+        Unit of energies, if the file names none: keV, MeV, eV or GeV.
+    """
+
+    hits_detector: str | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    flip_z: bool = False
+    length_unit: str | None = None
+    energy_unit: str | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Hits:
     """Hits of a set of events as flat arrays: event i owns ``offsets[i]:offsets[i + 1]``.

@@ -6,10 +6,11 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 
+from cpunet.electronics.remains import remains_in_words
 from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import noise_kev
-from cpunet.jobs.inspection.info_words import Lines, counted, percent, remains_lines, short
 from cpunet.pulses.loading import SideInfo
+from cpunet.tables import counted, percent
 from cpunet.training.run import FitInfo, Run
 from cpunet.validation.nested_tables import with_std
 
@@ -18,7 +19,7 @@ UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
 _OFF = 3.0  # standard deviations
 
 
-def summary(run: Run) -> Lines:
+def summary(run: Run) -> list[tuple[str, str]]:
     """Topics and texts on a run."""
     fit = run.fit or FitInfo()
     where = run.name
@@ -30,7 +31,7 @@ def summary(run: Run) -> Lines:
         (
             "trained",
             f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
-            f"{when}, {short(run.seconds)} s on {run.device}",
+            f"{when}, {run.seconds:.4g} s on {run.device}",
         ),
         ("from", run.init or ""),
         ("simulated", _side(run.sim)),
@@ -44,7 +45,7 @@ def summary(run: Run) -> Lines:
     if "baselines" in fit.noise:
         lines.append(("noise", f"{_noise(run)}of {fit.noise['baselines']:.0f} baselines"))
     if known is not None and "rate_khz" in known.model_fields_set:
-        lines += remains_lines(known.model_dump())
+        lines += remains_in_words(known.model_dump())
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]
@@ -83,5 +84,5 @@ def _parameters(values: Mapping[str, float]) -> str:
         if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name):
             words.append(f"{called}{shown} {percent(100 * value)}")
         else:
-            words.append(f"{called} {short(value)}{shown}")
+            words.append(f"{called} {value:.4g}{shown}")
     return ", ".join(words)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import islice
 from typing import Any
 
@@ -15,6 +15,7 @@ from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.recipes.schema import Recipe
+from cpunet.tables import counted, percent
 
 BLOCKS, BLOCK = 4, 1024  # number of blocks, traces per block: a few thousand are enough
 START = 0.01  # share of the height at which a pulse begins
@@ -80,6 +81,24 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
         "saturated_percent": 100 * reasons.get(Rejection.SATURATED.label, 0) / len(half),
         "pile_up_percent": 100 * piled / len(half),
     }
+
+
+def traces_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and texts for the result of `trace_properties`."""
+    low, middle, high = told["trigger_sample"]
+    noise = f"{told['noise_adc']:.3g} ADC"
+    if "noise_kev" in told:
+        noise += f", {told['noise_kev']:.3g} keV"
+    decay = told.get("decay_us")
+    return [
+        ("trigger", f"half of the height at sample {middle} (90 % from {low} to {high})"),
+        ("baseline", f"{told['baseline_samples']} samples before nearly all pulses"),
+        ("decay", f"{decay:.3g} µs" if decay else "the tails do not decay"),
+        ("noise", f"{noise} (RMS of a baseline, median)"),
+        ("saturated", percent(told["saturated_percent"])),
+        ("pile-up", f"{percent(told['pile_up_percent'])} (tails that are no single decay)"),
+        ("left out", f"{counted(told['rejected']) or 'none'} of {told['looked_at']} traces"),
+    ]
 
 
 def _edges(block: Pulses) -> tuple[Values, Values, Values]:

@@ -16,10 +16,12 @@ FITS = 0.999  # share inside above which the frame is right, but for rounding at
 BETTER = 0.02  # share by which another frame must be better than that of the file
 CELL_R_MM, CELL_Z_MM = 4.0, 8.0  # cells in which hits are counted
 EXPECTED, VOID = 20.0, 0.05  # expected hits needed to test a cell; share below which it is void
-AS_GIVEN = Transform()
+AS_IN_FILE = Transform()
 
 
-def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
+def describe_frame(
+    hits: Hits, detector: Detector, given: Transform = AS_IN_FILE
+) -> dict[str, Any]:
     """Count the hits inside a crystal, and find a frame with more of them inside.
 
     A frame does not fit, however many hits are inside, if a part of the crystal has no hits,
@@ -31,13 +33,15 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
         Hits in the frame of their file.
     detector
         Crystal with its point contact at z = 0.
+    given
+        Frame in which the hits are counted.
 
     Returns
     -------
     dict
         ``name``, ``radius_mm`` and ``length_mm`` of the crystal; ``inside_percent`` and
         ``outside_percent`` of the hits; and, if another frame fits better, ``fits``:
-        ``origin_mm``, ``flip_z``, ``inside_percent`` and ``options`` of ``cpunet simulate``.
+        ``origin_mm``, ``flip_z``, ``inside_percent`` and ``options``, these in words.
 
     Examples
     --------
@@ -55,7 +59,7 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
         x, y, z = frame.apply(position).T
         return float(detector.inside(np.hypot(x, y), z).mean())
 
-    as_given = inside(AS_GIVEN)
+    as_given = inside(given)
     told: dict[str, Any] = {
         "name": detector.name,
         "radius_mm": detector.crystal_radius,
@@ -73,13 +77,14 @@ def describe_frame(hits: Hits, detector: Detector) -> dict[str, Any]:
     if frame is None:
         return told
     origin = [float(value) for value in frame.origin_mm]
-    words = [f"--origin {','.join(f'{value:g}' for value in origin)}"] if any(origin) else []
+    words = [f"`origin` {' '.join(f'{value:g}' for value in origin)}"] if any(origin) else []
+    words += ["`flip_z`"] if frame.flip_z else []
     return told | {
         "fits": {
             "origin_mm": origin,
             "flip_z": frame.flip_z,
             "inside_percent": 100 * shares[frame],
-            "options": " ".join([*words, *(["--flip-z"] if frame.flip_z else [])]),
+            "options": " ".join(words) or "neither `origin` nor `flip_z`",
         }
     }
 
