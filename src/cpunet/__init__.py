@@ -29,6 +29,7 @@ __all__ = [
     "Translation",
     "__version__",
     "calibrate",
+    "import_weights",
     "open_pulses",
     "train",
     "translate",
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
+    from cpunet.training.published import import_weights
     from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
@@ -59,6 +61,7 @@ _HOMES = {
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "training.published": ("import_weights",),
     "training.run": ("Run",),
     "translation.translator": ("IREN", "REN"),
 }

@@ -34,6 +34,11 @@ app = App(
     ),
     result_action="return_value",
 )
+app.command(
+    "cpunet.training.published:import_weights",
+    name="import",
+    help="Make a run of the weights that the authors published.",
+)
 
 
 def run(words: Sequence[str]) -> int:

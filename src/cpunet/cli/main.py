@@ -20,7 +20,6 @@ from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.fields import fields
-from cpunet.cli.import_weights import import_
 from cpunet.cli.info import info
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
@@ -84,7 +83,6 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(library, name="library")
-app.add_typer(import_, name="import")
 
 
 def main() -> None:
