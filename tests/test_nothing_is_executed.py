@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.import_published import import_weights
+from cpunet.training.published import import_weights
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector

@@ -30,6 +30,7 @@ __all__ = [
     "Translation",
     "__version__",
     "calibrate",
+    "import_weights",
     "info",
     "load",
     "open_pulses",
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
     from cpunet.simulation.hits import HitOptions
+    from cpunet.training.published import import_weights
     from cpunet.training.run import Run
     from cpunet.translation.translator import IREN, REN
 
@@ -69,6 +71,7 @@ _HOMES = {
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
     "simulation.hits": ("HitOptions",),
+    "training.published": ("import_weights",),
     "training.run": ("Run",),
     "translation.translator": ("IREN", "REN"),
 }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import h5py
 import lh5
 import numpy as np
@@ -84,34 +82,12 @@ def test_export(command, trained, tmp_path):
     assert command("export", trained, "--format", "tflite", "--out", out).code == 2
 
 
-def test_import_pulses(command, tmp_path):
-    source = tmp_path / "fep.pickle"
-    with source.open("wb") as stream:
-        for i in range(3):
-            pickle.dump({"wf": np.arange(50.0) + i, "tp0": 3, "energy": 2614.5}, stream)
-    done = command("import", "pulses", source, "--out", tmp_path / "pulses.lh5")
-    assert done.code == 0, done.err
-    assert "3 of 3 pulses" in done.out
-    assert "3" in command("info", tmp_path / "pulses.lh5").out
-    source.write_bytes(source.read_bytes()[:-5])
-    done = command("import", "pulses", source, "--out", tmp_path / "pulses.lh5", "--force")
-    assert done.code == 0
-    assert "2 of 2 pulses" in done.out
-    assert "ends within a pulse" in " ".join(done.err.split())
-    source.write_bytes(b"cos\nsystem\n(S'touch made'\ntR.")
-    refused = command("import", "pulses", source, "--out", tmp_path / "other.lh5")
-    assert refused.code == 2
-    assert "refused, nothing of it was executed" in refused.err
-
-
 def test_import_weights(command, tmp_path):
-    refused = command("import", "weights", "--out", tmp_path / "run")
+    refused = command("import", "--out", tmp_path / "run")
     assert refused.code == 2
-    assert "no generator given" in refused.err
+    assert "no generator given; name fep_REN.pt (--ren), fep_IREN.pt (--iren)" in refused.err
     torch.save({"weight": torch.zeros(1)}, tmp_path / "other.pt")
-    refused = command(
-        "import", "weights", "--ren", tmp_path / "other.pt", "--out", tmp_path / "run"
-    )
+    refused = command("import", "--ren", tmp_path / "other.pt", "--out", tmp_path / "run")
     assert refused.code == 2
     assert "no Positional U-Net" in refused.err
     assert not (tmp_path / "run").exists()

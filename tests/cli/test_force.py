@@ -82,8 +82,7 @@ COMMANDS = {
     "library expand": [("D/hits.lh5", "D/hits.lh5")],
     "library lithium": [],  # reads no file
     "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
-    "import weights": [("--ren D/fep_REN.pt", "D")],
-    "import pulses": [("D/my.pickle", "D/my.pickle")],
+    "import": [("--ren D/fep_REN.pt", "D")],
 }
 OUT = {"info": "--without-remains"}  # in place of --out
 CASES = [

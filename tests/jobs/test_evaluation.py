@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.import_published import UNKNOWN
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.drawings import drawings
@@ -21,6 +20,7 @@ from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.validation.drift_slices import slice_edges
 from cpunet.validation.paired import pair_squares, scores_of_squares

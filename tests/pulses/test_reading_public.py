@@ -151,14 +151,14 @@ DEFECTS = {
         r"give --dt-ns \(CPU-Net's pulses are sampled every 16 ns\)",
     ),
     "a table": ({"table": "x"}, r"has no tables; leave out --table"),
-    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\); convert it"),
+    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\); write the pulses"),
     "no numbers": (
         {"then": {"wf": np.zeros(40), "energy": "much"}},
-        r"entry 3 is no pulse \(holds something other than numbers\); convert it",
+        r"entry 3 is no pulse \(holds something other than numbers\); write the pulses",
     ),
     "other length": (
         {"then": {"wf": np.zeros(39)}},
-        r"entry 3: 39 samples, before it 40; convert it with `cpunet import pulses`",
+        r"entry 3: 39 samples, before it 40; write the pulses of one length",
     ),
     "cut off": ({"cut": 20}, r"breaks off after \d entries .*; download it again"),
     "empty list": ({"only": []}, r"pickled pulses holds no pulses; give a file with events"),

@@ -21,6 +21,16 @@ for _options in (FileOptions, HitOptions, ReadOptions):
 _SHORT = {"settings": "set", "settings_file": "settings"}
 
 
+# Where the function of a command is, and what it does.
+COMMANDS = {
+    "import": (
+        "cpunet.training.published:import_weights",
+        "Make a run of the weights that the authors published.",
+    ),
+    "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+}
+
+
 def _option(name: str) -> str:
     return _SHORT.get(name) or default_name_transform(name)
 
@@ -42,11 +52,8 @@ app = App(
     ),
     result_action="return_value",
 )
-app.command(
-    "cpunet.inspection:info",
-    name="info",
-    help="Say what is in a file, detector, run or report.",
-)
+for _name, (_function, _help) in COMMANDS.items():
+    app.command(_function, name=_name, help=_help)
 
 
 def run(words: Sequence[str]) -> int:

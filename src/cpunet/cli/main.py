@@ -19,7 +19,6 @@ from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
-from cpunet.cli.import_weights import import_
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
@@ -80,7 +79,6 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(library, name="library")
-app.add_typer(import_, name="import")
 
 
 def main() -> None:

@@ -189,8 +189,8 @@ class Run(Part):
         facts |= self.model_dump(mode="json", exclude_unset=True)
         (folder / INFO).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
-    def save(self, folder: str | Path, force: bool = False) -> None:
-        """Write the run, with its losses, to a folder.
+    def save(self, folder: str | Path, force: bool = False) -> Self:
+        """Write the run, with its losses, to a folder; return the run of that folder.
 
         Raises
         ------
@@ -202,6 +202,7 @@ class Run(Part):
             self.write(aside)
             if records:
                 append_losses(aside, records)
+        return self.model_copy(update={"folder": Path(folder)})
 
     def fill(self, part: str, network: Network, device: str = "cpu") -> Network:
         """Fill a network with the weights of a part (``"ren"``, ``"iren"``, …) to apply it.

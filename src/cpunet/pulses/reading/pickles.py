@@ -34,7 +34,7 @@ _ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
     )
 }
 _PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
-_CONVERT = "convert it with `cpunet import pulses`, which leaves such out and counts them"
+_OTHERS = "write the pulses of one length without other entries"
 _WHY = {
     "no_pulse": "no dictionary with wf",
     "no_numbers": "holds something other than numbers",
@@ -136,13 +136,13 @@ class _Seen:
                 pulse, reason = as_pulse(entry, place)
                 if pulse is None:
                     raise CpunetError(
-                        f"{self.path}: entry {place} is no pulse ({_WHY[reason]}); {_CONVERT}"
+                        f"{self.path}: entry {place} is no pulse ({_WHY[reason]}); {_OTHERS}"
                     )
                 length = length or len(pulse.samples)
                 if len(pulse.samples) != length:
                     raise CpunetError(
                         f"{self.path}: entry {place}: {len(pulse.samples)} samples, before it "
-                        f"{length}; {_CONVERT}"
+                        f"{length}; {_OTHERS}"
                     )
                 if place == len(self.numbers):
                     self.numbers.append(pulse.numbers)
@@ -150,8 +150,7 @@ class _Seen:
         except TruncatedError as error:
             said = " ".join(str(error).split())
             raise CpunetError(
-                f"{self.path}: breaks off after {place + 1} entries ({said}); download it "
-                "again, or rescue what is there with `cpunet import pulses`"
+                f"{self.path}: breaks off after {place + 1} entries ({said}); download it again"
             ) from error
         self.complete = True
 

@@ -1,16 +1,23 @@
-"""Load the authors' published weights, by their file names, into networks of this package."""
+"""The authors' published weights become a run."""
 
 from __future__ import annotations
 
+import hashlib
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.discriminators import GruDiscriminator
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
-from cpunet.recipes.network_settings import GruConfig, PunetConfig
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.loading import SideInfo
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes import load_recipe
+from cpunet.recipes.network_settings import PunetConfig
+from cpunet.training.run import Run, versions
 
 # Published layer names → names here; the ninth positional map is never used.
 LAYERS = (
@@ -22,19 +29,92 @@ LAYERS = (
 MAPS = [f"pe{i}.pe" for i in range(1, 10)]
 MAP_TOLERANCE = 1e-3  # the published maps are computed in single precision
 
-DISCRIMINATOR_LAYERS = {
-    "embedding": "embedding",
-    "RNNLayer": "gru",
-    "attention_weight": "attention",
-    "norm": "norm",
-    "fcnet": "outlet",
-    "fcnet.0": "outlet",
-}
+# Facts on the training for a report; its pulses were not published.
+UNKNOWN = SideInfo(file="not published with the weights", used="an unknown number of")
 
 State = dict[str, Tensor]
 
 
-def load_state(path: Path) -> State:
+def import_weights(
+    out: str | Path | None = None,
+    *,
+    ren: str | Path | None = None,
+    iren: str | Path | None = None,
+    dt_ns: float = 16.0,
+    peak: str = "FEP",
+    force: bool = False,
+) -> Run:
+    """Make a run of the published state dicts; nothing of the files is executed.
+
+    Parameters
+    ----------
+    out
+        Run folder to make.
+    ren
+        Simulation → data: ``fep_REN.pt``.
+    iren
+        Data → simulation: ``fep_IREN.pt``.
+    dt_ns
+        Sampling period in ns of the pulses of the training.
+    peak
+        What the weights were trained on.
+    force
+        Replace existing output.
+
+    Returns
+    -------
+    Run
+        The run, with the files in ``imported``.
+
+    Raises
+    ------
+    CpunetError
+        If no generator is given, `peak` cannot be understood, a file is not a plain state
+        dict or has another architecture, the two generators differ in width, or `out` cannot
+        be written.
+
+    Examples
+    --------
+    ``cpunet import --ren fep_REN.pt --iren fep_IREN.pt --out run``
+    """
+    given = {"ren": ren, "iren": iren}
+    files = {part: Path(path) for part, path in given.items() if path is not None}
+    if not files:
+        raise CpunetError("no generator given; name fep_REN.pt (`ren`), fep_IREN.pt (`iren`)")
+    if out is not None:
+        refuse_existing(Path(out), *files.values(), force=force)
+    if not (np.isfinite(dt_ns) and dt_ns > 0):
+        raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
+    length = load_recipe("paper").preparation.length
+    networks = {part: _generator(path, length) for part, path in files.items()}
+    widths = {network.latent_mean.out_channels // 8 for network in networks.values()}
+    if len(widths) > 1:
+        raise CpunetError(
+            f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
+        )
+    recipe = load_recipe("paper", {"generator.width": widths.pop()})
+    parse_selection(peak, recipe.peaks)
+    run = Run.of(
+        nn.ModuleDict(networks),
+        recipe,
+        peak=peak,
+        seed=None,
+        dt_ns=dt_ns,
+        seconds=0.0,
+        device="elsewhere",
+        sim=UNKNOWN,
+        data=UNKNOWN,
+        imported={
+            part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+            for part, path in files.items()
+        },
+        imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions=versions(),
+    )
+    return run if out is None else run.save(out, force)
+
+
+def _load_state(path: Path) -> State:
     """Read a state dict with torch's loader of plain tensors.
 
     Raises
@@ -58,7 +138,7 @@ def load_state(path: Path) -> State:
     return dict(state)
 
 
-def read_generator(path: Path, length: int) -> PositionalUNet:
+def _generator(path: Path, length: int) -> PositionalUNet:
     """Load a published generator, ``fep_REN.pt`` or ``fep_IREN.pt``.
 
     Parameters
@@ -74,7 +154,7 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
         If the file is not a published generator, or its tensors or positional maps belong to
         another architecture; the message names missing, extra or differently shaped tensors.
     """
-    state = load_state(path)
+    state = _load_state(path)
     first = state.get("inc.double_conv.0.weight")
     width = 0 if first is None or first.ndim == 0 else len(first)
     if width < 2 or width % 2:
@@ -92,36 +172,6 @@ def read_generator(path: Path, length: int) -> PositionalUNet:
     network = PositionalUNet(config, length)
     network.load_state_dict(named)
     return network.eval()
-
-
-def read_discriminator(path: Path) -> tuple[GruDiscriminator, GruConfig]:
-    """Load the weights of a published discriminator, ``fep_netD_A.pth`` or ``fep_netD_B.pth``.
-
-    Weights are assigned by name.  The published network never calls its attention matrix
-    and batch norm, so outputs of the network here differ from its own.
-
-    Raises
-    ------
-    CpunetError
-        See `read_generator`.
-    """
-    state = load_state(path)
-    table, hidden = state.get("embedding.weight"), state.get("RNNLayer.weight_hh_l0")
-    if table is None or table.ndim != 2 or hidden is None or hidden.ndim != 2:
-        raise CpunetError(f"{path}: no discriminator; give a file such as fep_netD_A.pth")
-    config = GruConfig(
-        name="gru",
-        embedding_rows=len(table),
-        embedding_dim=table.shape[1],
-        hidden=hidden.shape[1],
-        samples_per_step=1,
-        value_range=None,
-    )
-    network = GruDiscriminator(config)
-    named = _renamed(state, DISCRIMINATOR_LAYERS)
-    _require_same(path, named, network.state_dict(), [])
-    network.load_state_dict(named)
-    return network.eval(), config
 
 
 def _renamed(state: State, layers: dict[str, str]) -> State:

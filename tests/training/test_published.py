@@ -1,14 +1,11 @@
-"""Published weights against the layer table, written out; pickles, pulses and others."""
+"""Published weights against the layer table, written out."""
 
 from __future__ import annotations
 
 import json
 import math
-import pickle
 from pathlib import Path
-from typing import Any
 
-import lh5
 import numpy as np
 import pytest
 import torch
@@ -16,8 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.import_published import import_pulses, import_weights
 from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.training.published import import_weights
 from cpunet.translation.translator import IREN, REN
 
 M = 4
@@ -160,39 +157,6 @@ def test_energies_that_no_validation_would_understand_are_refused(files, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
-def discriminator(hidden: int = 64) -> dict[str, Tensor]:
-    both = 2 * hidden
-    state = {"embedding.weight": torch.rand(1000, 64)}
-    for end in ("", "_reverse"):
-        state[f"RNNLayer.weight_ih_l0{end}"] = torch.rand(3 * hidden, 64)
-        state[f"RNNLayer.weight_hh_l0{end}"] = torch.rand(3 * hidden, hidden)
-        state[f"RNNLayer.bias_ih_l0{end}"] = torch.rand(3 * hidden)
-        state[f"RNNLayer.bias_hh_l0{end}"] = torch.rand(3 * hidden)
-    state["attention_weight.weight"] = torch.rand(both, both)
-    for name in ("weight", "bias", "running_mean", "running_var"):
-        state[f"norm.{name}"] = torch.rand(both)
-    state["norm.num_batches_tracked"] = torch.tensor(1)
-    state["fcnet.0.weight"], state["fcnet.0.bias"] = torch.rand(1, 2 * both), torch.rand(1)
-    return state
-
-
-def test_discriminators_are_kept(files, tmp_path):
-    weights = discriminator()
-    count = sum(v.numel() for n, v in weights.items() if "running" not in n and "num" not in n)
-    assert count == 130_817
-    torch.save(weights, tmp_path / "fep_netD_A.pth")
-    run = import_weights(
-        tmp_path / "run", ren=files[0], discriminator_data=tmp_path / "fep_netD_A.pth"
-    )
-    assert set(run.imported) == {"ren", "discriminator_data"}
-    del weights["norm.bias"]
-    torch.save(weights, tmp_path / "fep_netD_A.pth")
-    with pytest.raises(CpunetError, match=r"1 missing \(norm.bias\)"):
-        import_weights(
-            tmp_path / "other", ren=files[0], discriminator_data=tmp_path / "fep_netD_A.pth"
-        )
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -233,73 +197,6 @@ def test_broken_weights_are_refused(files, tmp_path):
             import_weights(tmp_path / "run", ren=bad)
         assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
-
-
-def entry(i: int, **more: object) -> dict[str, Any]:
-    wf = np.linspace(0, 100, 60) + i
-    return {"wf": wf, "tp0": 20 + i, "energy": 2600.0 + i} | more
-
-
-def dump(path: Path, values: list[Any], protocol: int | None = None) -> Path:
-    with path.open("wb") as stream:
-        for value in values:
-            pickle.dump(value, stream, protocol)
-    return path
-
-
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-@pytest.mark.parametrize("in_a_list", [False, True])
-def test_pulses_of_every_protocol(tmp_path, protocol, in_a_list):
-    pulses = [entry(i, event=100 + i) for i in range(5)]
-    pulses[1]["wf"] = pulses[1]["wf"].astype(">f4")
-    pulses[2]["energy"] = np.float64(2602.0)
-    pulses[3]["wf"] = np.asfortranarray(pulses[3]["wf"]).astype(np.int16)
-    pulses[4]["event"] = np.int32(104)
-    source = dump(tmp_path / "p.pkl", [pulses] if in_a_list else pulses, protocol)
-    told = import_pulses(source, tmp_path / "p.lh5", dt_ns=10)
-    assert told == {"read": 5, "written": 5, "rejections": {}, "truncated": False}
-    made = lh5.read("geds/raw", str(tmp_path / "p.lh5"))
-    np.testing.assert_allclose(
-        made["waveform"]["values"].nda,
-        [np.asarray(p["wf"], np.float32) for p in pulses],
-    )
-    assert made["waveform"]["dt"].nda.tolist() == [10.0] * 5
-    assert made["energy"].nda.tolist() == [2600.0, 2601, 2602, 2603, 2604]
-    assert made["event_number"].nda.tolist() == [100, 101, 102, 103, 104]
-    assert made["tp0"].nda.tolist() == [20, 21, 22, 23, 24]
-
-
-def test_what_is_no_pulse_is_counted(tmp_path):
-    values = [
-        entry(0),
-        {"energy": 3.0},
-        7,
-        entry(3, wf=np.zeros(9)),
-        entry(4, wf=np.zeros((2, 9))),
-        entry(5, energy="much"),
-        entry(6),
-    ]
-    told = import_pulses(dump(tmp_path / "p.pkl", values), tmp_path / "p.lh5")
-    assert (told["read"], told["written"]) == (7, 2)
-    assert told["rejections"] == {
-        "no_pulse": 2,
-        "other_length": 1,
-        "no_trace": 1,
-        "no_numbers": 1,
-    }
-    made = lh5.read("geds/raw", str(tmp_path / "p.lh5"))
-    assert made["event_number"].nda.tolist() == [0, 6]
-
-
-def test_a_truncated_file_gives_what_was_before_its_end(tmp_path):
-    source = dump(tmp_path / "p.pkl", [entry(i) for i in range(4)])
-    source.write_bytes(source.read_bytes()[:-20])
-    told = import_pulses(source, tmp_path / "p.lh5")
-    assert (told["read"], told["written"], told["truncated"]) == (3, 3, True)
-    source.write_bytes(source.read_bytes()[:50])
-    with pytest.raises(CpunetError, match="no pulse among 0 entries; it ends early"):
-        import_pulses(source, tmp_path / "q.lh5")
-    assert not (tmp_path / "q.lh5").exists()
 
 
 def test_the_network_of_the_run_is_the_published_one(files, tmp_path):
