@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.binning import data_axis
 from cpunet.recipes import load_recipe
 from cpunet.validation import distances
 from cpunet.validation.comparisons import (
     ceiling,
     compare,
-    data_axis,
     histogram,
     iou,
     iou_error,

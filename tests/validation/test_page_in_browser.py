@@ -5,8 +5,8 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from browser import browser, run_page
+from cpunet.plotting import line_look, styled
 from cpunet.validation.report import write_report
-from cpunet.validation.style import line_look, styled
 
 SELFTEST = """<script>
 const shown = (method) => [...document.querySelectorAll(`[data-method="${method}"]`)]

@@ -12,9 +12,9 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from cpunet.html_pages import DPI, figure_png
 from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
-from cpunet.validation.html_pages import DPI, figure_png
 from cpunet.validation.nested_tables import nested_html
 from cpunet.validation.report import write_report
 

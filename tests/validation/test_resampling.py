@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from cpunet.pulses.binning import data_axis
 from cpunet.validation import resampling
-from cpunet.validation.comparisons import ceiling, data_axis, iou, iou_error
+from cpunet.validation.comparisons import ceiling, iou, iou_error
 from cpunet.validation.distances import (
     distance_errors,
     kolmogorov_smirnov,

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from cpunet.calibration.titles import titled
 from cpunet.errors import CpunetError
+from cpunet.html_pages import part
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
 from cpunet.jobs.simulation.hit_sources import HitFile
@@ -25,7 +26,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run
 from cpunet.validation.calibration_figures import calibration_figures
-from cpunet.validation.html_pages import part
 
 
 class CalibratedRun(Run):

@@ -12,18 +12,18 @@ import hist
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.calls.translations import MAX_BINS, named, named_axis
+from cpunet.calls.translations import named
 from cpunet.errors import CpunetError
+from cpunet.html_pages import part
 from cpunet.jobs.validation.compare import read_metrics
 from cpunet.jobs.validation.drawings import Drawing
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.jobs.validation.validate import validated
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
 from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.training.run import RunLike
-from cpunet.validation.comparisons import data_axis
-from cpunet.validation.html_pages import part
 from cpunet.validation.report_folder import METRICS, VALUES
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table
@@ -138,7 +138,7 @@ class Report:
             if max_bins is None and told.get("bins")
             else data_axis(data, max_bins or MAX_BINS)
         )
-        axis = named_axis(axis, parameter)
+        axis = labelled(axis, parameter)
         made: hist.Hist[Any] = hist.Hist(methods, axis)
         for method, values in there.items():
             made.fill(method, values[np.isfinite(values)])

@@ -16,25 +16,24 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from cpunet.errors import CpunetError
+from cpunet.html_pages import notebook_picture, part
 from cpunet.jobs.translation.translate import FileTranslation
 from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
+from cpunet.plotting import COLOURS, styled
 from cpunet.progress import stage
+from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile, Source, pulse_file
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, all_parameters
+from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import RunLike
 from cpunet.translation.learned_remains import NONE
 from cpunet.translation.output_form import Formed
-from cpunet.validation.comparisons import data_axis
-from cpunet.validation.html_pages import notebook_picture, part
-from cpunet.validation.style import COLOURS, styled
 
 log = logging.getLogger(__name__)
 
-MAX_BINS = 49
 DRAWN = 50  # pulses in a figure
 
 
@@ -115,7 +114,7 @@ class Translation:
             If there is no such parameter.
         """
         values = named(self.parameters, parameter, "parameter")
-        axis = named_axis(data_axis(values, max_bins), parameter)
+        axis = labelled(data_axis(values, max_bins), parameter)
         made: hist.Hist[Any] = hist.Hist(axis)
         return made.fill(values[np.isfinite(values)])
 
@@ -273,13 +272,6 @@ def _in_memory(
         counts["saturated"] = int(sum(block.saturated.sum() for block in formed))
     whole = Pulses.concatenate([block.pulses for block in formed])
     return replace(made, counts=counts, kept=(whole, codes))
-
-
-def named_axis(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:
-    """The same bins, with the parameter's name and label."""
-    edges = axis.edges
-    label = SHAPE_PARAMETERS[parameter].axis_label
-    return hist.axis.Regular(axis.size, edges[0], edges[-1], name=parameter, label=label)
 
 
 def named(values: Mapping[str, Any], name: str, kind: str) -> Any:

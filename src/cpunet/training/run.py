@@ -346,7 +346,7 @@ class Run(Part):
         return f"<{type(self).__name__} {self.name}: {self.recipe.name}, {self.peak}{fit}>"
 
     def _repr_html_(self) -> str:
-        from cpunet.validation.html_pages import notebook_picture, part
+        from cpunet.html_pages import notebook_picture, part
 
         there = self.recipe.generator.name == "response" or self.records
         picture = notebook_picture(self.plot()) if there else ""

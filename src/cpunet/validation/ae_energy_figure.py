@@ -9,10 +9,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from cpunet.html_pages import joined, part
+from cpunet.plotting import GROUP, colours, group, label, styled
 from cpunet.validation.ae_energy import REFERENCE_KEV
-from cpunet.validation.html_pages import joined, part
 from cpunet.validation.nested_tables import html_table, with_std
-from cpunet.validation.style import GROUP, colours, group, label, styled
 
 FIGURE = "A over E and energy"
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.validation.style import (
+from cpunet.plotting import (
     GROUP,
     colours,
     group,
@@ -20,6 +19,7 @@ from cpunet.validation.style import (
     linear_within,
     styled,
 )
+from cpunet.pulses.parameters import PARAMETERS
 
 AMPLITUDE = PARAMETERS["current_amplitude"].axis_label
 DRIFT_TIME = PARAMETERS["drift_time"].axis_label

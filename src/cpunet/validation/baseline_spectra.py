@@ -20,8 +20,8 @@ from scipy.special import erfc
 from scipy.stats import norm
 
 from cpunet.errors import CpunetError
+from cpunet.plotting import colours, group, label, styled
 from cpunet.pulses.container import FloatArray
-from cpunet.validation.style import colours, group, label, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

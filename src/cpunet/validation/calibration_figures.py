@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.calibration.titles import titled
-from cpunet.validation.style import COLOURS, styled
+from cpunet.plotting import COLOURS, styled
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
 # Columns of panels.

@@ -9,6 +9,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from scipy.ndimage import distance_transform_edt
 
+from cpunet.plotting import COLOURS, styled
 from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import (
@@ -19,7 +20,6 @@ from cpunet.simulation.geometry import (
     FloatArray,
 )
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.validation.style import COLOURS, styled
 
 # Paths and times tolerate coarse steps, but must not end before the charge is collected.
 _SETTINGS = SimulationSettings(step_ns=2.0, dt_ns=16.0, length_ns=6000.0, diffusion=False)

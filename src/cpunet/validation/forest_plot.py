@@ -8,9 +8,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from cpunet.validation.html_pages import part
+from cpunet.html_pages import part
+from cpunet.plotting import colours
 from cpunet.validation.side_by_side import Cell, Row
-from cpunet.validation.style import colours
 
 WIDTH, NAMES, RIGHT = 460, 170, 14  # pixels: panel, names, right margin
 LINE, TOP, BOTTOM = 14, 6, 24

@@ -7,8 +7,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from cpunet.validation.html_pages import joined, part
-from cpunet.validation.style import LABELS, NO_NOISE, label
+from cpunet.html_pages import joined, part
+from cpunet.plotting import LABELS, NO_NOISE, label
 
 NO_VALUE = "–"
 ERRORS = ("_std", "_error")  # suffixes of the name of an error

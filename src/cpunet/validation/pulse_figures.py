@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
+from cpunet.plotting import DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.validation.nearest import nearest_pulses
 from cpunet.validation.paired import align_half_maximum
-from cpunet.validation.style import DATA_FILL, GROUP, colours, label, linear_within, styled
 
 Values = npt.NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from cpunet.electronics.baseline_tails import read_baselines
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.validation.style import COLOURS, DATA_FILL, styled
 
 Values = npt.NDArray[np.float64]
 

@@ -15,11 +15,7 @@ from typing import Any
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.settings import plain
-from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
-from cpunet.validation.ae_energy_figure import ae_energy_html
-from cpunet.validation.html_pages import (
+from cpunet.html_pages import (
     asset,
     figure_html,
     figure_png,
@@ -27,6 +23,11 @@ from cpunet.validation.html_pages import (
     part,
     rendered,
 )
+from cpunet.plotting import colours, label
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.settings import plain
+from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
+from cpunet.validation.ae_energy_figure import ae_energy_html
 from cpunet.validation.nested_tables import nested_html, number
 from cpunet.validation.report_folder import METRICS
 from cpunet.validation.report_tables import (
@@ -35,7 +36,6 @@ from cpunet.validation.report_tables import (
     survival_html,
     verdicts_html,
 )
-from cpunet.validation.style import colours, label
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 # section of a figure by the end of its name; all others are under Details

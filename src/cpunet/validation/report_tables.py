@@ -7,12 +7,12 @@ from typing import Any
 
 from markupsafe import Markup
 
+from cpunet.html_pages import joined, part
+from cpunet.plotting import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
-from cpunet.validation.html_pages import joined, part
 from cpunet.validation.nested_tables import NO_VALUE, html_table, number, with_std, words_of
 from cpunet.validation.score_panels import score_panels
-from cpunet.validation.style import NO_NOISE, label
 
 
 def verdicts_html(verdicts: Mapping[str, Any] | None) -> Markup:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.electronics.exponentials import Exponentials, FloatArray
+from cpunet.plotting import COLOURS, SPARE_COLOURS, styled
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.validation.style import COLOURS, SPARE_COLOURS, styled
 
 Numbers = dict[str, float]
 

@@ -17,12 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
-from cpunet.validation.comparisons import Comparison, data_axis, histogram
-from cpunet.validation.mean_pulse import MeanPulse
-from cpunet.validation.style import (
+from cpunet.plotting import (
     COLOURS,
     DATA_FILL,
     GROUP,
@@ -32,6 +27,12 @@ from cpunet.validation.style import (
     linear_within,
     styled,
 )
+from cpunet.pulses.binning import data_axis
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.validation.comparisons import Comparison, histogram
+from cpunet.validation.mean_pulse import MeanPulse
 
 Values = npt.NDArray[np.float64]
 

@@ -7,11 +7,11 @@ from typing import Any
 
 from markupsafe import Markup
 
+from cpunet.html_pages import part
+from cpunet.plotting import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.validation.forest_plot import forest_plot
-from cpunet.validation.html_pages import part
 from cpunet.validation.side_by_side import Cell, Row
-from cpunet.validation.style import NO_NOISE, label
 
 LAST = "ren"  # drawn last; the other methods are in the order of the tables
 

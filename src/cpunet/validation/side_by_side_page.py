@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from cpunet.html_pages import rendered
+from cpunet.plotting import label
 from cpunet.validation.forest_plot import forest_plot
-from cpunet.validation.html_pages import rendered
 from cpunet.validation.side_by_side import Metrics, SideBySide
-from cpunet.validation.style import label
 from cpunet.validation.verdicts import judged_scores, part, summary
 
 FEW = 8  # runs whose scores fit beside each other; more have an overview and panels

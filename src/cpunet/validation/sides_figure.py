@@ -9,8 +9,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cpunet.plotting import COLOURS, DATA_FILL, label, styled
 from cpunet.validation.paired import align_half_maximum
-from cpunet.validation.style import COLOURS, DATA_FILL, label, styled
 
 Values = npt.NDArray[np.floating]
 

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cpunet.plotting import GROUP, colours, label, line_look, linear_within, styled
 from cpunet.validation.drift_slices import Slices, Values, slice_residuals
-from cpunet.validation.style import GROUP, colours, label, line_look, linear_within, styled
 
 LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.spectrum import SOURCES, Spectrum
-from cpunet.validation.style import COLOURS, DATA_FILL, styled
 
 BINS = 1000
 HIGHEST = 0.999  # quantile of the values; the axis ends a little above it

@@ -21,8 +21,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from cpunet.plotting import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.validation.style import NO_NOISE, label
 
 AGREES = 2.0  # sigma
 TOO_CLOSE = 4.0  # sigma on the good side: not by chance, but the same events on both sides

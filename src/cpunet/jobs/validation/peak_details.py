@@ -9,6 +9,7 @@ from typing import Any
 from cpunet.errors import CpunetError
 from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.jobs.validation.scoring import ByMethod
+from cpunet.plotting import NO_NOISE
 from cpunet.pulses.parameters import Values
 from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
 from cpunet.validation.drift_slices import (
@@ -19,7 +20,6 @@ from cpunet.validation.drift_slices import (
 )
 from cpunet.validation.mean_pulse import MeanPulse
 from cpunet.validation.paired import align_half_maximum
-from cpunet.validation.style import NO_NOISE
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from cpunet.jobs.validation.translations import Translations
 from cpunet.jobs.validation.when_asked import WhenAsked
+from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.paired import PairedScores, scores_of_squares
-from cpunet.validation.style import NO_NOISE
 
 MIN_N = 10  # minimum number of pulses of a distribution
 

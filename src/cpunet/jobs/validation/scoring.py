@@ -7,12 +7,12 @@ from typing import Any
 
 from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.jobs.validation.pulse_tests import told_apart
+from cpunet.plotting import NO_NOISE
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.baseline_spectra import baseline_spectra
 from cpunet.validation.comparisons import compare
-from cpunet.validation.style import NO_NOISE
 
 ByMethod = dict[str, dict[str, Values]]
 

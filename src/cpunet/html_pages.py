@@ -21,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from cpunet.validation.style import GROUP
+from cpunet.plotting import GROUP
 
 DPI = 150
 NOTEBOOK_DPI = 80
