@@ -151,7 +151,7 @@ DEFECTS = {
         r"give --dt-ns \(CPU-Net's pulses are sampled every 16 ns\)",
     ),
     "a table": ({"table": "x"}, r"has no tables; leave out --table"),
-    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\); write the pulses"),
+    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\)"),
     "no numbers": (
         {"then": {"wf": np.zeros(40), "energy": "much"}},
         r"entry 3 is no pulse \(holds something other than numbers\); write the pulses",

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.validation.comparisons import ceiling, data_axis, iou, iou_error
+from cpunet.pulses.binning import data_axis
+from cpunet.validation.comparisons import ceiling, iou, iou_error
 from cpunet.validation.resampling import Resampled, resampled_twice
 
 Values = npt.NDArray[np.float64]
