@@ -17,11 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.training.train import train
 
 FAILED = 0.9
 
@@ -33,8 +32,8 @@ def scores_of(
     sim, data = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
-        how = load_recipe(recipe, overrides), TrainOptions(seed=seed)
-        run = train_run(sim, data, Path(folder) / "run", *how)
+        how = {"recipe": load_recipe(recipe, overrides), "seed": seed}
+        run = train(sim, data, Path(folder) / "run", **how)
         return evaluate(
             run,
             sim,

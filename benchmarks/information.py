@@ -22,7 +22,6 @@ import torch
 
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.measured_noise import measured_noise
-from cpunet.jobs.training.chain_and_inverse import known_response
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_measured, load_simulated
@@ -33,6 +32,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
+from cpunet.training.fit import known_response
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.outputs import written_aside
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.training.train import train
 
 FAILED = 0.9
 PEAKS = ("SEP", "DEP")
@@ -36,8 +35,8 @@ def one_seed(
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
         before = time.process_time()
-        how = load_recipe(recipe, overrides), TrainOptions(seed=seed)
-        run = train_run(*files, Path(folder) / "run", *how)
+        how = {"recipe": load_recipe(recipe, overrides), "seed": seed}
+        run = train(*files, Path(folder) / "run", **how)
         cpu = time.process_time() - before
         metrics = evaluate(
             run,

@@ -16,14 +16,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.train import train
 
 
 def few_of(data: PulseFile, pulses: int, folder: Path) -> PulseFile:
@@ -57,7 +56,7 @@ def main() -> None:
         folder = Path(name)
         known = folder / "known"
         sides = [PulseFile(arguments.known / f"{side}.lh5") for side in ("sim", "data")]
-        train_run(sides[0], sides[1], known, load_recipe("fast"), TrainOptions(device="cpu"))
+        train(sides[0], sides[1], known, recipe=load_recipe("fast"), device="cpu")
         few = few_of(data, arguments.pulses, folder)
         for title, start, measured in (
             ("fresh, all pulses", None, data),
@@ -66,7 +65,7 @@ def main() -> None:
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
             recipe = load_recipe("fast")
-            made = train_run(sim, measured, run, recipe, TrainOptions(init=start, device="cpu"))
+            made = train(sim, measured, run, recipe=recipe, init=start, device="cpu")
             scored = evaluate(
                 made,
                 sim,

@@ -27,7 +27,7 @@ SETTINGS = ["training.checkpoint_interval=1", "training.log_interval=1"]
 # what takes long to import, and a training or a test needs
 PRELOADED = [
     "cpunet.cli.main",
-    "cpunet.jobs.training.train",
+    "cpunet.training.train",
     "cpunet.pulses.reading.hdf5",
     "pytest",
     "torch._dynamo",

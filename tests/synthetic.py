@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import resource
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +27,7 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes.schema import PreparationConfig, Recipe
+from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
 from cpunet.validation.paired import PairedScores, pair_squares, scores_of_squares
 from cpunet.validation.truth import Responses
@@ -227,3 +229,18 @@ def write_run(
     """Write a run of networks as they are; `info` may be the content of a ``run.json``."""
     facts = {key: value for key, value in info.items() if key not in ("recipe", "format")}
     Run.of(model, recipe, **facts).write(folder)
+
+
+@contextmanager
+def interrupted_in(iteration: int) -> Iterator[None]:
+    """Ctrl-C in an iteration of a training of networks."""
+    call = Step.__call__
+
+    def interrupted(self: Step, number: int, *given: Any) -> Any:
+        if number + 1 == iteration:
+            signal.raise_signal(signal.SIGINT)
+        return call(self, number, *given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Step, "__call__", interrupted)
+        yield

@@ -20,12 +20,11 @@ import yaml
 import cpunet
 from cpunet.cli.main import app
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe, recipe_names
+from cpunet.training.train import train
 from cpunet.translation.translator import RejectionWarning
 from synthetic import decay, phased_edges
 
@@ -174,7 +173,7 @@ def home(tmp_path_factory) -> Path:
     write_pulses(folder / "fine.lh5", fine)
     recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = PulseFile(folder / "sim.lh5"), PulseFile(folder / "raw.lh5")
-    train_run(*sides, folder / "run", recipe, TrainOptions(device="cpu"))
+    train(*sides, folder / "run", recipe=recipe, device="cpu")
     for seed in ("seed_000", "seed_001"):
         shutil.copytree(folder / "run", folder / "ens" / seed)
     return folder

@@ -43,7 +43,6 @@ __all__ = [
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
     from cpunet.calls.reports import Report, validate
-    from cpunet.calls.runs import train
     from cpunet.calls.translations import Translation, translate
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
@@ -55,13 +54,13 @@ if TYPE_CHECKING:
     from cpunet.simulation.hits import HitOptions
     from cpunet.training.published import import_weights
     from cpunet.training.run import Run
+    from cpunet.training.train import train
     from cpunet.translation.translator import IREN, REN
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
     "calls.reports": ("Report", "validate"),
-    "calls.runs": ("train",),
     "calls.translations": ("Translation", "translate"),
     "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
@@ -73,6 +72,7 @@ _HOMES = {
     "simulation.hits": ("HitOptions",),
     "training.published": ("import_weights",),
     "training.run": ("Run",),
+    "training.train": ("train",),
     "translation.translator": ("IREN", "REN"),
 }
 

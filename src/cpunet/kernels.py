@@ -66,6 +66,9 @@ def start_threads() -> None:
         importlib.import_module("numba.np.ufunc.omppool")  # loads OpenMP: it has a number now
     with threadpoolctl.ThreadpoolController().select(user_api="openmp").limit(limits=None):
         numba.get_num_threads()
+    asked = os.environ.get("OMP_NUM_THREADS", "")  # which numba does not look at
+    if asked.isdecimal() and int(asked):
+        numba.set_num_threads(min(int(asked), config.NUMBA_NUM_THREADS))
 
 
 def use_threads(count: int) -> None:

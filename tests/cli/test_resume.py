@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training import checkpoints
 from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
 from cpunet.training.run import LOSSES
+from cpunet.training.train import train
 from synthetic import digests
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
@@ -60,7 +59,8 @@ def test_a_signal_stops_between_two_iterations(
     assert stopped.out == ""
     told = stopped.err.splitlines()
     assert "stopping after this iteration; once more to stop at once" in told
-    assert told[-1] == "error: stopped after 3 of 4 iterations; continue with --resume"
+    assert "stopped after 3 of 4 iterations; resume goes on from there" in told
+    assert told[-1].startswith("error: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
     assert command(*words, "--resume").code == 0
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -195,13 +195,13 @@ def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
     recipe = load_recipe("paper", overrides)
     files = PulseFile(stand.sim), PulseFile(stand.data)
-    train_run(*files, tmp_path / "whole", recipe, TrainOptions(seed=5, device="cpu"))
+    train(*files, tmp_path / "whole", recipe=recipe, seed=5, device="cpu")
     for moment in MOMENTS:
         given = {"MOMENT": moment, "ARGUMENTS": (*files, tmp_path / "run", recipe)}
         job = held.forked(__file__, given, PROCESS)
         job.join()
         assert job.exitcode == -signal.SIGKILL, moment
-    train_run(*files, tmp_path / "run", recipe, TrainOptions(seed=5, device="cpu", resume=True))
+    train(*files, tmp_path / "run", recipe=recipe, seed=5, device="cpu", resume=True)
     assert digests(tmp_path / "run") == digests(tmp_path / "whole")
     # one killed before its first checkpoint began again
     info = json.loads((tmp_path / "run" / "run.json").read_text())
@@ -213,4 +213,5 @@ if __name__ == PROCESS:
     asked = globals()
     torch.set_num_threads(1)
     die_at(*asked["MOMENT"])
-    train_run(*asked["ARGUMENTS"], TrainOptions(seed=5, device="cpu", resume=True))
+    *given, recipe = asked["ARGUMENTS"]
+    train(*given, recipe=recipe, seed=5, device="cpu", resume=True)

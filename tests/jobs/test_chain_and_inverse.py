@@ -15,10 +15,6 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.chain_and_inverse import Sides
-from cpunet.jobs.training.cyclegan_trainer import outside_noise
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
@@ -28,8 +24,11 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.training.fit import Sides
+from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
+from cpunet.training.train import train
 from cpunet.translation.translator import IREN, REN
 from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
 
@@ -98,7 +97,7 @@ def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     handler, logger = QueueHandler(told), logging.getLogger("cpunet")
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
-    made = train_run(*files, folder, RECIPE, TrainOptions(seed=3, device="cpu"))
+    made = train(*files, folder, recipe=RECIPE, seed=3, device="cpu")
     logger.removeHandler(handler)
     logger.setLevel(logging.NOTSET)
     return Trained(made, [told.get() for _ in range(told.qsize())])
@@ -183,13 +182,7 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     left = law.draw(N, rng)[:, np.newaxis]
     decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
     data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
-    made = train_run(
-        files.sim,
-        data,
-        tmp_path / "run",
-        RECIPE,
-        TrainOptions(seed=3, device="cpu"),
-    )
+    made = train(files.sim, data, tmp_path / "run", recipe=RECIPE, seed=3, device="cpu")
     fit = made.fit.model_dump()
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
@@ -232,7 +225,7 @@ def test_a_simulation_of_other_physics_is_told(
     # edges of many widths, as no pole makes them of the right ones
     other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
     recipe = load_recipe("fast", [*ONE_START, *SHORT])
-    made = train_run(other, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
+    made = train(other, files.data, tmp_path / "run", recipe=recipe, device="cpu")
     fit = made.fit.model_dump()
     assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
     said = [note for note in caplog.messages if "poor fit" in note]
@@ -246,7 +239,7 @@ def test_a_stretched_drift_is_told_and_translated(
 ) -> None:
     sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.25), FINE))
     recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
-    made = train_run(sim, files.data, tmp_path / "run", recipe, TrainOptions(device="cpu"))
+    made = train(sim, files.data, tmp_path / "run", recipe=recipe, device="cpu")
     fit = made.fit.model_dump()
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
     assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
@@ -269,28 +262,21 @@ def test_energies_of_one_side_only_are_refused(files: Files, tmp_path: Path) -> 
     more = Pulses.of(sampled(charge(N, seed=1), FINE), dt_ns=DT_NS, energy_kev=energies)
     write_pulses(tmp_path / "sim.lh5", more)
     with pytest.raises(CpunetError, match=r"data\.lh5: no pulse of 1000-1200 can be used, sim"):
-        train_run(
-            sim,
-            files.data,
-            tmp_path / "run",
-            RECIPE,
-            TrainOptions(peak="FEP,1000-1200", device="cpu"),
+        train(
+            sim, files.data, tmp_path / "run", recipe=RECIPE, peak="FEP,1000-1200", device="cpu"
         )
     with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
-        train_run(
-            sim,
-            files.data,
-            tmp_path / "run",
-            RECIPE,
-            TrainOptions(peak="FEP,300-400", device="cpu"),
+        train(
+            sim, files.data, tmp_path / "run", recipe=RECIPE, peak="FEP,300-400", device="cpu"
         )
     # a range that both sides have, but not all of it: what cannot be compared is counted
-    made = train_run(
+    made = train(
         sim,
         files.data,
         tmp_path / "r",
-        load_recipe("fast", [*ONE_START, *SHORT]),
-        TrainOptions(peak="1000-", device="cpu"),
+        recipe=load_recipe("fast", [*ONE_START, *SHORT]),
+        peak="1000-",
+        device="cpu",
     )
     assert made.fit.in_no_band == {"sim": 50, "data": 0}
 
@@ -301,5 +287,5 @@ def test_too_few_pulses_leave_nothing(files: Files, tmp_path: Path) -> None:
     with pytest.raises(
         CpunetError, match=r"^40 simulated and \d+ measured pulses; 200 of each"
     ):
-        train_run(few, files.data, tmp_path / "run", RECIPE, TrainOptions(device="cpu"))
+        train(few, files.data, tmp_path / "run", recipe=RECIPE, device="cpu")
     assert [path.name for path in tmp_path.iterdir()] == ["few.lh5"]

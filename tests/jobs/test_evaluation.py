@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.drawings import drawings
 from cpunet.jobs.validation.energy_ranges import validation_selection
 from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, _compared, evaluate
@@ -22,6 +20,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
+from cpunet.training.train import train
 from cpunet.validation.drift_slices import slice_edges
 from cpunet.validation.paired import pair_squares, scores_of_squares
 from synthetic import after_pole, decay, phased_edges
@@ -71,9 +70,7 @@ def files(tmp_path_factory) -> dict[str, PulseFile]:
 @pytest.fixture(scope="module")
 def run(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("run") / "run"
-    return train_run(
-        files["sim"], files["data"], out, RECIPE, TrainOptions(seed=0, device="cpu")
-    )
+    return train(files["sim"], files["data"], out, recipe=RECIPE, seed=0, device="cpu")
 
 
 def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:

@@ -11,14 +11,13 @@ from safetensors.torch import load_file
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
+from cpunet.training.train import train
 from cpunet.translation.translator import REN
 from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges, write_run
 
@@ -71,14 +70,14 @@ def files(tmp_path_factory) -> dict[str, PulseFile]:
 @pytest.fixture(scope="module")
 def chain(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("chain") / "run"
-    train_run(files["sim"], files["one"], out, FAST, TrainOptions(device="cpu"))
+    train(files["sim"], files["one"], out, recipe=FAST, device="cpu")
     return out
 
 
 @pytest.fixture(scope="module")
 def network(files, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("network") / "run"
-    train_run(files["sim"], files["one"], out, TINY, TrainOptions(device="cpu"))
+    train(files["sim"], files["one"], out, recipe=TINY, device="cpu")
     return out
 
 
@@ -89,15 +88,9 @@ def poles(run: Path) -> list[float]:
 
 @pytest.mark.slow
 def test_a_chain_that_starts_near_takes_fewer_steps(files, chain, tmp_path) -> None:
-    cold = train_run(
-        files["sim"], files["other"], tmp_path / "cold", FAST, TrainOptions(device="cpu")
-    )
-    warm = train_run(
-        files["sim"],
-        files["other"],
-        tmp_path / "warm",
-        FAST,
-        TrainOptions(init=chain, device="cpu"),
+    cold = train(files["sim"], files["other"], tmp_path / "cold", recipe=FAST, device="cpu")
+    warm = train(
+        files["sim"], files["other"], tmp_path / "warm", recipe=FAST, init=chain, device="cpu"
     )
     assert warm.init == str(chain)
     assert warm.fit.steps < cold.fit.steps
@@ -120,13 +113,13 @@ def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
     model = nn.ModuleDict({"ren": generator})
     (tmp_path / "near").mkdir()
     write_run(tmp_path / "near", model, recipe, json.loads((chain / "run.json").read_text()))
-    start = TrainOptions(init=tmp_path / "near", device="cpu")
+    start = {"init": tmp_path / "near", "device": "cpu"}
     fixed = load_recipe("fast", [*SHORT, "training.drift_terms=0"])
-    alone = train_run(files["sim"], files["one"], tmp_path / "alone", fixed, start)
+    alone = train(files["sim"], files["one"], tmp_path / "alone", recipe=fixed, **start)
     assert "drift_stretch" not in alone.fit.parameters
     # none is true, and whether it is then taken out again is up to chance
     monkeypatch.setattr(response_starts, "SURE", 0.0)
-    goes_on = train_run(files["sim"], files["one"], tmp_path / "free", FAST, start)
+    goes_on = train(files["sim"], files["one"], tmp_path / "free", recipe=FAST, **start)
     assert abs(goes_on.fit.parameters["drift_stretch"]) < 0.05
     assert REN.load(tmp_path / "free").backend.chain.response.drift is not None
 
@@ -134,9 +127,7 @@ def test_a_stretched_drift_goes_on_only_where_a_recipe_stretches(
 @pytest.mark.thorough
 def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None:
     # a training whose rates are next to nothing stays where it began
-    train_run(
-        files["sim"], files["other"], tmp_path / "run", TINY, TrainOptions(init=network, seed=5)
-    )
+    train(files["sim"], files["other"], tmp_path / "run", recipe=TINY, init=network, seed=5)
     before, after = (load_file(r / "weights.safetensors") for r in (network, tmp_path / "run"))
     kept = [n for n in before if n.startswith(("ren.", "iren.")) and "running" not in n]
     assert kept
@@ -147,23 +138,17 @@ def test_networks_begin_with_the_weights_given(files, network, tmp_path) -> None
 @pytest.mark.thorough
 def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> None:
     with pytest.raises(CpunetError, match="from which fast cannot start"):
-        train_run(files["sim"], files["one"], tmp_path / "a", FAST, TrainOptions(init=network))
+        train(files["sim"], files["one"], tmp_path / "a", recipe=FAST, init=network)
     with pytest.raises(CpunetError, match="from which no network can start"):
-        train_run(files["sim"], files["one"], tmp_path / "a", TINY, TrainOptions(init=chain))
+        train(files["sim"], files["one"], tmp_path / "a", recipe=TINY, init=chain)
     wider = load_recipe("paper", ["generator.width=4"])
     with pytest.raises(CpunetError, match="weights of another network"):
-        train_run(files["sim"], files["one"], tmp_path / "b", wider, TrainOptions(init=network))
+        train(files["sim"], files["one"], tmp_path / "b", recipe=wider, init=network)
     with pytest.raises(CpunetError, match="no finished run"):
-        train_run(
-            files["sim"],
-            files["one"],
-            tmp_path / "c",
-            TINY,
-            TrainOptions(init=tmp_path / "none"),
-        )
+        train(files["sim"], files["one"], tmp_path / "c", recipe=TINY, init=tmp_path / "none")
     fast_sampled = [write(tmp_path / f"{k}.lh5", k, p, 10.0) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match="trained on 16 ns, these pulses have 10 ns"):
-        train_run(*fast_sampled, tmp_path / "d", FAST, TrainOptions(init=chain))
+        train(*fast_sampled, tmp_path / "d", recipe=FAST, init=chain)
     assert not any((tmp_path / name).exists() for name in "abcd")
 
 
@@ -177,9 +162,7 @@ def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> Non
         ],
     )
     with pytest.raises(CpunetError, match=r"know windows of 400 \+ 400 samples") as told:
-        train_run(
-            files["sim"], files["one"], tmp_path / "a", shorter, TrainOptions(init=network)
-        )
+        train(files["sim"], files["one"], tmp_path / "a", recipe=shorter, init=network)
     assert "this recipe has 400 + 384" in str(told.value)
     assert "\n" not in str(told.value)
 
@@ -190,6 +173,6 @@ def test_noise_needs_baselines(tmp_path) -> None:
     )
     few = [write(tmp_path / f"{k}.lh5", k, p, n=20) for k, p in ((1, None), (2, 4.0))]
     with pytest.raises(CpunetError, match=r"2\.lh5: no baselines to draw noise from") as told:
-        train_run(*few, tmp_path / "run", recipe, TrainOptions(device="cpu"))
-    assert "--set training.noise=none" in str(told.value)
+        train(*few, tmp_path / "run", recipe=recipe, device="cpu")
+    assert "training.noise=none" in str(told.value)
     assert "\n" not in str(told.value)

@@ -10,8 +10,6 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.translation import translate as translate_job
 from cpunet.jobs.translation.translate import translate_file
 from cpunet.jobs.translation.translate_options import TranslateOptions
@@ -30,6 +28,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
+from cpunet.training.train import train
 from synthetic import (
     KEV,
     SMALL_NETWORK,
@@ -121,7 +120,7 @@ def test_devices():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 @pytest.mark.parametrize("name", ["cuda", "cuda:1"])
 def test_a_gpu_that_is_not_there(name):
-    with pytest.raises(CpunetError, match="no GPU was found; use --device cpu"):
+    with pytest.raises(CpunetError, match="no GPU was found; use `device` cpu"):
         resolve_device(name)
 
 
@@ -154,7 +153,7 @@ def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
 
 def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
     caplog.set_level("INFO", "cpunet")
-    made = train_run(*files, tmp_path / "run", RECIPE, TrainOptions(seed=7, device="cpu"))
+    made = train(*files, tmp_path / "run", recipe=RECIPE, seed=7, device="cpu")
     assert stages == {
         "Preparing sim.lh5": [N, N],
         "Preparing data.lh5": [N, N],
@@ -169,8 +168,8 @@ def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
 
 
 def test_a_range_of_energies(files, tmp_path, caplog):
-    how = TrainOptions(peak="1500-2200", device="cpu")
-    made = train_run(*files, tmp_path / "run", RECIPE, how)
+    how = {"recipe": RECIPE, "peak": "1500-2200", "device": "cpu"}
+    made = train(*files, tmp_path / "run", **how)
     told = "SEP, DEP are in the range trained on, and no test of it any more"
     assert [note for note in caplog.messages if "trained on" in note] == [told]
     assert made.peak == "1500-2200"

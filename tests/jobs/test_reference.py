@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.training.train import train
 
 pytestmark = pytest.mark.slow
 
@@ -21,7 +20,7 @@ def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_p
     """Trained on FEP, judged on SEP and DEP, which it has not seen."""
     folder = reference_data / "closure"
     sim, data = PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5")
-    train_run(sim, data, tmp_path / "run", load_recipe("fast"), TrainOptions(device="cpu"))
+    train(sim, data, tmp_path / "run", recipe=load_recipe("fast"), device="cpu")
     metrics = validate_run(
         tmp_path / "run",
         sim,
@@ -61,9 +60,7 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     data = PulseFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
     recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
-    made = train_run(
-        sim, data, tmp_path / "run", recipe, TrainOptions(peak="300-", device="cpu")
-    )
+    made = train(sim, data, tmp_path / "run", recipe=recipe, peak="300-", device="cpu")
     assert 200 < made.data.used < 1000
     metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")
     scores = metrics["peaks"]["300-"]

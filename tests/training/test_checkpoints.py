@@ -22,9 +22,9 @@ from cpunet.training.checkpoints import (
     differences,
     unfinished_folder,
 )
-from cpunet.training.loop import CheckpointHooks, StoppedError, train
+from cpunet.training.loop import CheckpointHooks, train
 from cpunet.training.run import LOSSES, WEIGHTS
-from synthetic import nearly_full_disk
+from synthetic import interrupted_in, nearly_full_disk
 
 N = 5
 
@@ -66,11 +66,8 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
     """Train up to an iteration; its state goes to a file, its records are returned."""
     records, run = [], unfinished(folder)
     run.begin(resume=False)
-    hooks = CheckpointHooks(
-        run.save, stop=lambda: len(asked) >= iteration or bool(asked.append(0))
-    )
-    asked = [0]
-    with pytest.raises(StoppedError, match=f"^stopped after {iteration} of {N} iterations;"):
+    hooks = CheckpointHooks(run.save)
+    with interrupted_in(iteration), pytest.raises(KeyboardInterrupt):
         train(*sets, recipe, seed=3, listener=records.extend, hooks=hooks)
     return records
 

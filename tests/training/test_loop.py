@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import copy
+import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.training.loop import CheckpointHooks, StoppedError, train
-from synthetic import LOSS_NAMES
+from cpunet.training.loop import CheckpointHooks, train
+from synthetic import LOSS_NAMES, interrupted_in
 
 
 def run(sets, recipe, seed=0):
@@ -163,7 +165,7 @@ def test_a_training_on_a_gpu_goes_on(tiny, sets):
         torch.testing.assert_close(again[name], value, rtol=1e-3, atol=1e-4)
 
 
-def kept(sets, recipe, stop=lambda: False):
+def kept(sets, recipe):
     """Train; numbers of iterations after which the state was kept, and of records by then."""
     records, states = [], []
 
@@ -176,7 +178,7 @@ def kept(sets, recipe, stop=lambda: False):
             recipe,
             seed=0,
             listener=records.extend,
-            hooks=CheckpointHooks(save, stop=stop),
+            hooks=CheckpointHooks(save),
         )
     finally:
         assert [record["iteration"] for record in records] == [*range(len(records))]
@@ -189,21 +191,25 @@ def test_the_state_is_kept_at_its_interval_and_at_the_end(tiny, sets):
     assert kept(sets, recipe) == [(2, 2), (4, 4), (5, 5)]
 
 
-def test_a_stop_is_kept(tiny, sets):
-    asked = iter([False, False, True])
-    states = []
-    hooks = CheckpointHooks(
-        lambda state: states.append(state["iteration"]), stop=lambda: next(asked)
-    )
-    with pytest.raises(
-        StoppedError, match=r"^stopped after 3 of 4 iterations; continue with --res"
-    ):
+def test_an_interruption_is_kept(tiny, sets, caplog):
+    caplog.set_level("INFO", "cpunet")
+    before, states = signal.getsignal(signal.SIGINT), []
+    hooks = CheckpointHooks(lambda state: states.append(state["iteration"]))
+    with interrupted_in(3), pytest.raises(KeyboardInterrupt):
         train(*sets, tiny(), seed=0, hooks=hooks)
     assert states == [3]
+    assert caplog.messages[-1].startswith("stopped after 3 of 4 iterations; resume")
+    assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_stop_in_the_last_iteration_is_none(tiny, sets):
-    assert kept(sets, tiny("training.iterations=1"), stop=lambda: True) == [(1, 1)]
+def test_an_interruption_in_the_last_iteration_is_none(tiny, sets):
+    with interrupted_in(1):
+        assert kept(sets, tiny("training.iterations=1")) == [(1, 1)]
+
+
+def test_a_thread_trains_without_signals(tiny, sets):
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(kept, sets, tiny("training.iterations=1")).result() == [(1, 1)]
 
 
 def test_what_diverged_is_not_kept(tiny, sets, monkeypatch):

@@ -76,7 +76,7 @@ rule train:
         options=options(**config["train"], device=config["device"]),
     shell:
         "cpunet train --sim {input.sim:q} --data {input.data:q} {params.reading}"
-        " {params.options} --threads {threads} --out {output:q} --force > {log:q} 2>&1"
+        " {params.options} --out {output:q} --force > {log:q} 2>&1"
 
 
 def translation_reading(wildcards):

@@ -28,6 +28,10 @@ COMMANDS = {
         "Make a run of the weights that the authors published.",
     ),
     "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "train": (
+        "cpunet.training.train:train",
+        "Train REN and IREN on simulated and measured pulses, unpaired.",
+    ),
 }
 
 

@@ -13,7 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
-    from cpunet.jobs.training.check import Checked
+    from cpunet.training.check import Checked
 
 Out = Annotated[
     Path | None,
@@ -47,8 +47,8 @@ def check(
 
     Example: cpunet check --sim sim.lh5 --data raw.lh5 --data-table all
     """
-    from cpunet.jobs.training.check import Checked, Level, check
     from cpunet.pulses.channels import ALL, paired
+    from cpunet.training.check import Checked, Level, check
 
     sides = read_as.sim(sim), read_as.data(data)
     if out_file is not None:
@@ -71,7 +71,7 @@ def check(
 
 
 def _show(checked: Checked, picture: Path | None, *, force: bool) -> None:
-    from cpunet.jobs.training.check import draw
+    from cpunet.training.check import draw
 
     for finding in checked.findings:
         out.print(MARKS[finding.level], end="", soft_wrap=True)

@@ -24,7 +24,6 @@ from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
-from cpunet.cli.train import train
 from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
@@ -68,7 +67,6 @@ for command in (
     simulate,
     stand,
     check,
-    train,
     calibrate,
     tune,
     translate,

@@ -11,14 +11,13 @@ from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_p
 from cpunet.jobs.simulation.hit_sources import energy_windows
 from cpunet.jobs.simulation.stand import write_stand
 from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
-from cpunet.jobs.training.train import train_run
-from cpunet.jobs.training.training_job import TrainOptions
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
+from cpunet.training.train import train
 
 _PEAK = "FEP"  # peak of the training
 _HALF_WINDOW_KEV = 0.5  # half-width of the deposited energies around each line
@@ -55,7 +54,7 @@ def demonstrate(
     quick
         Whether the report is a quick look, see `ValidateOptions`.
     seed, device
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Returns
     -------
@@ -84,19 +83,17 @@ def demonstrate(
         write_stand(plan, stand)
     sim, data = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
     if not is_there(out, "run"):
-        train_run(
+        train(
             sim,
             data,
             run,
-            recipe,
-            TrainOptions(
-                _PEAK,
-                seed,
-                device,
-                # an unfinished training is resumed, except with --force
-                resume=recipe.training.method == "cyclegan" and not force,
-                force=force,
-            ),
+            recipe=recipe,
+            peak=_PEAK,
+            seed=seed,
+            device=device,
+            # an unfinished training is resumed, except with --force
+            resume=recipe.training.method == "cyclegan" and not force,
+            force=force,
         )
     return validate_run(
         run,

@@ -18,8 +18,6 @@ import yaml
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.chain_and_inverse import Sides, match
-from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.outputs import refuse_inputs, written_aside
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
@@ -37,7 +35,9 @@ from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.devices import resolve_device
+from cpunet.training.fit import Sides, match
 from cpunet.training.loop import train
+from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
 from cpunet.translation.learned_remains import LEARNED, wanted_remains
 from cpunet.translation.output_form import drawn_kev
@@ -77,7 +77,7 @@ def tune_recipe(
     Parameters
     ----------
     sim, data, peak, device
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
     out
         Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe),
         ``trials.csv``, and ``journal.log`` with all that Optuna knows.
@@ -347,7 +347,7 @@ class HeldOut:
         return score
 
     def train(self, recipe: Recipe, seed: int, device: str) -> REN:
-        """Train on the pulses that are not held out; see `cpunet.jobs.training.train`.
+        """Train on the pulses that are not held out; see `cpunet.training.train`.
 
         Raises
         ------

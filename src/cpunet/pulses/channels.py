@@ -109,7 +109,7 @@ class Outcome(Generic[R]):
         return not self.failed
 
     def __str__(self) -> str:
-        lines = {name: str(found) for name, found in self.done.items()}
+        lines = {name: repr(found).strip("<>'") for name, found in self.done.items()}
         lines |= {name: f"failed: {reason}" for name, reason in self.failed.items()}
         width = max(map(len, lines), default=0)
         return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
@@ -130,7 +130,6 @@ def one_by_one(
     channels: Mapping[str, Pair | CpunetError],
     out: Path,
     do: Callable[[str, Pair, Path], R],
-    ends: type[CpunetError] | tuple[type[CpunetError], ...] = (),
 ) -> Outcome[R]:
     """Process each channel; a failed channel does not stop the others.
 
@@ -142,13 +141,11 @@ def one_by_one(
         Folder of the outputs; each is a folder (or file) named after its channel.
     do
         Function called with the name of a channel, its two files and the path of its output.
-    ends
-        Errors that end the loop, such as a request to stop.
 
     Raises
     ------
     CpunetError
-        If `out` is the output of one channel, or an error of `ends` occurs.
+        If `out` is the output of one channel.
     """
     if out.is_file() or (out / MARKER).exists():
         raise CpunetError(
@@ -163,8 +160,6 @@ def one_by_one(
             log.info(f"{name}:")
             outcome.done[name] = do(name, pair, out / name)
         except CpunetError as error:
-            if isinstance(error, ends):
-                raise
             outcome.failed[name] = str(error)
             log.info(f"{name}: failed: {error}")
     return outcome

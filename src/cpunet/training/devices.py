@@ -19,7 +19,7 @@ def resolve_device(device: str) -> str:
     if known is None:
         raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
     if device != "cpu" and not torch.cuda.is_available():
-        raise CpunetError("no GPU was found; use --device cpu or install a CUDA build of torch")
+        raise CpunetError("no GPU was found; use `device` cpu or install a CUDA build of torch")
     if known[1] and int(known[1]) >= torch.cuda.device_count():
         count = torch.cuda.device_count()
         raise CpunetError(f"device {device!r}: the last of {count} GPUs is cuda:{count - 1}")

@@ -6,11 +6,15 @@ trained ones, with batch-norm statistics of the side that each of them translate
 
 from __future__ import annotations
 
+import logging
 import math
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from types import FrameType
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -23,6 +27,8 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Step
 from cpunet.training.outside import Outside
 
+log = logging.getLogger(__name__)
+
 Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
 # dicts and lists of tensors, numbers and text; has "iteration"
@@ -33,10 +39,6 @@ MIN_N = 20  # minimum number of updates
 WON, LOST = 0.95, 0.52  # accuracy of a discriminator from which a generator learns nothing
 
 
-class StoppedError(CpunetError):
-    """A training was stopped early on request, after saving its state."""
-
-
 @dataclass(frozen=True)
 class CheckpointHooks:
     """Hooks to save and resume a training.
@@ -45,17 +47,14 @@ class CheckpointHooks:
     ----------
     save
         Called with the state every ``checkpoint_interval`` iterations, after the last one and
-        before a stop, always after the listener has received all earlier records.  The tensors
-        change again once it returns.
+        before an interruption, always after the listener has received all earlier records.
+        The tensors change again once it returns.
     start
         State to continue from.
-    stop
-        Called after each iteration; True to stop there.
     """
 
     save: Callable[[State], None]
     start: State | None = None
-    stop: Callable[[], bool] = lambda: False
 
 
 NOTHING_KEPT = CheckpointHooks(lambda _state: None)
@@ -76,7 +75,8 @@ def train(
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
     The same seed on the same computer results in the same weights, whether or not the training
-    was interrupted and resumed.
+    was interrupted and resumed.  Ctrl-C and SIGTERM act between two iterations, once the state
+    is saved; a second one acts at once.
 
     Parameters
     ----------
@@ -97,14 +97,12 @@ def train(
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
         and ``"accuracy"`` of the discriminators where they were updated.
     hooks
-        Hooks to save and resume the training, and to stop it.
+        Hooks to save and resume the training.
 
     Raises
     ------
     CpunetError
         If a set is empty, or a loss becomes NaN or infinite.
-    StoppedError
-        If `hooks` asked to stop.
     """
     for name, pulses in (("simulated", sim), ("measured", data)):
         if not len(pulses):
@@ -126,7 +124,8 @@ def train(
         if hooks.start is not None:
             training.load_state_dict(hooks.start)
         try:
-            _iterate(training, listener, hooks)
+            with _Interruption() as interruption:
+                _iterate(training, listener, hooks, interruption)
         except _DivergenceError as error:
             raise CpunetError(
                 f"training diverged: {error} (seed {seed}); lower the learning rates or change "
@@ -275,14 +274,42 @@ class _Training:
             torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
 
 
-def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHooks) -> None:
+class _Interruption:
+    """Ctrl-C and SIGTERM wait for the end of an iteration; a second one acts at once."""
+
+    def __init__(self) -> None:
+        self.signal = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # others get no signals
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, _frame: FrameType | None) -> None:
+        self.__exit__()
+        self.signal = number
+        log.info("stopping after this iteration; once more to stop at once")
+
+
+def _iterate(
+    training: _Training,
+    listener: Listener | None,
+    hooks: CheckpointHooks,
+    interruption: _Interruption,
+) -> None:
     config = training.config
     pending: list[dict[str, Any]] = []
     while training.iteration < config.iterations:
         pending.append(training.advance())
         done = training.iteration
         last = done == config.iterations
-        stop = hooks.stop() and not last
+        stop = 0 if last else interruption.signal
         keep = last or stop or done % config.checkpoint_interval == 0
         # several iterations are fetched at once: each transfer makes a GPU wait
         if keep or len(pending) == config.log_interval:
@@ -297,10 +324,11 @@ def _iterate(training: _Training, listener: Listener | None, hooks: CheckpointHo
                     raise _DivergenceError(f"{name} is not finite after iteration {done - 1}")
             hooks.save(training.state_dict())
         if stop:
-            raise StoppedError(
-                f"stopped after {done} of {config.iterations} iterations; "
-                "continue with --resume"
+            log.info(
+                f"stopped after {done} of {config.iterations} iterations; resume goes on "
+                "from there"
             )
+            signal.raise_signal(stop)
 
 
 def _finite(record: dict[str, Any]) -> Record:

@@ -35,8 +35,6 @@ from cpunet.jobs.calibration.calibration_inputs import (
 )
 from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.training.response_trainer import train_chain
-from cpunet.jobs.training.training_job import TrainingJob, TrainOptions
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import FolderKind, folder_written_aside
@@ -46,6 +44,8 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.chain import train_chain
+from cpunet.training.job import TrainingJob
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
 from cpunet.validation.calibration_figures import calibration_figures, directions_figure
@@ -112,7 +112,7 @@ class Calibration:
     def run(self, out: Path, *, force: bool = False) -> dict[str, Any]:
         """Calibrate detector and readout together, and write a run folder of the result.
 
-        The folder is a run like those of `cpunet.jobs.training.train.train_run`, and contains
+        The folder is a run like those of `cpunet.train`, and contains
         the calibrated ``detector.yaml`` and ``settings.yaml``, ``sim.lh5`` (all events,
         simulated again with them), ``calibration.json`` (see
         `cpunet.calibration.result.described`) and its figures, ``profiles.png``, ``pulls.png``
@@ -123,7 +123,7 @@ class Calibration:
         out
             Output folder; it appears when it is complete.
         force
-            See `cpunet.jobs.training.train.train_run`.
+            See `cpunet.train`.
 
         Returns
         -------
@@ -151,8 +151,9 @@ class Calibration:
             # not stretched: what is off in the drift is for the physics to explain
             training = self.recipe.training.model_copy(update={"drift_terms": 0})
             recipe = self.recipe.model_copy(update={"training": training})
-            how = TrainOptions(self.peak, self.seed, "cpu")
-            job = TrainingJob(recipe, how, again, sides.data, self.data, None, folder)
+            job = TrainingJob(
+                recipe, self.peak, self.seed, "cpu", again, sides.data, self.data, folder
+            )
             run = train_chain(job, calibrated.response)
             content["seconds"] = round(time.perf_counter() - clock, 1)
             assert run.fit is not None  # of a chain

@@ -70,7 +70,7 @@ def simulate_file(
 ) -> Summary:
     """Simulate the pulses of a detector and write them, with their hits, to an LH5 file.
 
-    The table ``geds/sim`` is the input of `cpunet.jobs.training.train.train_run`: ``waveform``
+    The table ``geds/sim`` is the input of `cpunet.train`: ``waveform``
     in units of the collected charge, collected ``energy`` (keV), ``event_number``,
     ``lost_energy`` (keV, deposited where it gives no signal), ``n_hits``, with trapping
     ``trapped_energy`` (keV, deposited elsewhere but not collected), and with a resolution
@@ -102,7 +102,7 @@ def simulate_file(
     seed
         Seed of the resolution (the Monte Carlo has its own).
     force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Raises
     ------

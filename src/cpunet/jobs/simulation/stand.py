@@ -115,7 +115,7 @@ def make_stand(
     seed
         Seed of all random numbers; the sides are independent.
     force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Raises
     ------

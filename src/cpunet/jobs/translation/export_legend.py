@@ -79,7 +79,7 @@ def export_legend_pars(
     library
         Library of ideal charge pulses on which the error of the kernel is determined.
     force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Returns
     -------

@@ -85,7 +85,7 @@ def translate_for_simflow(
         Number of components to write, with the coefficients of each grid point, instead of
         templates; see `cpunet.jobs.translation.simflow_files.read_library`.
     device, force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Returns
     -------

@@ -64,7 +64,7 @@ class FileTranslation:
     options
         How to translate.
     device
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def translate_file(
     resume
         Whether to keep an output that was made from this source with this run and options.
     device, force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Returns
     -------

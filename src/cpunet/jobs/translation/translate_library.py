@@ -111,7 +111,7 @@ def translate_library(
         ``drift_time_*_deg`` become the times of the maxima, by which a template must be
         shifted to be in its original position.
     device, force
-        See `cpunet.jobs.training.train.train_run`.
+        See `cpunet.train`.
 
     Returns
     -------

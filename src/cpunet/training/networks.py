@@ -12,12 +12,12 @@ import torch
 from cpunet.electronics.drawn_remains import TraceNoise
 from cpunet.electronics.measured_noise import measured_noise
 from cpunet.errors import CpunetError
-from cpunet.jobs.training.chain_and_inverse import Sides, remains_of_sides
-from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.progress import stage
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan
+from cpunet.training.fit import Sides, remains_of_sides
+from cpunet.training.job import TrainingJob
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
 from cpunet.training.run import FitInfo, Run, read_losses
@@ -30,9 +30,9 @@ _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 
 def train_networks(job: TrainingJob) -> Run:
     """Train the networks of a CycleGAN, or resume their training."""
-    recipe, how = job.recipe, job.options
+    recipe = job.recipe
     run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
-    state = run.begin(resume=how.resume)
+    state = run.begin(resume=job.resume)
     outside, fit = outside_noise(job.sides, recipe)
     left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
     with stage("Training", left) as bar:
@@ -45,12 +45,12 @@ def train_networks(job: TrainingJob) -> Run:
             job.sim.prepared.pulses.waveforms,
             job.data.prepared.pulses.waveforms,
             recipe,
-            seed=how.seed,
-            device=how.device,
+            seed=job.seed,
+            device=job.device,
             init=None if job.init is None else weights_of(job.init, recipe),
             outside=outside,
             listener=listen,
-            hooks=CheckpointHooks(run.save, state, job.stop),
+            hooks=CheckpointHooks(run.save, state),
         )
     run.finish()
     for line in judges_noted(read_losses(job.folder)):
@@ -78,7 +78,7 @@ def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, FitInfo
     except CpunetError as error:
         raise CpunetError(
             f"{sides.data_file.path}: no baselines to draw noise from ({error}); or train "
-            "without it (--set training.noise=none)"
+            "without it (training.noise=none in `settings`)"
         ) from error
     if note is not None:
         log.warning(note)
@@ -129,7 +129,7 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
     del recipe["search"]  # the search space does not affect the weights
     training = recipe["training"]
     recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
-    settings = {"recipe": recipe, "peak": job.options.peak, "seed": job.options.seed}
+    settings = {"recipe": recipe, "peak": job.peak, "seed": job.seed}
     if job.init is not None:
         settings["init"] = job.init.weights_sha256
     return settings | {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
@@ -138,7 +138,7 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
 def _environment(job: TrainingJob) -> dict[str, Any]:
     """Environment that affects the last bits of the weights."""
     return {
-        "device": job.options.device,
+        "device": job.device,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from datetime import UTC, datetime
 
-from cpunet.jobs.training.chain_and_inverse import known_response, match
-from cpunet.jobs.training.training_job import TrainingJob
 from cpunet.networks.response_layer import Readout
 from cpunet.progress import stage
+from cpunet.training.fit import known_response, match
+from cpunet.training.job import TrainingJob
 from cpunet.training.loop import Record
 from cpunet.training.run import Run, append_losses
 
@@ -27,7 +27,7 @@ def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-        found = match(job.sides, job.recipe, job.options.seed, listen, known)
+        found = match(job.sides, job.recipe, job.seed, listen, known)
     found.log()
     seconds = time.perf_counter() - clock
     began = started.isoformat(timespec="seconds")
