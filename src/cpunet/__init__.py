@@ -17,6 +17,7 @@ __version__ = "0.1.0"
 __all__ = [
     "IREN",
     "REN",
+    "Adc",
     "CalibratedRun",
     "CpunetError",
     "FileOptions",
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
     from cpunet.calls.reports import Report, validate
     from cpunet.calls.runs import train
-    from cpunet.calls.translations import Translation, translate
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
@@ -55,6 +55,9 @@ if TYPE_CHECKING:
     from cpunet.simulation.hits import HitOptions
     from cpunet.training.published import import_weights
     from cpunet.training.run import Run
+    from cpunet.translation.options import Adc
+    from cpunet.translation.translate import translate
+    from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
@@ -62,7 +65,6 @@ _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
     "calls.reports": ("Report", "validate"),
     "calls.runs": ("train",),
-    "calls.translations": ("Translation", "translate"),
     "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
@@ -73,6 +75,9 @@ _HOMES = {
     "simulation.hits": ("HitOptions",),
     "training.published": ("import_weights",),
     "training.run": ("Run",),
+    "translation.options": ("Adc",),
+    "translation.translate": ("translate",),
+    "translation.translation": ("Translation",),
     "translation.translator": ("IREN", "REN"),
 }
 

@@ -19,8 +19,6 @@ from cpunet.jobs.training.chain_and_inverse import Sides
 from cpunet.jobs.training.cyclegan_trainer import outside_noise
 from cpunet.jobs.training.train import train_run
 from cpunet.jobs.training.training_job import TrainOptions
-from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
@@ -30,6 +28,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
+from cpunet.translation.translate import translate
 from cpunet.translation.translator import IREN, REN
 from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
 
@@ -148,9 +147,7 @@ def test_files_are_translated_in_both_directions(
 ) -> None:
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
-    told = translate_file(
-        run.folder, source, out, TranslateOptions(inverse=inverse), device="cpu"
-    )
+    told = translate(run.folder, source, out, inverse=inverse).counts
     assert told == {"read": N, "translated": N, "rejections": {}}
     windows = open_pulses(out).read()
     assert windows.waveforms.shape == (N, 800)
@@ -166,10 +163,9 @@ def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
     energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    told = translate_file(run.folder, PulseFile(path), tmp_path / "a.lh5", device="cpu")
+    told = translate(run.folder, path, tmp_path / "a.lh5").counts
     assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
-    quiet = TranslateOptions(noise=False)
-    told = translate_file(run.folder, PulseFile(path), tmp_path / "b.lh5", quiet, device="cpu")
+    told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 

@@ -13,9 +13,10 @@ from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.files import FileOptions, ReadOptions
 from cpunet.simulation.hits import HitOptions
+from cpunet.translation.options import Adc
 
 # Each field of these is an option of its own.
-for _options in (FileOptions, HitOptions, ReadOptions):
+for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
 _SHORT = {"settings": "set", "settings_file": "settings"}
@@ -28,6 +29,10 @@ COMMANDS = {
         "Make a run of the weights that the authors published.",
     ),
     "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "translate": (
+        "cpunet.translation.translate:translate",
+        "Translate pulses with a trained run, keeping the rows and columns of their files.",
+    ),
 }
 
 

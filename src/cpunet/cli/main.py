@@ -25,7 +25,6 @@ from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
 from cpunet.cli.train import train
-from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.installation import other_package
@@ -52,6 +51,7 @@ Debug = Annotated[
 ]
 app = typer.Typer(
     help="Make simulated germanium-detector pulses look measured.",
+    epilog=f"Further commands: {', '.join(name for name in commands if name[0] != '-')}",
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -71,7 +71,6 @@ for command in (
     train,
     calibrate,
     tune,
-    translate,
     validate,
     compare,
     response,

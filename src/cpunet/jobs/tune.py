@@ -39,7 +39,8 @@ from cpunet.training.checkpoints import differences
 from cpunet.training.devices import resolve_device
 from cpunet.training.loop import train
 from cpunet.training.run import Run
-from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 from cpunet.validation.distances import null_distances, wasserstein

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from cpunet.calls.reports import Report
-    from cpunet.calls.translations import Translation
+    from cpunet.pulses.channels import Outcome
+    from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
 
 FORMAT = 2
@@ -315,9 +316,11 @@ class Run(Part):
         tail_ns = self.recipe.preparation.samples_after * self.dt_ns
         return response_figure([chain_of(self)], tail_ns=tail_ns)
 
-    def translate(self, pulses: Any, out: str | Path | None = None, **how: Any) -> Translation:
+    def translate(
+        self, pulses: Any, out: str | Path | None = None, **how: Any
+    ) -> Translation | Outcome[Translation]:
         """Translate with this run, see `cpunet.translate`."""
-        from cpunet.calls.translations import translate
+        from cpunet.translation.translate import translate
 
         return translate(self, pulses, out, **how)
 
