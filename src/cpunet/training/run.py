@@ -295,7 +295,7 @@ class Run(Part):
         CpunetError
             If the run is not a readout chain.
         """
-        from cpunet.jobs.inspection.chain_description import describe_responses
+        from cpunet.training.chain_description import describe_responses
 
         return dict(describe_responses([self])["runs"][0]["values"])
 
@@ -307,8 +307,8 @@ class Run(Part):
         CpunetError
             If a run of networks contains no losses.
         """
-        from cpunet.jobs.inspection.chain_description import chain_of
-        from cpunet.validation.response_figure import response_figure
+        from cpunet.training.chain_description import chain_of
+        from cpunet.training.response_figure import response_figure
         from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
