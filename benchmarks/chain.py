@@ -115,7 +115,7 @@ def simulated(folder: Path, steps: Path, mode: str) -> Cost:
 def chain(folder: Path, steps: Path) -> dict[str, Cost]:
     """Run each stage of the chain on one file."""
     pulses, raw, dsp = (folder / f"{name}.lh5" for name in ("pulses", "raw", "dsp"))
-    translate = ["translate", folder / "run", pulses, "--output", "adc"]
+    translate = ["translate", folder / "run", pulses, "--adc"]
     translate += ["--adc-per-kev", 10, "--baseline", 10000, "--out-table", "V01/raw"]
     parameters = [DSP, raw, dsp, "--config", CONFIG, "--table", "V01/raw"]
     return {

@@ -21,14 +21,13 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
+from cpunet.translation.options import Adc
+from cpunet.translation.translate import translate
 
 DT_NS, LENGTH, BLOCK = 16.0, 225, 4096
 PAGE_MB = resource.getpagesize() / 2**20
@@ -112,15 +111,16 @@ def main() -> None:
         folder = Path(name)
         write_fast_run(folder / "run")
         write_input(folder / "sim.lh5", given.pulses)
-        adc = Adc(6.0, 15_000, 1400, 700) if given.adc else None
+        scale = Adc(6.0, 15_000, 1400, 700) if given.adc else Adc()
         begin = time.perf_counter()
         with watching() as seen:
-            told = translate_file(
+            told = translate(
                 folder / "run",
-                PulseFile(folder / "sim.lh5"),
+                folder / "sim.lh5",
                 folder / "out.lh5",
-                TranslateOptions(adc=adc),
-            )
+                adc=given.adc,
+                scale=scale,
+            ).counts
         seconds = time.perf_counter() - begin
         size = (folder / "out.lh5").stat().st_size
     memory = np.array([mb for _, mb in seen])

@@ -57,7 +57,7 @@ LANES: list[dict[str, list[str]]] = [
         ],
         "translate": [
             "translate matched stand/sim.lh5 --seed 1 --out windows.lh5",
-            "translate matched stand/sim.lh5 --seed 1 --output adc --adc-per-kev 3.5"
+            "translate matched stand/sim.lh5 --seed 1 --adc --adc-per-kev 3.5"
             " --baseline 9000 --pile-up-khz 5 --out adc.lh5",
             "translate matched stand/data.lh5 --inverse --out inverse.lh5",
         ],

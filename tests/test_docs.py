@@ -18,6 +18,7 @@ import typer
 import yaml
 
 import cpunet
+from cpunet.cli.app import app as functions
 from cpunet.cli.main import app
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
@@ -64,6 +65,9 @@ def require_parsed(words: list[str]) -> None:
 
     What is set of a recipe must be one of its settings.
     """
+    if words[0] in [*functions]:
+        functions.parse_args(words, exit_on_error=False, print_error=False)
+        return
     command, name = typer.main.get_command(app), "cpunet"
     while words and words[0] in getattr(command, "commands", {}):
         name, *words = words
@@ -72,6 +76,19 @@ def require_parsed(words: list[str]) -> None:
     given = command.make_context(name, list(words)).params
     if given.get("recipe") in recipe_names():
         load_recipe(given["recipe"], given.get("set_values") or ())
+
+
+def option_names(words: list[str]) -> set[str]:
+    """Options of a command that is a function; none of a group of such."""
+    command = functions
+    for word in words:
+        if word not in [*command]:
+            break
+        command = command[word]
+    if command.default_command is None:
+        return set()
+    found = command.assemble_argument_collection(default_parameter=functions.default_parameter)
+    return {name for argument in found for name in argument.names}
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("", "sh", "console"))
@@ -90,6 +107,11 @@ def test_the_commands_within_sentences():
     for page in PAGES:
         for inline in re.findall(r"(?<!`)`cpunet ([^`]+)`(?!`)", page.read_text()):
             command, words = typer.main.get_command(app), inline.split()
+            if words[0] in [*functions]:
+                known = option_names(words)
+                given = {word.strip("[]").partition("=")[0] for word in words}
+                assert {w for w in given if w[:2] == "--"} <= known | {"--help"}, inline
+                continue
             while words and words[0] in getattr(command, "commands", {}):
                 command = command.commands[words.pop(0)]
             known = {name for option in command.params for name in option.opts}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator
 from enum import Enum
@@ -9,9 +10,11 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
+from cyclopts import App
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+from cpunet.cli.app import app as of_functions
 from cpunet.cli.main import app
 
 FOLDER = "reference/commands"
@@ -27,6 +30,15 @@ def commands(command: Any = None, name: str = "cpunet") -> Iterator[tuple[str, A
     for word, below in command.commands.items():
         if not below.hidden:
             yield from commands(below, f"{name} {word}")
+
+
+def functions(below: App = of_functions, name: str = "cpunet") -> Iterator[tuple[str, App]]:
+    """The same of every command that is made of a function."""
+    words = [word for word in below if not word.startswith("-")]
+    if not words:
+        yield name, below
+    for word in words:
+        yield from functions(below[word], f"{name} {word}")
 
 
 def page_of(name: str) -> str:
@@ -96,6 +108,35 @@ def command_page(name: str, command: Any) -> str:
     return "\n".join(lines)
 
 
+def sections(command: App) -> tuple[str, list[str]]:
+    """What the docstring of a function says before its first section, and its examples."""
+    text = inspect.getdoc(command.default_command) or ""
+    parts = re.split(r"^(\w+)\n-+\n", text, flags=re.MULTILINE)
+    of_section = dict(zip(parts[1::2], parts[2::2], strict=True))
+    return parts[0].strip(), [line for line in of_section["Examples"].splitlines() if line]
+
+
+def function_page(name: str, command: App) -> str:
+    summary, examples = sections(command)
+    lines = [f"# {name}", "", summary, "", "```sh", *examples, "```", ""]
+    lines += ["| | | default |", "|---|---|---|"]
+    arguments = command.assemble_argument_collection(
+        default_parameter=of_functions.default_parameter, parse_docstring=True
+    )
+    for one in arguments:
+        if one.show:
+            positional = one.field_info.kind in (
+                inspect.Parameter.POSITIONAL_OR_KEYWORD,
+                inspect.Parameter.VAR_POSITIONAL,
+            )
+            word = one.names[0].removeprefix("--").upper() if positional else one.names[0]
+            default = one.field_info.default
+            shown = "" if default in (None, (), "", False) else f"`{default}`"
+            about = cell(one.parameter.help or "")
+            lines.append(f"| `{word}` | {about} | {'required' if one.required else shown} |")
+    return "\n".join(lines) + "\n"
+
+
 def index_page() -> str:
     lines = [
         "# Commands",
@@ -111,12 +152,16 @@ def index_page() -> str:
         link = page_of(name).removeprefix(f"{FOLDER}/")
         first = summary.partition("\n\n")[0]
         lines.append(f"| [`{name}`]({link}) | {cell(first)} |")
+    for name, command in functions():
+        link = page_of(name).removeprefix(f"{FOLDER}/")
+        lines.append(f"| [`{name}`]({link}) | {cell(command.help)} |")
     return "\n".join(lines) + "\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {f"{FOLDER}/index.md": index_page()}
     pages |= {page_of(name): command_page(name, command) for name, command in commands()}
+    pages |= {page_of(name): function_page(name, command) for name, command in functions()}
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
     return files
@@ -125,6 +170,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_config(config: MkDocsConfig) -> None:
     """Add the pages to the navigation, in the order of ``cpunet --help``."""
     pages = [{"All commands": f"{FOLDER}/index.md"}]
-    pages += [{name.removeprefix("cpunet "): page_of(name)} for name, _ in commands()]
+    names = [name for name, _ in (*commands(), *functions())]
+    pages += [{name.removeprefix("cpunet "): page_of(name)} for name in names]
     reference = next(part["Reference"] for part in config.nav or [] if "Reference" in part)
     reference.append({"Commands": pages})

@@ -17,6 +17,7 @@ __version__ = "0.1.0"
 __all__ = [
     "IREN",
     "REN",
+    "Adc",
     "CalibratedRun",
     "CpunetError",
     "FileOptions",
@@ -43,7 +44,6 @@ __all__ = [
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
     from cpunet.calls.reports import Report, validate
-    from cpunet.calls.translations import Translation, translate
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
@@ -55,13 +55,15 @@ if TYPE_CHECKING:
     from cpunet.training.published import import_weights
     from cpunet.training.run import Run
     from cpunet.training.train import train
+    from cpunet.translation.options import Adc
+    from cpunet.translation.translate import translate
+    from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
     "calls.reports": ("Report", "validate"),
-    "calls.translations": ("Translation", "translate"),
     "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
@@ -73,6 +75,9 @@ _HOMES = {
     "training.published": ("import_weights",),
     "training.run": ("Run",),
     "training.train": ("train",),
+    "translation.options": ("Adc",),
+    "translation.translate": ("translate",),
+    "translation.translation": ("Translation",),
     "translation.translator": ("IREN", "REN"),
 }
 

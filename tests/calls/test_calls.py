@@ -286,17 +286,13 @@ WRONG = {
         lambda home, _: cpunet.translate(home, home / "sim.lh5"),
         "no finished run",
     ),
-    "pulses to a file": (
-        lambda home, run: run.translate(Pulses.of(np.zeros((1, 9)), dt_ns=16), home / "t.lh5"),
-        "pulses in memory stay there; leave out the file",
-    ),
     "other sampling": (
         lambda _, run: run.translate(Pulses.of(np.zeros((1, 900)), dt_ns=10)),
         "sampled every 10 ns, the run was trained on 16 ns; resample",
     ),
     "no pulse": (
         lambda _, run: run.translate(Pulses.of(np.zeros((0, 900)), dt_ns=16)),
-        "there are no pulses to translate",
+        "memory holds no pulses",
     ),
     "none good": (
         lambda _, run: run.translate(Pulses.of(np.zeros((3, 900)), dt_ns=16)),

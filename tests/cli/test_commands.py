@@ -105,59 +105,6 @@ def test_translate_keeps_the_rows(command, trained, stand, tmp_path):
     assert (done["t0"] == -400 * 16).all()  # sample 400 is where the pulse is aligned
 
 
-def test_seed_and_noise_of_translate(command, trained, stand, tmp_path):
-    def values(name: str, *options: object) -> np.ndarray:
-        path = tmp_path / name
-        assert command("translate", trained, stand.sim, "--out", path, *options).code == 0
-        return translated(path, "geds/ren")["values"]
-
-    first = values("a.lh5", "--seed", 1)
-    assert np.array_equal(first, values("b.lh5", "--seed", 1))
-    assert not np.array_equal(first, values("c.lh5", "--seed", 2))
-    mean = values("d.lh5", "--no-noise", "--seed", 1)
-    assert np.array_equal(mean, values("e.lh5", "--no-noise", "--seed", 2))
-
-
-def test_translate_is_the_python_api(command, trained, stand, tmp_path):
-    import cpunet
-
-    assert command("translate", trained, stand.sim, "--out", tmp_path / "o.lh5").code == 0
-    from_file = translated(tmp_path / "o.lh5", "geds/ren")["values"]
-    from_python = cpunet.REN.load(trained).translate(stand.sim_waveforms, seed=0)
-    np.testing.assert_allclose(from_file, from_python, atol=1e-6)
-
-
-def test_inverse(command, trained, stand, tmp_path):
-    path = tmp_path / "inverse.lh5"
-    outcome = command("translate", trained, stand.data, "--out", path, "--inverse")
-    assert outcome.code == 0
-    done = translated(path, "geds/iren")
-    assert done["values"].shape == (len(stand.data_kev), 800)
-    assert done["event_number"].tolist() == [1000 + 3 * i for i in range(len(stand.data_kev))]
-
-
-def test_another_table_for_the_output(command, trained, stand, tmp_path):
-    path = tmp_path / "out.lh5"
-    words = ("translate", trained, stand.sim, "--out", path, "--out-table", "ch1/like_data")
-    assert command(*words).code == 0
-    assert len(translated(path, "ch1/like_data")["values"]) == len(stand.sim_kev)
-
-
-def test_pulses_that_cannot_be_translated_stay_as_nan(command, trained, stand, tmp_path):
-    waveforms = stand.sim_waveforms.copy()
-    waveforms[3, 100] = np.nan
-    waveforms[8] = 0.5
-    source = stand.write(tmp_path / "in.lh5", "geds/sim", waveforms, stand.sim_kev, units="")
-    outcome = command("translate", trained, source, "--out", tmp_path / "out.lh5")
-    assert outcome.code == 0
-    assert "rows of NaN for 1 nan, 1 constant" in " ".join(outcome.out.split())
-    done = translated(tmp_path / "out.lh5", "geds/ren")
-    missing = np.isnan(done["values"]).all(axis=1)
-    assert np.flatnonzero(missing).tolist() == [3, 8]
-    assert np.array_equal(done["rejection"] != 0, missing)
-    assert done["event_number"][[3, 8]].tolist() == [1009, 1024]
-
-
 def drawn_elsewhere(name: str) -> bool:
     """Whether another peak's figure is of the same kind; to draw one takes half a second."""
     return name.startswith(("SEP", "DEP")) and "cycle" not in name

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from cpunet.cli.app import app as functions
 from cpunet.cli.main import app
 
 GAMMAS = "--detector icpc --events FEP=1"
@@ -102,7 +103,19 @@ def writing_commands() -> set[str]:
         if any("--force" in option.opts for option in command.params):
             found.add(name)
 
+    def walk_functions(group, name: str) -> None:
+        for word in (word for word in group if word[0] != "-"):
+            inner, whole = group[word], f"{name} {word}".strip()
+            if inner.default_command is None:
+                walk_functions(inner, whole)
+                continue
+            usual = functions.default_parameter
+            options = inner.assemble_argument_collection(default_parameter=usual)
+            if any("--force" in option.names for option in options):
+                found.add(whole)
+
     walk(typer.main.get_command(app), "")
+    walk_functions(functions, "")
     return found
 
 

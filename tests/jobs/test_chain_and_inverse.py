@@ -15,8 +15,6 @@ from safetensors.numpy import load_file
 
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
@@ -29,6 +27,7 @@ from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
 from cpunet.training.train import train
+from cpunet.translation.translate import translate
 from cpunet.translation.translator import IREN, REN
 from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
 
@@ -147,9 +146,7 @@ def test_files_are_translated_in_both_directions(
 ) -> None:
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
-    told = translate_file(
-        run.folder, source, out, TranslateOptions(inverse=inverse), device="cpu"
-    )
+    told = translate(run.folder, source, out, inverse=inverse).counts
     assert told == {"read": N, "translated": N, "rejections": {}}
     windows = open_pulses(out).read()
     assert windows.waveforms.shape == (N, 800)
@@ -165,10 +162,9 @@ def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
     energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    told = translate_file(run.folder, PulseFile(path), tmp_path / "a.lh5", device="cpu")
+    told = translate(run.folder, path, tmp_path / "a.lh5").counts
     assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
-    quiet = TranslateOptions(noise=False)
-    told = translate_file(run.folder, PulseFile(path), tmp_path / "b.lh5", quiet, device="cpu")
+    told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
     assert told == {"read": 6, "translated": 6, "rejections": {}}
 
 

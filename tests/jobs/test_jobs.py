@@ -10,9 +10,6 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation import translate as translate_job
-from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
@@ -22,13 +19,14 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.training.train import train
+from cpunet.translation import file_translation
+from cpunet.translation.translate import translate
 from synthetic import (
     KEV,
     SMALL_NETWORK,
@@ -179,11 +177,11 @@ def test_a_range_of_energies(files, tmp_path, caplog):
 @pytest.mark.parametrize("inverse", [False, True])
 def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, stages, inverse):
     source = files[1] if inverse else files[0]
-    options = TranslateOptions(inverse=inverse, noise=False)
-    whole = translate_file(run, source, tmp_path / "whole.lh5", options, device="cpu")
-    monkeypatch.setattr(translate_job, "BLOCK_SIZE", 7)
+    options = {"inverse": inverse, "noise": False}
+    whole = translate(run, source, tmp_path / "whole.lh5", **options).counts
+    monkeypatch.setattr(file_translation, "BLOCK_SIZE", 7)
     stages.clear()
-    parts = translate_file(run, source, tmp_path / "parts.lh5", options, device="cpu")
+    parts = translate(run, source, tmp_path / "parts.lh5", **options).counts
     assert whole == parts == {"read": N, "translated": N, "rejections": {}}
     assert stages == {"Translating": [N, 7, 7, 7, 7, 2]}
     found = [open_pulses(tmp_path / name).read() for name in ("whole.lh5", "parts.lh5")]
@@ -197,6 +195,6 @@ def test_a_failed_translation_leaves_the_old_file(files, run, tmp_path):
     constant = tmp_path / "constant.lh5"
     write_pulses(constant, Pulses.of(np.ones((3, 225)), dt_ns=16))
     with pytest.raises(CpunetError, match=r"none of 3 pulses can be translated \(3 constant\)"):
-        translate_file(run, PulseFile(constant), out, force=True, device="cpu")
+        translate(run, constant, out, force=True)
     assert out.read_bytes() == b"old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["constant.lh5", "out.lh5"]

@@ -54,7 +54,7 @@ rule event_raw:
         words=words_of("events", "translate"),
         device=config["device"],
     shell:
-        "cpunet translate {input.run:q} {input.pulses:q} --output adc {params.words}"
+        "cpunet translate {input.run:q} {input.pulses:q} --adc {params.words}"
         " --out-table {wildcards.detector}/raw --seed {params.seed} --device {params.device}"
         " --out {output:q} --force > {log:q} 2>&1"
 

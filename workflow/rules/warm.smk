@@ -12,7 +12,7 @@ def dsp_of_a_demo(_wildcards):
     words = " ".join(shlex.quote(str(word)) for word in config["events"]["translate"])
     demo = '"$folder/demo'
     return (
-        f'; cpunet translate {demo}/run" {demo}/stand/sim.lh5" --output adc {words}'
+        f'; cpunet translate {demo}/run" {demo}/stand/sim.lh5" --adc {words}'
         f' --out-table demo/raw --out "$folder/raw.lh5"; python {DSP_SCRIPT}'
         f' "$folder/raw.lh5" "$folder/dsp.lh5" --config {shlex.quote(DSP)}'
         f' --table demo/raw --run {demo}/run"'

@@ -12,7 +12,6 @@ import hist
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.calls.translations import named
 from cpunet.errors import CpunetError
 from cpunet.html_pages import part
 from cpunet.jobs.validation.compare import read_metrics
@@ -24,6 +23,7 @@ from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
 from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.training.run import RunLike
+from cpunet.translation.translation import named
 from cpunet.validation.report_folder import METRICS, VALUES
 
 _SHOWN = ("raw", "ren", "truth")  # methods in a notebook's table

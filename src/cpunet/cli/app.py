@@ -13,9 +13,10 @@ from cpunet.cli.messages import tell
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.files import FileOptions, ReadOptions
 from cpunet.simulation.hits import HitOptions
+from cpunet.translation.options import Adc
 
 # Each field of these is an option of its own.
-for _options in (FileOptions, HitOptions, ReadOptions):
+for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
 _SHORT = {"settings": "set", "settings_file": "settings"}
@@ -31,6 +32,10 @@ COMMANDS = {
     "train": (
         "cpunet.training.train:train",
         "Train REN and IREN on simulated and measured pulses, unpaired.",
+    ),
+    "translate": (
+        "cpunet.translation.translate:translate",
+        "Translate pulses with a trained run, keeping the rows and columns of their files.",
     ),
 }
 

@@ -24,7 +24,6 @@ from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
-from cpunet.cli.translate import translate
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.installation import other_package
@@ -51,6 +50,7 @@ Debug = Annotated[
 ]
 app = typer.Typer(
     help="Make simulated germanium-detector pulses look measured.",
+    epilog=f"Further commands: {', '.join(name for name in commands if name[0] != '-')}",
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -69,7 +69,6 @@ for command in (
     check,
     calibrate,
     tune,
-    translate,
     validate,
     compare,
     response,

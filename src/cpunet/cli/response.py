@@ -66,7 +66,7 @@ def response(
     Example: cpunet response run1 run2 --stand stand --out response
     """
     from cpunet.electronics.chain import read_electronics
-    from cpunet.jobs.inspection.chain_description import describe_responses, stand_electronics
+    from cpunet.training.chain_description import describe_responses, stand_electronics
 
     if stand is not None and electronics is not None:
         raise CpunetError("--stand and --electronics both name the truth; give one of them")

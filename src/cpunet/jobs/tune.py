@@ -39,7 +39,8 @@ from cpunet.training.fit import Sides, match
 from cpunet.training.loop import train
 from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
-from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 from cpunet.validation.distances import null_distances, wasserstein

@@ -24,6 +24,7 @@ _DEFAULTS = {
     "inverse": False,
     "noise": True,
     "seed": 0,
+    "realisations": 1,
     "remains": "none",
     "pile_up_khz": 0.0,
 }

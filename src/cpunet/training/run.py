@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from cpunet.calls.reports import Report
-    from cpunet.calls.translations import Translation
+    from cpunet.pulses.channels import Outcome
+    from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
 
 FORMAT = 2
@@ -294,7 +295,7 @@ class Run(Part):
         CpunetError
             If the run is not a readout chain.
         """
-        from cpunet.jobs.inspection.chain_description import describe_responses
+        from cpunet.training.chain_description import describe_responses
 
         return dict(describe_responses([self])["runs"][0]["values"])
 
@@ -306,8 +307,8 @@ class Run(Part):
         CpunetError
             If a run of networks contains no losses.
         """
-        from cpunet.jobs.inspection.chain_description import chain_of
-        from cpunet.validation.response_figure import response_figure
+        from cpunet.training.chain_description import chain_of
+        from cpunet.training.response_figure import response_figure
         from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
@@ -315,9 +316,11 @@ class Run(Part):
         tail_ns = self.recipe.preparation.samples_after * self.dt_ns
         return response_figure([chain_of(self)], tail_ns=tail_ns)
 
-    def translate(self, pulses: Any, out: str | Path | None = None, **how: Any) -> Translation:
+    def translate(
+        self, pulses: Any, out: str | Path | None = None, **how: Any
+    ) -> Translation | Outcome[Translation]:
         """Translate with this run, see `cpunet.translate`."""
-        from cpunet.calls.translations import translate
+        from cpunet.translation.translate import translate
 
         return translate(self, pulses, out, **how)
 

@@ -9,11 +9,10 @@ import numpy as np
 from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.second_pulses import DrawnPileUp
 from cpunet.errors import CpunetError
+from cpunet.translation.options import LEARNED, NONE
 
 if TYPE_CHECKING:
     from cpunet.translation.translator import Translator
-
-NONE, LEARNED = "none", "learned"
 
 
 def wanted_remains(
@@ -41,7 +40,7 @@ def wanted_remains(
     known = translator.remains
     if known is None:
         raise CpunetError(
-            f"--remains {wanted}: the run tells nothing of remains of earlier pulses (a "
+            f"`remains` {wanted}: the run tells nothing of remains of earlier pulses (a "
             "network, trained before they were told, or without raw traces); train a readout "
             "chain on raw traces, or leave it out"
         )
@@ -68,13 +67,13 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
         If the rate is negative or not finite, or the run has no energies.
     """
     if not (np.isfinite(rate_khz) and rate_khz >= 0):
-        raise CpunetError(f"--pile-up-khz {rate_khz:g}: expected a rate in kHz, 0 or more")
+        raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
     if rate_khz == 0:
         return None
     known = translator.remains
     if known is None:
         raise CpunetError(
-            f"--pile-up-khz {rate_khz:g}: the run does not tell the energies of other pulses "
+            f"`pile_up_khz` {rate_khz:g}: the run does not tell the energies of other pulses "
             "(a network, trained before they were told, or without raw traces); train a "
             "readout chain on raw traces, or leave it out"
         )
@@ -87,5 +86,5 @@ def _rate(wanted: str | float) -> float:
     except ValueError:
         rate = np.nan
     if not (np.isfinite(rate) and rate >= 0):
-        raise CpunetError(f"--remains {wanted}: expected learned, none, or a rate in kHz")
+        raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
     return rate

@@ -30,15 +30,20 @@ class Formed:
     saturated
         Mask of the rows that reach an end of the digitiser's range, shape (n,).
     truth
-        What is known of other pulses in each trace, arrays of shape (n,) with their units:
-        ``remains_kev`` with remains of earlier pulses; ``n_piled``, ``piled_kev`` and
-        ``piled_ns`` with second pulses, see `SecondPulses.largest`.
+        What is known of each trace, arrays of shape (n,) with their units: ``remains_kev``
+        with remains of earlier pulses; ``n_piled``, ``piled_kev`` and ``piled_ns`` with second
+        pulses, see `SecondPulses.largest`; ``realisation`` with several.
     """
 
     pulses: Pulses
     codes: Codes
     saturated: npt.NDArray[np.bool_]
     truth: Columns = field(default_factory=dict)
+
+    @property
+    def columns(self) -> Columns:
+        """Columns to be stored beside the pulses."""
+        return {"rejection": (self.codes, ""), **self.truth}
 
 
 class OutputForm(Protocol):

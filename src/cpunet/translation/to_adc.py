@@ -93,7 +93,7 @@ def adc_scale(
         The run, and its translator.
     adc_per_kev
         Height of a fast pulse above the baseline in ADC counts per keV, the inverse of
-        ``--kev-per-adc`` of the data.
+        ``kev_per_adc`` of the data.
     baseline
         Baseline in ADC counts.
 
@@ -104,18 +104,18 @@ def adc_scale(
         is negative.
     """
     if adc_per_kev is not None and not (np.isfinite(adc_per_kev) and adc_per_kev > 0):
-        raise CpunetError(f"--adc-per-kev is {adc_per_kev}; expected a number above 0")
+        raise CpunetError(f"`adc_per_kev` is {adc_per_kev}; expected a number above 0")
     if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
-        raise CpunetError(f"--baseline is {baseline}; expected a number that is not negative")
+        raise CpunetError(f"`baseline` is {baseline}; expected a number that is not negative")
     known_gain, known_baseline = _of_the_data(run)
     per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
     level = known_baseline if baseline is None else baseline
     if per_kev is None:
         raise CpunetError(
-            f"{run.name}: does not say how many ADC counts a keV is; give --adc-per-kev"
+            f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"
         )
     if level is None:
-        raise CpunetError(f"{run.name}: does not say where the baseline is; give --baseline")
+        raise CpunetError(f"{run.name}: does not say where the baseline is; give `baseline`")
     return AdcScale(per_kev, level)
 
 
@@ -160,14 +160,14 @@ class AdcForm:
         if pile_up is not None and ren.backend.chain is None:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "second pulses; leave out --pile-up-khz, or --output adc"
+                "second pulses; leave out `pile_up_khz` or `adc`"
             )
         self.length = self.config.length if length is None else length
         self.n_pre = self.config.samples_before if n_pre is None else n_pre
         if not 0 <= self.n_pre < self.length:
             raise CpunetError(
-                f"--n-pre {self.n_pre} is not within a trace of {self.length} samples; "
-                "give less, or more for --length"
+                f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
+                "give less, or a longer `length`"
             )
         self.t0_ns = -self.n_pre * ren.dt_ns
 

@@ -8,9 +8,9 @@ from contextlib import suppress
 
 from cpunet.electronics.remains import remains_in_words
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.chain_description import noise_kev
 from cpunet.pulses.loading import SideInfo
 from cpunet.tables import counted, percent
+from cpunet.training.chain_description import noise_kev
 from cpunet.training.run import FitInfo, Run
 from cpunet.validation.nested_tables import with_std
 

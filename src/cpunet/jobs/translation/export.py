@@ -12,11 +12,11 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.chain_description import describe_responses
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.settings import read_json
+from cpunet.training.chain_description import describe_responses
 from cpunet.training.run import Run, RunLike, as_run
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export
 from cpunet.translation.graphs import Graph

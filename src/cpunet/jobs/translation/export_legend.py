@@ -22,7 +22,6 @@ from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.inspection.chain_description import chain_of, describe_responses
 from cpunet.jobs.translation.library_file import n_not_ending, require_charge
 from cpunet.jobs.translation.simflow_checks import (
     IdealLibrary,
@@ -32,6 +31,7 @@ from cpunet.jobs.translation.simflow_checks import (
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
+from cpunet.training.chain_description import chain_of, describe_responses
 from cpunet.training.run import RunLike, as_run
 
 log = logging.getLogger(__name__)

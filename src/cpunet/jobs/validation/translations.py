@@ -22,7 +22,8 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.learned_remains import LEARNED, wanted_remains
+from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 from cpunet.validation.paired import pair_squares

@@ -23,12 +23,6 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
 from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation import translate as translate_job
-from cpunet.jobs.translation.translate import translate_file
-from cpunet.jobs.translation.translate_channels import translate_channels
-from cpunet.jobs.translation.translate_files import _in_processes, expanded, translate_files
-from cpunet.jobs.translation.translate_options import Adc, TranslateOptions
-from cpunet.jobs.translation.translation_blocks import noise_seed, regrouped
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.progress import Stage
@@ -39,7 +33,12 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from cpunet.translation import file_translation
+from cpunet.translation.many_files import _in_processes, expanded
+from cpunet.translation.noise_blocks import noise_seed, regrouped
+from cpunet.translation.options import Adc
 from cpunet.translation.to_adc import to_adc
+from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
 from synthetic import decay, edges, in_traces, nearly_full_disk, write_run
 
@@ -165,7 +164,7 @@ def names(folder):
 
 def test_all_other_columns_are_kept(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5", **many_columns())
-    translate_file(run, PulseFile(source), tmp_path / "out.lh5", device="cpu")
+    translate(run, source, tmp_path / "out.lh5")
     before, after = lh5.read("geds/sim", source), lh5.read("geds/ren", tmp_path / "out.lh5")
     assert set(after) == set(before) | {"rejection_source"}
     assert plain(after.rejection_source) == [9] * N
@@ -183,7 +182,7 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
         file["short"] = np.arange(3)
         file["pair"] = np.ones(N, complex)
     out = tmp_path / "out.lh5"
-    translate_file(run, PulseFile(tmp_path / "sim.hdf5"), out, device="cpu")
+    translate(run, tmp_path / "sim.hdf5", out)
     table = lh5.read("geds/ren", out)
     assert plain(table.depth) == list(range(N))
     assert plain(table.text) == [b"a", b"bc"] * (N // 2)
@@ -196,19 +195,13 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
         tmp_path / "sim.npz", waveforms=charge(), energy_kev=np.full(N, 1e3), z=np.arange(N)
     )
     source = PulseFile(tmp_path / "sim.npz", dt_ns=DT_NS)
-    translate_file(run, source, tmp_path / "npz.lh5", device="cpu")
+    translate(run, source, tmp_path / "npz.lh5")
     assert plain(lh5.read("geds/ren", tmp_path / "npz.lh5").z) == list(range(N))
 
 
 def test_realisations_repeat_rows(run, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
-    told = translate_file(
-        run,
-        source,
-        tmp_path / "out.lh5",
-        TranslateOptions(realisations=3, seed=4),
-        device="cpu",
-    )
+    told = translate(run, source, tmp_path / "out.lh5", realisations=3, seed=4).counts
     assert told["translated"] == 3 * N
     table = lh5.read("geds/ren", tmp_path / "out.lh5")
     assert plain(table.realisation) == [0, 1, 2] * N
@@ -216,7 +209,7 @@ def test_realisations_repeat_rows(run, tmp_path):
     rows = np.repeat(np.arange(N), 3)
     for name in ("edep", "drift_time", "vertex", "position", "names", "event_number"):
         assert plain(table[name]) == plain(before[name], rows)
-    translate_file(run, source, tmp_path / "one.lh5", TranslateOptions(seed=4), device="cpu")
+    translate(run, source, tmp_path / "one.lh5", seed=4)
     waveforms = table.waveform.values.nda.reshape(N, 3, 800)
     np.testing.assert_array_equal(waveforms[:, 0], values(tmp_path / "one.lh5"))
     noise = waveforms[..., :300] - waveforms[..., :300].mean(axis=1, keepdims=True)
@@ -230,11 +223,12 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
         for channel in ("ch1", "ch2"):
             file.copy("geds/sim", f"{channel}/sim")
         del file["geds"]
-    outcome = translate_channels(run, PulseFile(source, "all"), tmp_path / "out", device="cpu")
-    assert {name: told["translated"] for name, told in outcome.done.items()} == {
+    outcome = translate(run, PulseFile(source, "all"), tmp_path / "out")
+    assert {name: made.counts["translated"] for name, made in outcome.done.items()} == {
         "ch1": N,
         "ch2": N,
     }
+    assert outcome.ok
     first, second = (values(tmp_path / "out" / f"ch{i}.lh5")[:, :300] for i in (1, 2))
     together = (first * second).mean() / (first.std() * second.std())
     assert together == pytest.approx(0, abs=0.05)
@@ -242,17 +236,17 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
 
 def test_the_options_of_a_translation_are_told(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    adc = Adc(baseline=0.0)
+    raw = {"adc": True, "scale": Adc(baseline=0.0)}
     for number, (options, said) in enumerate(
         [
-            (TranslateOptions(), None),
-            (TranslateOptions(noise=False), "noise False"),
-            (TranslateOptions(seed=4, remains="learned"), "seed 4, remains learned"),
-            (TranslateOptions(adc=adc, realisations=2), "realisations 2, adc baseline 0.0"),
+            ({}, None),
+            ({"noise": False}, "noise False"),
+            ({"seed": 4, "remains": "learned"}, "seed 4, remains learned"),
+            (raw | {"realisations": 2}, "realisations 2, adc baseline 0.0"),
         ]
     ):
         out = tmp_path / f"{number}.lh5"
-        translate_file(busy, source, out, options, device="cpu")
+        translate(busy, source, out, **options)
         assert provenance(open_pulses(out)).get("options") == said
 
 
@@ -279,8 +273,8 @@ def in_blocks(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("blocks")
     source = PulseFile(sim_file(folder / "sim.lh5", n=50))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(translate_job, "NOISE_ROWS", 16)
-        translate_file(run, source, folder / "whole.lh5", device="cpu")
+        patch.setattr(file_translation, "NOISE_ROWS", 16)
+        translate(run, source, folder / "whole.lh5")
     return source, (folder / "whole.lh5").read_bytes()
 
 
@@ -290,19 +284,55 @@ def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, l
     source, expected = in_blocks
     out = tmp_path_factory.mktemp("blocks") / "whole.lh5"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(translate_job, "NOISE_ROWS", 16)
-        patch.setattr(translate_job, "BLOCK_SIZE", size)
-        patch.setattr(translate_job, "BLOCK_SAMPLES", longest)
-        translate_file(run, source, out, device="cpu")
+        patch.setattr(file_translation, "NOISE_ROWS", 16)
+        patch.setattr(file_translation, "BLOCK_SIZE", size)
+        patch.setattr(file_translation, "BLOCK_SAMPLES", longest)
+        translate(run, source, out)
     assert out.read_bytes() == expected
+
+
+def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
+    """A path, a file, pulses and arrays; in memory, streamed, and saved later."""
+    path = sim_file(tmp_path / "sim.lh5", **many_columns())
+    pulses = open_pulses(path).read()
+    how = {"seed": 4, "realisations": 2}
+    kept = translate(run, path, **how)
+    assert len(kept) == 2 * N
+    assert kept.waveforms.shape == (2 * N, 800)
+    translate(run, PulseFile(path), tmp_path / "streamed.lh5", **how)
+    translate(run, pulses, tmp_path / "given.lh5", **how)
+    kept.save(tmp_path / "saved.lh5")
+    for name in ("streamed", "given", "saved"):
+        found = translate(run, pulses, tmp_path / "given.lh5", **how, resume=True)
+        np.testing.assert_array_equal(values(tmp_path / f"{name}.lh5"), kept.waveforms)
+        assert plain(lh5.read("geds/ren", tmp_path / f"{name}.lh5").realisation) == [0, 1] * N
+    assert found.counts["skipped"]
+    with pytest.raises(CpunetError, match="holds these pulses already"):
+        found.save(tmp_path / "again.lh5")
+    with pytest.raises(CpunetError, match=r"saved.lh5: exists already"):
+        kept.save(tmp_path / "saved.lh5")
+    with pytest.raises(CpunetError, match="was made with another source"):
+        translate(run, pulses[1:], tmp_path / "given.lh5", **how, resume=True)
+    array = translate(run, pulses.waveforms, noise=False)
+    assert array.pulses.dt_ns == DT_NS
+    expected = translate(run, pulses, noise=False).waveforms
+    np.testing.assert_array_equal(array.waveforms, expected)
+    table = kept.to_dataframe()
+    assert len(table) == 2 * N
+    assert {"energy_kev", "rejection", "current_amplitude"} <= set(table)
+    for nothing in ([], pulses[:0]):
+        with pytest.raises(CpunetError, match="no pulses"):
+            translate(run, nothing)
+    with pytest.raises(CpunetError, match="several files or tables do not stay in memory"):
+        translate(run, [path, path])
 
 
 def test_options_may_be_numbers_of_numpy(run, tmp_path):
     source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
-    options = TranslateOptions(seed=np.int64(3), realisations=np.int32(2))
-    told = translate_file(run, source, out, options, device="cpu")
-    options = TranslateOptions(seed=3, realisations=2)
-    assert translate_file(run, source, out, options, device="cpu", resume=True) == told | {
+    options = {"seed": np.int64(3), "realisations": np.int32(2)}
+    told = translate(run, source, out, **options).counts
+    options = {"seed": 3, "realisations": 2}
+    assert translate(run, source, out, **options, resume=True).counts == told | {
         "skipped": True
     }
 
@@ -324,11 +354,11 @@ def changed_record(path, change):
 )
 def test_a_file_with_another_record_is_not_kept(run, tmp_path, change, said):
     source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
-    translate_file(run, source, out, device="cpu")
-    assert translate_file(run, source, out, device="cpu", resume=True)["skipped"]
+    translate(run, source, out)
+    assert translate(run, source, out, resume=True).counts["skipped"]
     changed_record(out, change)
     with pytest.raises(CpunetError, match=said):
-        translate_file(run, source, out, device="cpu", resume=True)
+        translate(run, source, out, resume=True)
 
 
 def test_seeds_differ_by_file_block_and_realisation():
@@ -353,7 +383,7 @@ def many(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sequential(run, many, tmp_path_factory):
     out = tmp_path_factory.mktemp("sequential") / "out"
-    told = translate_files(run, many, out, device="cpu")
+    told = translate(run, many, out).counts
     return out, told
 
 
@@ -361,12 +391,12 @@ def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch
     """And yet none may be another's input."""
     seen = []
     monkeypatch.setattr(
-        "cpunet.jobs.translation.translate_files.refuse_inputs",
+        "cpunet.translation.many_files.refuse_inputs",
         lambda *paths: seen.append(len(paths)),
     )
     (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
     with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
-        translate_files(run, many, tmp_path, device="cpu", force=True)
+        translate(run, many, tmp_path, force=True)
     assert max(seen) <= 4
 
 
@@ -401,7 +431,7 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     with pytest.raises(
         CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"
     ) as error:
-        translate_files(run, sources, out, jobs=jobs, device="cpu")
+        translate(run, sources, out, jobs=jobs)
     assert "\n" not in str(error.value)
     assert sum("bad.lh5" in note for note in caplog.messages) == 1
     assert names(out) == names(sequential[0])
@@ -417,18 +447,18 @@ def test_what_processes_say_is_heard(run, tmp_path, caplog):
         with h5py.File(source.path, "w") as file:
             file["waveform"], file["dt_ns"] = charge(), DT_NS
             file["energy_kev"], file["short"] = np.full(N, 1000.0), np.arange(3)
-    translate_files(run, sources, tmp_path / "out", jobs=2, device="cpu")
+    translate(run, sources, tmp_path / "out", jobs=2)
     told = sorted((record.levelname, record.message[:10]) for record in caplog.records)
     assert told == [("WARNING", "sim_0.hdf5"), ("WARNING", "sim_1.hdf5")]
 
 
 def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
     out = tmp_path / "out"
-    translate_files(run, many[:2], out, device="cpu")
+    translate(run, many[:2], out)
     before = [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)]
     with pytest.raises(CpunetError, match="exists already"):
-        translate_files(run, many, out, device="cpu")
-    told = translate_files(run, many, out, device="cpu", resume=True)
+        translate(run, many, out)
+    told = translate(run, many, out, resume=True).counts
     assert (told["skipped"], told["translated"]) == (2, 3 * N)
     assert [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)] == before
     for path in sequential[0].iterdir():
@@ -440,9 +470,7 @@ def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, 
 
     def refused(run=run, sources=many, **options):
         with pytest.raises(CpunetError) as error:
-            translate_files(
-                run, sources, out, TranslateOptions(**options), resume=True, device="cpu"
-            )
+            translate(run, sources, out, **options, resume=True)
         return str(error.value)
 
     assert "was made with another run" in refused(run=network)
@@ -454,7 +482,7 @@ def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, 
     foreign.mkdir()
     (foreign / "sim_0.lh5").write_bytes(b"x")
     with pytest.raises(CpunetError, match="no translation that is finished"):
-        translate_files(run, many[:1], foreign, resume=True, device="cpu")
+        translate(run, many[:1], foreign, resume=True)
 
 
 # --- ADC counts
@@ -501,7 +529,7 @@ def test_windows_are_extended_by_their_decay():
 @pytest.mark.parametrize("adc", [Adc(), ADC])
 def test_traces_in_adc_counts(run, tmp_path, adc):
     source, out = sim_file(tmp_path / "sim.lh5"), tmp_path / "out.lh5"
-    told = translate_file(run, PulseFile(source), out, TranslateOptions(adc=adc), device="cpu")
+    told = translate(run, source, out, adc=True, scale=adc).counts
     assert (told["translated"], told["saturated"]) == (N, 0)
     length, n_pre = adc.length or 800, adc.n_pre or 400
     table = lh5.read("geds/ren", out)
@@ -519,9 +547,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     # prepared again they are what translation gives without ADC
     config = load_recipe("fast").preparation
     clean = tmp_path / "clean.lh5"
-    translate_file(
-        run, PulseFile(source), clean, TranslateOptions(adc=adc, noise=False), device="cpu"
-    )
+    translate(run, source, clean, adc=True, scale=adc, noise=False)
     back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
     assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
     windows = REN.load(run).translate(charge(), noise=False)
@@ -536,19 +562,15 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
     run, network, tmp_path, caplog
 ):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    translate_file(run, source, tmp_path / "chain.lh5", TranslateOptions(adc=ADC), device="cpu")
+    translate(run, source, tmp_path / "chain.lh5", adc=True, scale=ADC)
     traces = values(tmp_path / "chain.lh5").astype(float)
     for part in (slice(0, 250), slice(1150, 1400)):
         steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
         assert steps.mean() == pytest.approx(10 * NOISE_KEV, rel=0.05)
     given = Adc(adc_per_kev=8.0, baseline=14_000, length=1000, n_pre=500)
-    told = translate_file(
-        network,
-        source,
-        tmp_path / "unet.lh5",
-        TranslateOptions(adc=given, noise=False),
-        device="cpu",
-    )
+    told = translate(
+        network, source, tmp_path / "unet.lh5", adc=True, scale=given, noise=False
+    ).counts
     assert told["read"] == N
     assert any("beyond them stand baseline and decay" in note for note in caplog.messages)
     assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
@@ -558,9 +580,7 @@ def test_gain_is_the_height_of_a_fast_pulse(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5")
     given = Adc(adc_per_kev=7.0, baseline=100.0)
     out = tmp_path / "out.lh5"
-    translate_file(
-        run, PulseFile(source), out, TranslateOptions(adc=given, noise=False), device="cpu"
-    )
+    translate(run, source, out, adc=True, scale=given, noise=False)
     table = lh5.read("geds/ren", out)
     height = table.waveform.values.nda.max(axis=1) - 100.0
     np.testing.assert_allclose(height / table.energy.nda, 7.0, rtol=0.01)
@@ -571,9 +591,7 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     waveforms[3] = 0.5
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
-    told = translate_file(
-        run, PulseFile(path), tmp_path / "out.lh5", TranslateOptions(adc=ADC), device="cpu"
-    )
+    told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=ADC).counts
     assert told == {
         "read": 6,
         "translated": 4,
@@ -595,7 +613,7 @@ def left_in(path, table="geds/ren"):
 def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder, name in ((busy, "a.lh5"), (run, "b.lh5")):
-        translate_file(folder, source, tmp_path / name, device="cpu")
+        translate(folder, source, tmp_path / name)
         with h5py.File(tmp_path / name) as file:
             assert "remains_kev" not in file["geds/ren"]
     assert values(tmp_path / "a.lh5") == pytest.approx(values(tmp_path / "b.lh5"))
@@ -604,7 +622,7 @@ def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
 def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, many = tmp_path / "out.lh5", {"realisations": 40}
-    translate_file(busy, source, out, TranslateOptions(remains="learned", **many), device="cpu")
+    translate(busy, source, out, remains="learned", **many)
     left = left_in(out)
     assert len(left) == 40 * N
     assert left.max() < 40
@@ -613,9 +631,7 @@ def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     higher = values(out)[:, 410:440].mean(axis=1)
     share = left / lh5.read("geds/ren/energy", out).nda
     assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate_file(
-        busy, source, tmp_path / "rate.lh5", TranslateOptions(remains="1", **many), device="cpu"
-    )
+    translate(busy, source, tmp_path / "rate.lh5", remains="1", **many)
     assert left_in(tmp_path / "rate.lh5").max() > 100
 
 
@@ -623,9 +639,7 @@ def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for remains in ("none", "3"):
         out = tmp_path / f"{remains}.lh5"
-        translate_file(
-            busy, source, out, TranslateOptions(adc=ADC, remains=remains, seed=3), device="cpu"
-        )
+        translate(busy, source, out, adc=True, scale=ADC, remains=remains, seed=3)
     left = left_in(tmp_path / "3.lh5")
     none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
     assert (left > 20).sum() > 5
@@ -643,17 +657,9 @@ def piled(out):
 
 def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    options = {"adc": ADC, "seed": 3, "realisations": 5}
-    translate_file(
-        busy, source, tmp_path / "none.lh5", TranslateOptions(**options), device="cpu"
-    )
-    translate_file(
-        busy,
-        source,
-        tmp_path / "some.lh5",
-        TranslateOptions(pile_up_khz=20, **options),
-        device="cpu",
-    )
+    options = {"adc": True, "scale": ADC, "seed": 3, "realisations": 5}
+    translate(busy, source, tmp_path / "none.lh5", **options)
+    translate(busy, source, tmp_path / "some.lh5", pile_up_khz=20, **options)
     with h5py.File(tmp_path / "none.lh5") as file:
         assert "n_piled" not in file["geds/ren"]
     count, kev, after_ns = piled(tmp_path / "some.lh5")
@@ -674,7 +680,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
 def test_second_pulses_are_within_windows(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, options = tmp_path / "some.lh5", {"seed": 3, "realisations": 10}
-    translate_file(busy, source, out, TranslateOptions(pile_up_khz=20, **options), device="cpu")
+    translate(busy, source, out, pile_up_khz=20, **options)
     count, kev, after_ns = piled(out)
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
@@ -692,41 +698,35 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
     [
         ({"pile_up_khz": -1.0}, "expected a rate in kHz, 0 or more"),
         ({"pile_up_khz": 1e6}, "give a lower rate"),
-        ({"pile_up_khz": 1.0, "noise": False}, "leave out --no-noise"),
-        ({"pile_up_khz": 1.0, "inverse": True}, "leave out --pile-up-khz"),
-        ({"table": ""}, "--out-table is empty"),
-        ({"seed": -1}, "seed -1: expected a whole number from 0"),
+        ({"pile_up_khz": 1.0, "noise": False}, "or translate with noise"),
+        ({"pile_up_khz": 1.0, "inverse": True}, "leave out `pile_up_khz`"),
+        ({"out_table": ""}, "`out_table` is empty"),
+        ({"realisations": 0}, "expected 1 or more"),
+        ({"realisations": 2, "noise": False}, "all the same"),
+        ({"inverse": True, "adc": True}, "leave out `adc`"),
+        ({"scale": Adc(length=900)}, "add `adc`"),
+        ({"jobs": 0}, "`jobs` is 0; expected 1 or more"),
+        ({"seed": -1}, "`seed` -1: expected a whole number from 0"),
         ({"seed": 2**64}, "expected a whole number from 0"),
-        ({"table": "/"}, "--out-table is empty"),
-        ({"remains": "many"}, "--remains many: expected learned, none, or a rate in kHz"),
+        ({"remains": "many"}, "`remains` many: expected learned, none, or a rate in kHz"),
         ({"remains": "-1"}, "expected learned, none, or a rate"),
-        ({"remains": "learned", "noise": False}, "leave out --no-noise"),
-        ({"remains": "learned", "inverse": True}, "leave out --remains"),
+        ({"remains": "learned", "noise": False}, "or translate with noise"),
+        ({"remains": "learned", "inverse": True}, "leave out `remains`"),
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
-        translate_file(
-            busy, source, tmp_path / "out.lh5", TranslateOptions(**options), device="cpu"
-        )
+        translate(busy, source, tmp_path / "out.lh5", **options)
 
 
 def test_runs_that_tell_of_no_remains(run, network, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of remains"):
-            translate_file(
-                folder, source, tmp_path / "o.lh5", TranslateOptions(remains="1"), device="cpu"
-            )
+            translate(folder, source, tmp_path / "o.lh5", remains="1")
         with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
-            translate_file(
-                folder,
-                source,
-                tmp_path / "o.lh5",
-                TranslateOptions(pile_up_khz=1),
-                device="cpu",
-            )
+            translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
 
 
 def test_adc_needs_to_be_known(network, tmp_path):
@@ -734,17 +734,11 @@ def test_adc_needs_to_be_known(network, tmp_path):
 
     def refused(**adc):
         with pytest.raises(CpunetError) as error:
-            translate_file(
-                network,
-                source,
-                tmp_path / "o.lh5",
-                TranslateOptions(adc=Adc(**adc)),
-                device="cpu",
-            )
+            translate(network, source, tmp_path / "o.lh5", adc=True, scale=Adc(**adc))
         return str(error.value)
 
-    assert "give --adc-per-kev" in refused()
-    assert "give --baseline" in refused(adc_per_kev=5)
+    assert "give `adc_per_kev`" in refused()
+    assert "give `baseline`" in refused(adc_per_kev=5)
     assert "expected a number above 0" in refused(adc_per_kev=0, baseline=5)
     assert "expected a number that is not negative" in refused(adc_per_kev=5, baseline=-1)
     assert "not within a trace" in refused(adc_per_kev=5, baseline=5, length=100, n_pre=100)
@@ -753,25 +747,12 @@ def test_adc_needs_to_be_known(network, tmp_path):
 # --- what can go wrong
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"realisations": 0}, "expected 1 or more"),
-        ({"realisations": 2, "noise": False}, "all the same"),
-        ({"inverse": True, "adc": Adc()}, "leave out --output adc"),
-    ],
-)
-def test_options_that_contradict_each_other(options, said):
-    with pytest.raises(CpunetError, match=said):
-        TranslateOptions(**options)
-
-
 def test_a_file_that_changes_meanwhile_gives_no_output(run, tmp_path, monkeypatch):
     source = sim_file(tmp_path / "sim.lh5")
 
     monkeypatch.setattr(Stage, "update", lambda *_: os.utime(source, ns=(0, 0)))
     with pytest.raises(CpunetError, match=r"sim.lh5: changed while it was read"):
-        translate_file(run, PulseFile(source), tmp_path / "out.lh5", device="cpu")
+        translate(run, source, tmp_path / "out.lh5")
     assert names(tmp_path) == ["sim.lh5"]
 
 
@@ -780,7 +761,7 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path):
     listing = r"out.lh5: cannot be written \(File too large\); make room"
     for size in (source.stat().st_size // 2, source.stat().st_size + 100_000):
         with nearly_full_disk(size), pytest.raises(CpunetError, match=listing):
-            translate_file(run, PulseFile(source), out, device="cpu")
+            translate(run, source, out)
         assert names(out.parent) == []
 
 
@@ -791,18 +772,18 @@ def test_no_space_left_is_told(run, tmp_path, monkeypatch):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     monkeypatch.setattr("cpunet.pulses.writing.lh5.write", full)
     with pytest.raises(CpunetError, match=r"out.lh5: cannot be written \(No space left on dev"):
-        translate_file(run, source, tmp_path / "out.lh5", device="cpu")
+        translate(run, source, tmp_path / "out.lh5")
     assert names(tmp_path) == ["sim.lh5"]
 
 
 def test_targets_that_cannot_be_written(run, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=r"/proc/nowhere/out.lh5: cannot be written"):
-        translate_file(run, source, Path("/proc/nowhere/out.lh5"), device="cpu")
+        translate(run, source, Path("/proc/nowhere/out.lh5"))
     with pytest.raises(CpunetError, match="is the input; choose another"):
-        translate_file(run, source, source.path, device="cpu", force=True)
+        translate(run, source, source.path, force=True)
     with pytest.raises(CpunetError, match="is a file, but several outputs need a folder"):
-        translate_files(run, [source, source], source.path, device="cpu")
+        translate(run, [source, source], source.path)
 
 
 class _Killed:
@@ -821,13 +802,13 @@ def test_a_process_that_is_killed_is_told():
 
 def test_names(run, many, tmp_path):
     folder = many[0].path.parent
-    assert expanded([folder / "sim_*.lh5"]) == [source.path for source in many]
-    assert expanded([folder / "other.lh5"]) == [folder / "other.lh5"]
+    assert expanded(folder / "sim_*.lh5") == [source.path for source in many]
+    assert expanded(folder / "other.lh5") == [folder / "other.lh5"]
     with pytest.raises(CpunetError, match="no such files"):
-        expanded([folder / "x*.lh5"])
+        expanded(folder / "x*.lh5")
     twice = [many[0], many[0]]
     with pytest.raises(CpunetError, match=r"occur twice among the files, as sim_0.lh5"):
-        translate_files(run, twice, tmp_path / "out", device="cpu")
+        translate(run, twice, tmp_path / "out")
     shared = [PulseFile(one.path, energy="hit.lh5:a/b") for one in many]
     with pytest.raises(CpunetError, match="belongs to one file"):
-        translate_files(run, shared, tmp_path / "out", device="cpu")
+        translate(run, shared, tmp_path / "out")

@@ -25,17 +25,16 @@ from typing import Any
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.translate import FileTranslation
-from cpunet.jobs.translation.translate_options import TranslateOptions
 from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.training.run import Run, RunLike, as_run
+from cpunet.training.run import Run
+from cpunet.translation.file_translation import FileTranslation
+from cpunet.translation.options import TranslateOptions
 
 log = logging.getLogger(__name__)
 
-DEFAULTS = TranslateOptions()
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
 Told = dict[str, Any]
@@ -49,39 +48,22 @@ class _Task:
 
 
 def translate_files(
-    run: RunLike,
+    run: Run,
     sources: Sequence[PulseFile],
     out: Path,
-    options: TranslateOptions = DEFAULTS,
+    options: TranslateOptions,
     *,
-    jobs: int = 1,
-    device: str = "auto",
-    resume: bool = False,
-    force: bool = False,
+    jobs: int,
+    device: str,
+    resume: bool,
+    force: bool,
 ) -> Told:
     """Translate files into files of the same names in a folder.
 
     The output depends on the seed and the name of a file, not on the number of processes or on
     the other files.  A file that cannot be translated does not stop the others.
 
-    Parameters
-    ----------
-    run
-        A trained run, or its folder.
-    sources
-        Files of pulses.
-    out
-        Output folder; created if missing.
-    options
-        How to translate, see `cpunet.jobs.translation.translate.translate_file`.
-    jobs
-        Number of processes, with one thread each.
-    device
-        ``"cpu"``, ``"cuda"`` or ``"auto"``.
-    resume
-        Whether to skip files whose outputs exist, made from the same sources in the same way.
-    force
-        Whether to replace existing outputs.
+    For the parameters see `cpunet.translate`.
 
     Returns
     -------
@@ -97,7 +79,6 @@ def translate_files(
     tasks = [_Task(source, out / _name(source.path)) for source in sources]
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    run = as_run(run)
     _refuse_inputs(tasks, run.folder)
     _require_apart(tasks, resume=resume, force=force)
     make = _Maker(run, options, device, resume, force)
@@ -120,29 +101,25 @@ def translate_files(
         done = f"; {len(told)} are in {out}" if told else ""
         raise CpunetError(
             f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{done}; "
-            "continue with --resume"
+            "continue with `resume`"
         )
     return _summed(told)
 
 
-def expanded(names: Sequence[Path]) -> list[Path]:
-    """File names, with patterns (``*``, ``?``, ``[``) replaced by the matching files.
+def expanded(name: Path) -> list[Path]:
+    """The file of a name, or those that match a pattern (``*``, ``?``, ``[``).
 
     Raises
     ------
     CpunetError
         If no file matches a pattern.
     """
-    found: list[Path] = []
-    for name in names:
-        if name.exists() or not glob.has_magic(str(name)):
-            found.append(name)
-            continue
-        fitting = sorted(glob.glob(str(name), recursive=True))  # noqa: PTH207 (absolute ones too)
-        if not fitting:
-            raise CpunetError(f"{name}: no such files; check the name")
-        found += map(Path, fitting)
-    return found
+    if name.exists() or not glob.has_magic(str(name)):
+        return [name]
+    fitting = sorted(glob.glob(str(name), recursive=True))  # noqa: PTH207 (absolute ones too)
+    if not fitting:
+        raise CpunetError(f"{name}: no such files; check the name")
+    return [*map(Path, fitting)]
 
 
 @dataclass(frozen=True)
@@ -211,8 +188,8 @@ def _in_processes(make: _Maker, tasks: Sequence[_Task], jobs: int) -> _Outcomes:
                     yield left.pop(future), outcome
         except BrokenProcessPool as error:
             raise CpunetError(
-                "a process was ended, perhaps for lack of memory; try fewer --jobs, and "
-                "continue with --resume"
+                "a process was ended, perhaps for lack of memory; try fewer `jobs`, and "
+                "continue with `resume`"
             ) from error
         finally:
             if left:
@@ -283,7 +260,7 @@ def _refuse_inputs(tasks: Sequence[_Task], run: Path | None) -> None:
     for task in tasks:
         refuse_inputs(task.out, run, *task.source.files)
         if _identity(task.out) in inputs:
-            raise CpunetError(f"{task.out}: is the input; choose another --out")
+            raise CpunetError(f"{task.out}: is the input; choose another `out`")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -305,7 +282,7 @@ def _require_apart(tasks: Sequence[_Task], *, resume: bool, force: bool) -> None
     shared = next((t.source.energy for t in tasks if ":" in (t.source.energy or "")), None)
     if shared is not None and len(tasks) > 1:
         raise CpunetError(
-            f"--energy {shared} belongs to one file of pulses, not to {len(tasks)}; "
+            f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
             "translate them one by one"
         )
     for task in tasks:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cpunet.electronics.second_pulses import Columns
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection
 from cpunet.translation.output_form import Formed
@@ -62,13 +63,13 @@ def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
 
 
 def interleaved(realisations: list[Formed]) -> Formed:
-    """Realisations of the same pulses as rows: all of the first pulse, then of the second."""
+    """Realisations of the same pulses as numbered rows: all of a pulse, then of the next."""
     if len(realisations) == 1:
         return realisations[0]
     n, first = len(realisations), realisations[0].pulses
     rows = np.repeat(np.arange(len(first)), n)
     waveforms = np.stack([formed.pulses.waveforms for formed in realisations], axis=1)
-    truth = {
+    truth: Columns = {
         name: (np.stack([each.truth[name][0] for each in realisations], axis=1).ravel(), units)
         for name, (_, units) in realisations[0].truth.items()
     }
@@ -81,7 +82,20 @@ def interleaved(realisations: list[Formed]) -> Formed:
         ),
         np.stack([formed.codes for formed in realisations], axis=1).ravel(),
         np.stack([formed.saturated for formed in realisations], axis=1).ravel(),
-        truth,
+        truth | {"realisation": (np.tile(np.arange(n), len(first)), "")},
+    )
+
+
+def joined(blocks: list[Formed]) -> Formed:
+    """The rows of all blocks."""
+    return Formed(
+        Pulses.concatenate([block.pulses for block in blocks]),
+        np.concatenate([block.codes for block in blocks]),
+        np.concatenate([block.saturated for block in blocks]),
+        {
+            name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
+            for name, (_, units) in blocks[0].truth.items()
+        },
     )
 
 

@@ -14,23 +14,22 @@ import numpy as np
 import cpunet
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.closed_forms import (
-    learned_chain,
-    slow_numbers,
-    true_chain_of,
-    true_parameters,
-    with_noise,
-)
-from cpunet.jobs.inspection.response_errors import fitted_errors, propagated
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import checked, read_json
+from cpunet.training.closed_forms import (
+    learned_chain,
+    slow_numbers,
+    true_chain_of,
+    true_parameters,
+    with_noise,
+)
 from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.run import FitInfo, Run, RunLike, as_run
-from cpunet.validation.response_figure import (
+from cpunet.training.response_errors import fitted_errors, propagated
+from cpunet.training.response_figure import (
     Chain,
     Numbers,
     align_ns,
@@ -38,6 +37,7 @@ from cpunet.validation.response_figure import (
     noise_numbers,
     response_figure,
 )
+from cpunet.training.run import FitInfo, Run, RunLike, as_run
 
 MARKER = "response.json"
 RESPONSE = FolderKind(

@@ -1,9 +1,9 @@
-"""Translate the pulses of a file row by row."""
+"""A run and options, applied to the pulses of a file row by row."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,21 +12,6 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.translate_options import TranslateOptions
-from cpunet.jobs.translation.translation_blocks import (
-    NOISE_ROWS,
-    Counts,
-    interleaved,
-    noise_seed,
-    regrouped,
-)
-from cpunet.jobs.translation.translation_record import (
-    as_json,
-    finished,
-    require_unchanged,
-    run_print,
-    source_print,
-)
 from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
@@ -39,13 +24,28 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
+from cpunet.translation.noise_blocks import (
+    NOISE_ROWS,
+    Counts,
+    interleaved,
+    joined,
+    noise_seed,
+    regrouped,
+)
+from cpunet.translation.options import TranslateOptions
 from cpunet.translation.output_form import Formed, Normalised, OutputForm
+from cpunet.translation.record import (
+    as_json,
+    finished,
+    require_unchanged,
+    run_print,
+    source_print,
+)
 from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
 
 log = logging.getLogger(__name__)
 
-DEFAULTS = TranslateOptions()
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
@@ -64,7 +64,7 @@ class FileTranslation:
     options
         How to translate.
     device
-        See `cpunet.train`.
+        ``"cpu"``, ``"cuda"`` or ``"auto"``.
 
     Raises
     ------
@@ -99,12 +99,36 @@ class FileTranslation:
         resume: bool = False,
         force: bool = False,
     ) -> dict[str, Any]:
-        """Translate a file; see `translate_file`.
+        """Translate a file, block by block, keeping its rows and other columns.
+
+        Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
+        ``rejection`` contains the reason (0: translated).
 
         Parameters
         ----------
+        source
+            Simulated pulses, or measured ones for the inverse.
+        out
+            LH5 file to write.
         noise_key
-            See `translate_file`.
+            Name that is combined with the seed, so that the noise of files or channels
+            differs; None for the noise of `cpunet.translation.translator.Translator.translate`.
+        resume
+            Whether to keep an output that was made from this source with this run and options.
+        force
+            Whether to replace an existing file.
+
+        Returns
+        -------
+        dict
+            ``read``, ``translated`` and ``rejections`` (counts of rows by reason); in ADC also
+            ``saturated``, and ``skipped`` for an output that was kept.
+
+        Raises
+        ------
+        CpunetError
+            If source or output cannot be used, no pulse can be translated, the source changes
+            meanwhile, or another process writes the same output.
         """
         refuse_inputs(out, self.run.folder, *source.files)
         before = source_print(source)
@@ -115,23 +139,28 @@ class FileTranslation:
         refuse_existing(out, force=force)
         pulses = self.opened(source)
         others = _other_columns(pulses)
-        writer = PulseWriter(
-            out,
-            table=self.options.table or f"geds/{self.kind.part}",
-            waveform_units=self.form.units,
-            t0_ns=self.form.t0_ns,
-            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
-            samples=self.form.samples,
-            force=force,
-        )
-        with stage("Translating", pulses.n_pulses) as bar, writer:
-            counts = self._translate(pulses, noise_key, writer, others, bar)
+        with self.writer(out, force=force) as writer:
+            counts = self._written(pulses, noise_key, writer, others)
             self._require_some(source, counts)
             require_unchanged(source, before)
             told = counts.told(adc=self.options.adc is not None)
             record = made | {"counts": told, "cpunet": cpunet.__version__}
             writer.stamp(TRANSLATION, as_json(record))
         return told
+
+    def in_memory(self, source: PulseFile) -> tuple[Formed, dict[str, Any]]:
+        """Translated pulses of a file, and their counts, as those of `__call__`.
+
+        Raises
+        ------
+        CpunetError
+            If the source cannot be used, or no pulse can be translated.
+        """
+        counts, blocks = Counts(), list(self._blocks(self.opened(source), None))
+        for block in blocks:
+            counts.add(block)
+        self._require_some(source, counts)
+        return joined(blocks), counts.told(adc=self.options.adc is not None)
 
     def opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate.
@@ -146,12 +175,17 @@ class FileTranslation:
         require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
         return pulses
 
-    def blocks(
-        self, pulses: Iterable[Pulses], noise_key: str | None = None
-    ) -> Iterator[Formed]:
-        """Translate pulses in blocks of any size; the noise depends only on their order."""
-        for number, block in enumerate(regrouped(pulses, NOISE_ROWS)):
-            yield self._formed(block, number, noise_key)
+    def writer(self, out: Path, *, force: bool) -> PulseWriter:
+        """Return a writer of translated pulses."""
+        return PulseWriter(
+            out,
+            table=self.options.table or f"geds/{self.kind.part}",
+            waveform_units=self.form.units,
+            t0_ns=self.form.t0_ns,
+            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
+            samples=self.form.samples,
+            force=force,
+        )
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
@@ -176,7 +210,7 @@ class FileTranslation:
         found = recorded_side(pulses)
         if found is not None and "translated" in found.why:
             return f"translate the {self.kind.takes} ones that they were made of"
-        return "leave out --inverse" if self.options.inverse else "give --inverse"
+        return f"{'leave out' if self.options.inverse else 'give'} `inverse`"
 
     def _require_some(self, source: PulseFile, counts: Counts) -> None:
         if counts.translated:
@@ -187,23 +221,18 @@ class FileTranslation:
             f"({reasons}); are these {self.translator.takes} pulses?"
         )
 
-    def _translate(
+    def _written(
         self,
         pulses: PulseSource,
         noise_key: str | None,
         writer: PulseWriter,
         others: RowColumns,
-        bar: Stage,
     ) -> Counts:
         give_back_large_arrays()
-        counts, start = Counts(), 0
-        times = self.options.realisations
-        for formed in self.blocks(_read(pulses, bar), noise_key):
-            columns: dict[str, Any] = {"rejection": (formed.codes, ""), **formed.truth}
-            given = len(formed.codes) // (times or 1)
-            if times is not None:
-                columns["realisation"] = (np.tile(np.arange(times), given), "")
-            writer.append(formed.pulses, columns, others.read(start, given, times or 1))
+        counts, start, times = Counts(), 0, self.options.realisations
+        for formed in self._blocks(pulses, noise_key):
+            given = len(formed.codes) // times
+            writer.append(formed.pulses, formed.columns, others.read(start, given, times))
             counts.add(formed)
             start += given
         if pulses.n_pulses not in (None, start):
@@ -213,10 +242,16 @@ class FileTranslation:
             )
         return counts
 
+    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[Formed]:
+        """Translate block by block; the noise depends only on the order of the pulses."""
+        with stage("Translating", pulses.n_pulses) as bar:
+            for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
+                yield self._formed(block, number, noise_key)
+
     def _formed(self, block: Pulses, number: int, noise_key: str | None) -> Formed:
         seeds = [
             noise_seed(self.options.seed, noise_key, number, realisation)
-            for realisation in range(self.options.realisations or 1)
+            for realisation in range(self.options.realisations)
         ]
         return interleaved(
             [
@@ -226,54 +261,6 @@ class FileTranslation:
                 for seed in seeds
             ]
         )
-
-
-def translate_file(
-    run: RunLike,
-    source: PulseFile,
-    out: Path,
-    options: TranslateOptions = DEFAULTS,
-    *,
-    noise_key: str | None = None,
-    device: str = "auto",
-    resume: bool = False,
-    force: bool = False,
-) -> dict[str, Any]:
-    """Translate all pulses of a file, block by block, keeping their rows and other columns.
-
-    Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
-    ``rejection`` contains the reason (0: translated), and the counts are returned.
-
-    Parameters
-    ----------
-    run
-        A trained run, or its folder.
-    source
-        Simulated pulses, or measured ones for the inverse.
-    noise_key
-        Name that is combined with the seed, so that the noise of files or channels differs;
-        None for the noise of `cpunet.translation.translator.Translator.translate`.
-    resume
-        Whether to keep an output that was made from this source with this run and options.
-    device, force
-        See `cpunet.train`.
-
-    Returns
-    -------
-    dict
-        ``read``, ``translated`` and ``rejections`` (counts of rows by reason); in ADC also
-        ``saturated``, and ``skipped`` for an output that was kept.
-
-    Raises
-    ------
-    CpunetError
-        If run, source or output cannot be used, options contradict each other, no pulse can be
-        translated, the source changes meanwhile, or another process writes the same output.
-    """
-    translation = FileTranslation(run, options, device)
-    for doubt in translation.doubts:
-        log.warning(doubt)
-    return translation(source, out, noise_key=noise_key, resume=resume, force=force)
 
 
 def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:

@@ -13,7 +13,7 @@ from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.validation.response_figure import Chain, Numbers, align_ns
+from cpunet.training.response_figure import Chain, Numbers, align_ns
 
 _MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
 _FOREVER_US = 1e9  # decay time of a chain without decay

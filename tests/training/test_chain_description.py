@@ -17,17 +17,17 @@ from cpunet.cli.main import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.inspection.chain_description import (
+from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.recipes import load_recipe
+from cpunet.training.chain_description import (
     chain_of,
     describe_responses,
     stand_electronics,
 )
-from cpunet.jobs.inspection.closed_forms import learned_chain, true_chain_of, true_parameters
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
-from cpunet.recipes import load_recipe
+from cpunet.training.closed_forms import learned_chain, true_chain_of, true_parameters
+from cpunet.training.response_figure import response_figure
 from cpunet.training.run import Run
-from cpunet.validation.response_figure import response_figure
 from synthetic import write_run
 
 DT_NS = 16.0

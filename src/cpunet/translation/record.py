@@ -22,11 +22,17 @@ Record = dict[str, Any]
 def source_print(source: PulseFile) -> Record:
     """Names, sizes and modification times of the input files, and how they are read.
 
+    Pulses in memory have a digest instead.
+
     Raises
     ------
     CpunetError
         If a file does not exist.
     """
+    if source.pulses is not None:
+        content = source.pulses.waveforms, source.pulses.energy_kev
+        digest = hashlib.sha256(b"".join(values.tobytes() for values in content))
+        return {"files": [], "sha256": digest.hexdigest()}
     paths = [source.path]
     elsewhere = (source.energy or "").rpartition(":")[0]
     if elsewhere and Path(elsewhere).is_file():
@@ -85,12 +91,12 @@ def finished(out: Path, wanted: Record) -> dict[str, Any]:
             theirs = found[what]
             other = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
             told = f"other options ({', '.join(other)})"
-        raise CpunetError(f"{out}: was made with {told}; choose another --out or give --force")
+        raise CpunetError(f"{out}: was made with {told}; choose another `out` or give `force`")
     counts = found.get("counts")
     if not isinstance(counts, dict) or not all(map(_is_count, _counted(counts))):
         raise CpunetError(
-            f"{out}: does not say how many pulses it holds; choose another --out or give "
-            "--force"
+            f"{out}: does not say how many pulses it holds; choose another `out` or give "
+            "`force`"
         )
     return dict(counts)
 
@@ -120,6 +126,6 @@ def _read(out: Path) -> Record:
         record = None
     if not isinstance(record, dict):
         raise CpunetError(
-            f"{out}: is no translation that is finished; choose another --out or give --force"
+            f"{out}: is no translation that is finished; choose another `out` or give `force`"
         )
     return record

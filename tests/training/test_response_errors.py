@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.jobs.inspection.response_errors import propagated
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
+from cpunet.training.response_errors import propagated
 
 RESPONSE = ElectronicsResponse(
     load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]).matching[0],

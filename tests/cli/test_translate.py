@@ -1,9 +1,8 @@
-"""`cpunet translate` over many files, and in ADC counts, on the command line."""
+"""`cpunet translate` over many files and in ADC counts."""
 
 from __future__ import annotations
 
 import h5py
-import lh5
 import numpy as np
 import pytest
 
@@ -62,32 +61,17 @@ def test_a_file_into_a_folder_that_is_there(command, trained, sources, tmp_path)
     assert names(out) == ["sim_0.lh5"]
 
 
-def test_one_finished_file_is_skipped(command, trained, sources, tmp_path):
-    words = ("translate", trained, sources / "sim_0.lh5", "--out", tmp_path / "o.lh5")
-    assert command(*words).code == 0
-    again = command(*words, "--resume")
-    assert again.code == 0
-    assert "20 of 20 pulses translated (it was there already)" in said(again)
-
-
-def test_realisations(command, trained, sources, tmp_path):
-    first = ("translate", trained, sources / "sim_0.lh5", "--out")
-    assert command(*first, tmp_path / "b.lh5", "--realisations", 2).code == 0
-    table = lh5.read("geds/ren", tmp_path / "b.lh5")
-    assert table.realisation.nda.tolist() == [0, 1] * 20
-
-
 def test_adc_counts(command, trained, stand, sources, tmp_path, monkeypatch):
     # at its end, as windows of data are
     monkeypatch.setattr(PositionalUNet, "forward", lambda _, pulses, **_options: 0.8 * pulses)
-    first = ("translate", trained, sources / "sim_1.lh5", "--output", "adc", "--out")
-    length = ("--length", 1000, "--n-pre", 480)
+    first = ("translate", trained, sources / "sim_1.lh5", "--adc", "--out")
+    length = ("--length", 1000, "--n-pre", 480, "--out-table", "ch1/like_data")
     # the run was trained on data of 15 ADC per keV on a baseline of 8000
     outcome = command(*first, tmp_path / "a.lh5", *length)
     assert outcome.code == 0, outcome.err
     assert "18 of 20 pulses translated; rows of 0 for 1 nan, 1 constant" in said(outcome)
     with h5py.File(tmp_path / "a.lh5") as file:
-        values = file["geds/ren/waveform/values"]
+        values = file["ch1/like_data/waveform/values"]
         assert (values.dtype, values.shape) == (np.uint16, (20, 1000))
         traces = values[:].astype(float)
     assert (traces[4:6] == 0).all()
@@ -98,10 +82,10 @@ def test_adc_counts(command, trained, stand, sources, tmp_path, monkeypatch):
     np.testing.assert_allclose(late, expected, rtol=0.01)
     refused = command("translate", trained, sources / "sim_0.lh5", "--out", "x", *length)
     assert refused.code == 2
-    assert "add --output adc" in refused.err
+    assert "add --adc" in refused.err
 
 
-@pytest.mark.parametrize("words", [("--jobs", 0), ("--output", "volts"), ("--length", 0)])
+@pytest.mark.parametrize("words", [("--jobs", 0), ("--adc-per-kev", "V"), ("--length", 0)])
 def test_words_that_are_none(command, trained, sources, tmp_path, words):
     first = ("translate", trained, sources / "sim_0.lh5", "--out", tmp_path / "out")
     assert command(*first, *words).code == 2

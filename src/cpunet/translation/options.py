@@ -1,0 +1,77 @@
+"""Options of a translation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cpunet.errors import CpunetError
+
+NONE, LEARNED = "none", "learned"  # remains of earlier pulses
+
+
+@dataclass(frozen=True)
+class Adc:
+    """Raw traces in ADC counts, see `cpunet.translation.to_adc`.
+
+    Parameters
+    ----------
+    adc_per_kev
+        Maximum over the baseline in ADC counts per keV; that of the run's data by default.
+    baseline
+        Baseline in ADC counts; that of the run's data by default.
+    length
+        Samples of a trace; those of a window by default.
+    n_pre
+        Samples before 99.9 % of the maximum; those of a window by default.
+    """
+
+    adc_per_kev: float | None = None
+    baseline: float | None = None
+    length: int | None = None
+    n_pre: int | None = None
+
+
+@dataclass(frozen=True)
+class TranslateOptions:
+    """How to translate, see `cpunet.translate`; `adc` is None for normalised windows.
+
+    Raises
+    ------
+    CpunetError
+        If options contradict each other.
+    """
+
+    inverse: bool = False
+    noise: bool = True
+    seed: int = 0
+    table: str | None = None
+    realisations: int = 1
+    adc: Adc | None = None
+    remains: str | float = NONE
+    pile_up_khz: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**64:
+            raise CpunetError(f"`seed` {self.seed}: expected a whole number from 0 to 2^64 - 1")
+        if self.realisations < 1:
+            raise CpunetError(f"`realisations` is {self.realisations}; expected 1 or more")
+        if self.realisations > 1 and not self.noise:
+            raise CpunetError("`realisations` without noise are all the same; give one of both")
+        if self.table is not None and not self.table.strip("/ "):
+            raise CpunetError("`out_table` is empty; leave it out, or give a name as geds/ren")
+        asked = {
+            "remains": self.remains != NONE,
+            "pile_up_khz": self.pile_up_khz != 0,
+            "adc": self.adc is not None,
+        }
+        for name in (name for name in asked if asked[name]):
+            if self.inverse:
+                raise CpunetError(
+                    f"`{name}`: the inverse gives charge, without other pulses and ADC counts; "
+                    f"leave out `{name}`"
+                )
+            if not self.noise and name != "adc":
+                raise CpunetError(
+                    f"`{name}`: other pulses are drawn with the noise; leave out `{name}`, or "
+                    "translate with noise"
+                )

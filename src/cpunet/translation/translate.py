@@ -1,0 +1,207 @@
+"""`cpunet.translate`: make simulated pulses look measured, or the other way round."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, one_by_one, own_folder
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import FileOptions, PulseFile, Source, pulse_file
+from cpunet.training.run import INFO, Run, RunLike, as_run
+from cpunet.translation.file_translation import FileTranslation
+from cpunet.translation.many_files import expanded, translate_files
+from cpunet.translation.options import NONE, Adc, TranslateOptions
+from cpunet.translation.translation import Translation
+
+log = logging.getLogger(__name__)
+
+
+def translate(
+    run: RunLike,
+    pulses: Sequence[Source] | Source | npt.ArrayLike,
+    out: str | Path | None = None,
+    *,
+    inverse: bool = False,
+    noise: bool = True,
+    remains: str | float = NONE,
+    pile_up_khz: float = 0.0,
+    realisations: int = 1,
+    adc: bool = False,
+    scale: Adc = Adc(),
+    out_table: str | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    resume: bool = False,
+    device: str = "auto",
+    read: FileOptions = FileOptions(),
+    force: bool = False,
+) -> Translation | Outcome[Translation]:
+    """Translate pulses with a trained run, keeping the rows and columns of their files.
+
+    Parameters
+    ----------
+    run
+        A trained run or its folder; for all tables of a file, a folder of runs by table.
+    pulses
+        A file of pulses, several, or patterns as ``sim_*.lh5``; or pulses in memory, or an
+        array of shape (n, samples) with the sampling of the run.
+    out
+        LH5 file to write; for several files, or with a slash at its end, a folder.  Without
+        it, pulses stay in memory.
+    inverse
+        Translate measured pulses to simulation-like ones.
+    noise
+        Add noise as the data have it.  It is the same in memory and in a file.
+    remains
+        Remains of earlier pulses: ``learned``, ``none``, or a rate in kHz.
+    pile_up_khz
+        Rate in kHz of second pulses within a trace.
+    realisations
+        Number of noise draws for each pulse: rows are repeated and numbered.
+    adc
+        Make raw traces in ADC counts, as a digitiser's, instead of normalised windows.
+    scale
+        Settings of these traces.
+    out_table
+        Table to write; ``geds/ren`` or ``geds/iren`` by default.
+    seed
+        Seed of the noise.
+    jobs
+        Processes, each of which translates a file at a time.
+    resume
+        Keep files that are there already, if made from the same input in the same way.
+    device
+        ``cpu``, ``cuda`` or ``auto``.
+    read
+        How files are read, if they do not tell themselves.  With ``all`` for the table, each
+        table is translated to a file in `out`.
+    force
+        Replace existing files.
+
+    Returns
+    -------
+    Translation
+        The translated pulses; those of each table if all are translated.
+
+    Raises
+    ------
+    CpunetError
+        If an argument cannot be used, no pulse can be translated, or files failed.
+
+    Examples
+    --------
+    cpunet translate run sim.lh5 --out translated.lh5
+    cpunet translate run sim_*.lh5 --out translated/ --jobs 4 --resume
+    cpunet translate runs sim.lh5 --table all --out translated/
+    """
+    if scale != Adc() and not adc:
+        raise CpunetError(
+            "`adc_per_kev`, `baseline`, `length` and `n_pre` belong to traces in ADC counts; "
+            "add `adc`"
+        )
+    if jobs < 1:
+        raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
+    options = TranslateOptions(
+        inverse,
+        noise,
+        seed,
+        out_table,
+        realisations,
+        scale if adc else None,
+        remains,
+        pile_up_khz,
+    )
+    files = list(_files(pulses, read, run))
+    how: dict[str, Any] = {"device": device, "resume": resume, "force": force}
+    several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
+    channels = any(file.table == ALL for file in files)
+    if out is None:
+        if several or channels:
+            raise CpunetError("several files or tables do not stay in memory; give `out`")
+        return _in_memory(as_run(run), files[0], options, device)
+    if channels:
+        if len(files) > 1:
+            raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
+        return _of_channels(run, files[0], Path(out), options, **how)
+    run = as_run(run)
+    if several:
+        counts = translate_files(run, files, Path(out), options, jobs=jobs, **how)
+        return Translation(run.name, run.recipe, counts, adc, Path(out))
+    return _to_file(run, files[0], Path(out), options, **how)
+
+
+def _files(
+    given: Sequence[Source] | Source | npt.ArrayLike, read: FileOptions, run: RunLike
+) -> Iterator[PulseFile]:
+    """Files of pulses from all that a user may give."""
+    sources: list[Any] = [given] if isinstance(given, Source) else list(given)  # type: ignore[arg-type]
+    if not sources:
+        raise CpunetError("there are no pulses to translate; give some")
+    if not all(isinstance(source, Source) for source in sources):
+        waveforms = np.atleast_2d(np.asarray(given, np.float32))
+        sources = [Pulses.of(waveforms, dt_ns=as_run(run).dt_ns)]
+    for source in sources:
+        names = expanded(Path(source)) if isinstance(source, str | Path) else [source]
+        yield from (pulse_file(name, read) for name in names)
+
+
+def _in_memory(
+    run: Run, source: PulseFile, options: TranslateOptions, device: str
+) -> Translation:
+    job = _job(run, options, device)
+    kept, counts = job.in_memory(source)
+    adc = options.adc is not None
+    return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
+
+
+def _to_file(
+    run: Run,
+    source: PulseFile,
+    out: Path,
+    options: TranslateOptions,
+    *,
+    device: str,
+    noise_key: str | None = None,
+    **how: bool,
+) -> Translation:
+    counts = _job(run, options, device)(source, out, noise_key=noise_key, **how)
+    return Translation(run.name, run.recipe, counts, options.adc is not None, out)
+
+
+def _job(run: Run, options: TranslateOptions, device: str) -> FileTranslation:
+    job = FileTranslation(run, options, device)
+    for doubt in job.doubts:
+        log.warning(doubt)
+    return job
+
+
+def _of_channels(
+    runs: RunLike, source: PulseFile, out: Path, options: TranslateOptions, **how: Any
+) -> Outcome[Translation]:
+    """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
+
+    A single table, such as a simulation that serves all channels, is translated with each
+    run.  The noise depends on the seed and the name of the channel, so that of channels
+    differs.
+    """
+
+    def act(name: str, pair: Pair, place: Path) -> Translation:
+        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+        target = place.with_name(f"{name}.lh5")
+        return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)
+
+    channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
+    if len(channels) == 1 and not isinstance(runs, Run):
+        own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
+        if not any(own):
+            (single,) = channels.values()
+            trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
+            channels = dict.fromkeys(trained, single) or channels
+    return one_by_one(channels, out, act)

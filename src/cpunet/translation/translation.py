@@ -1,0 +1,211 @@
+"""Translated pulses, in memory or in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hist
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from cpunet.errors import CpunetError
+from cpunet.html_pages import notebook_picture, part
+from cpunet.plotting import COLOURS, styled
+from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Codes, Rejection
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.pulses.writing import PulseWriter
+from cpunet.recipes.schema import Recipe
+from cpunet.translation.output_form import Formed
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+DRAWN = 50  # pulses in a figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Translation:
+    """Translated pulses, in the order of the input.
+
+    Parameters
+    ----------
+    run
+        Name of the run that translated them.
+    recipe
+        Recipe of the run.
+    counts
+        Row counts: ``read``, ``translated``, ``rejections`` by reason; ``saturated`` in ADC;
+        of several files also ``files`` and ``skipped``.
+    adc
+        Whether the pulses are raw traces in ADC counts instead of normalised windows.
+    path
+        The file they were written to, or a folder of several; None if they are in memory only.
+    kept
+        The pulses if they are in memory.
+    writer
+        Opens a file for those in memory.
+    """
+
+    run: str
+    recipe: Recipe
+    counts: Mapping[str, Any]
+    adc: bool = False
+    path: Path | None = None
+    kept: Formed | None = None
+    writer: Callable[..., PulseWriter] | None = None
+
+    @cached_property
+    def pulses(self) -> Pulses:
+        """All pulses; those in a file are read on first access."""
+        return self.kept.pulses if self.kept else open_pulses(self._file).read()
+
+    @cached_property
+    def codes(self) -> Codes:
+        """`cpunet.pulses.preparation.Rejection` code of each row; 0 for a translated pulse."""
+        if self.kept:
+            return self.kept.codes
+        column = open_pulses(self._file).columns["rejection"]
+        return np.asarray(column.read(0, len(column)), np.uint8)
+
+    @property
+    def waveforms(self) -> FloatArray:
+        """Translated waveforms, shape (n, samples); NaN, or 0 in ADC, in rejected rows."""
+        return self.pulses.waveforms
+
+    @property
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """Which rows hold a pulse, shape (n,)."""
+        return np.asarray(self.codes == Rejection.ACCEPTED)
+
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Number of rows without a pulse, by reason."""
+        return dict(self.counts["rejections"])
+
+    @cached_property
+    def parameters(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Pulse-shape parameters by name, shape (n,); see `SHAPE_PARAMETERS`.
+
+        Raises
+        ------
+        CpunetError
+            If these are raw traces, which must be prepared first.
+        """
+        if self.adc:
+            raise CpunetError(
+                f"{self.path or self.run}: raw traces in ADC have no parameters yet; run "
+                "dspeed on them, or translate to windows"
+            )
+        return all_parameters(self.pulses, self.recipe.preparation, self.recipe.scores)
+
+    def hist(
+        self, parameter: str = "current_amplitude", max_bins: int = MAX_BINS
+    ) -> hist.Hist[Any]:
+        """Distribution of a parameter as a `hist.Hist`.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such parameter.
+        """
+        values = named(self.parameters, parameter, "parameter")
+        axis = labelled(data_axis(values, max_bins), parameter)
+        made: hist.Hist[Any] = hist.Hist(axis)
+        return made.fill(values[np.isfinite(values)])
+
+    @styled
+    def plot(self, n: int = DRAWN) -> Figure:
+        """Draw the first `n` translated pulses over each other."""
+        rows = np.flatnonzero(self.valid)[:n]
+        figure = Figure(figsize=(6.4, 3.2))
+        axes = figure.subplots()
+        pulses = self.pulses
+        time_us = np.arange(pulses.length) * pulses.dt_ns * 1e-3
+        lines = pulses.waveforms[rows].T
+        axes.plot(time_us, lines, color=COLOURS["ren"], lw=0.6, alpha=0.5)
+        axes.set_xlabel("Time [µs]")
+        axes.set_ylabel("ADC counts" if self.adc else "Pulse height")
+        axes.set_title(f"{len(rows)} of {self.counts['translated']} translated pulses")
+        return figure
+
+    def to_dataframe(self) -> DataFrame:
+        """Event, energy, reason of rejection and parameters of each pulse, as a data frame."""
+        told = {"rejection": [Rejection(int(code)).label for code in self.codes]}
+        columns = told if self.adc else told | self.parameters
+        return self.pulses.to_dataframe().assign(**columns)
+
+    def save(self, path: str | Path, *, force: bool = False) -> Path:
+        """Write pulses that are in memory to an LH5 file, without other columns of the source.
+
+        Raises
+        ------
+        CpunetError
+            If they are in a file, or the file exists (without `force`) or cannot be written.
+        """
+        if self.kept is None or self.writer is None:
+            raise CpunetError(f"{self.path}: holds these pulses already; copy it")
+        with self.writer(Path(path), force=force) as writer:
+            writer.append(self.kept.pulses, self.kept.columns)
+        return Path(path)
+
+    @property
+    def _file(self) -> Path:
+        assert self.path is not None  # else they are in memory
+        return self.path
+
+    def __len__(self) -> int:
+        return int(self.counts["read"])
+
+    def __str__(self) -> str:
+        told = self.counts
+        text = f"{told['translated']} of {told['read']} pulses translated"
+        if "files" in told:
+            text = f"{told['files']} files, {text}"
+        if told.get("skipped"):
+            which = f"{told['skipped']} files were" if "files" in told else "it was"
+            text += f" ({which} there already)"
+        rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejections.items())
+        if rejected:
+            text += f"; rows of {'0' if self.adc else 'NaN'} for {rejected}"
+        if told.get("saturated"):
+            text += f"; {told['saturated']} saturated"
+        return f"{self.path or 'in memory'}: {text}"
+
+    def __repr__(self) -> str:
+        where = "in memory" if self.path is None else str(self.path)
+        done = f"{self.counts['translated']} of {self.counts['read']} pulses"
+        return f"<Translation {where}: {done}>"
+
+    def _repr_html_(self) -> str:
+        told: dict[str, object] = {
+            "run": self.run,
+            "file": self.path,
+            "translated": f"{self.counts['translated']} of {self.counts['read']} pulses",
+            "as": "raw traces in ADC" if self.adc else "normalised windows",
+            "saturated": self.counts.get("saturated"),
+        }
+        told |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
+        small = self.kept is not None  # a file may be large
+        drawn = notebook_picture(self.plot()) if small and self.counts["translated"] else ""
+        return part("object", "cpunet translation", told, picture=drawn)
+
+
+def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
+    """A value by name.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such value; the message lists the known names.
+    """
+    if name not in values:
+        raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")
+    return values[name]
