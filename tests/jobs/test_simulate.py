@@ -207,7 +207,7 @@ def test_hits_outside_are_told(ppc, source, tmp_path: Path, caplog):
 @pytest.mark.parametrize(("outside", "said"), [(1, ""), (2, "2 of 1002 (0.2%) hits")])
 def test_a_stray_hit_draws_no_warning(ppc, tmp_path: Path, outside: int, said: str):
     places = [[10.0, 0, 20 + 0.01 * i] for i in range(1000)] + [[0.0, 0, 47]] * outside
-    hits = Hits.of(places, np.ones(len(places)), range(len(places) + 1))
+    hits = Hits.of(places, np.full(len(places), 100.0), range(len(places) + 1))
     warning = HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc).warning
     assert said in warning
     assert bool(said) == bool(warning)
@@ -215,7 +215,7 @@ def test_a_stray_hit_draws_no_warning(ppc, tmp_path: Path, outside: int, said: s
 
 def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
     places = [[10, 0, 20], *([10, 0, -20 - i] for i in range(10))]
-    hits = Hits.of(places, np.ones(11), range(12))
+    hits = Hits.of(places, np.full(11, 100.0), range(12))
     with pytest.raises(CpunetError, match=r"10 of 11 \(90.9%\) hits lie outside ppc .* move"):
         HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc)
 

@@ -15,7 +15,7 @@ from cpunet.jobs.simulation import hit_sources
 from cpunet.jobs.simulation.hit_sources import HitFile, Window
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import hit_parts, read_hits
-from cpunet.simulation.hit_readers.remage import parts_of
+from cpunet.simulation.hit_readers.tables import parts_of, table_of
 from cpunet.simulation.hits import Hits
 
 N = 53
@@ -54,7 +54,7 @@ def require_same(a: Hits, b: Hits) -> None:
 def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
     numbers = np.repeat(np.arange(N), 3)[:N] if repeated else 10 * np.arange(N)[::-1]
     file = write(tmp_path / "stp.lh5", numbers)
-    monkeypatch.setattr("cpunet.simulation.hit_readers.remage.ROWS", size)
+    monkeypatch.setattr("cpunet.simulation.hit_readers.tables.ROWS", size)
     monkeypatch.setattr(parts_of, "__defaults__", (size,))
     parts = hit_parts(file)
     for _ in range(2):  # as often as one likes
@@ -86,7 +86,7 @@ def test_event_numbers_that_are_text(tmp_path):
 def test_rows_of_an_event_that_lie_apart_are_read_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(parts_of, "__defaults__", (5,))
     file = write(tmp_path / "stp.lh5", np.r_[np.arange(N - 1), 0])
-    assert parts_of(file, None) is None
+    assert parts_of(file, table_of(file, None)) is None
     (whole,) = hit_parts(file)()
     require_same(whole, read_hits(file).hits)
 

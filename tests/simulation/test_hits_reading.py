@@ -72,7 +72,7 @@ def test_geant4_csv_needs_units(reference_data: Path) -> None:
     with pytest.raises(CpunetError, match="column X names no unit; give length_unit"):
         read_hits(path)
     hits = read_hits(path, length_unit="mm", energy_unit="keV").hits
-    assert (hits.n_events, len(hits.edep_kev)) == (120, 1411)
+    assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
     assert hits.event_number[0] == 2
     assert 2500 < hits.energy_kev.max() < 2615
 
@@ -97,10 +97,10 @@ def test_g4simple_detector_and_columns_are_checked(tmp_path: Path) -> None:
         read_hits(g4simple_file(tmp_path))
     with pytest.raises(CpunetError, match="no detector 3; it holds 1, 2"):
         read_hits(g4simple_file(tmp_path), detector="3")
-    with pytest.raises(CpunetError, match="no step-wise column Edep"):
+    with pytest.raises(CpunetError, match="has columns for event, x, y, z, edep"):
         read_hits(g4simple_file(tmp_path, Edep=None))
     with pytest.raises(CpunetError, match="differ in length"):
-        read_hits(g4simple_file(tmp_path, x=np.zeros(3)))
+        read_hits(g4simple_file(tmp_path, x=np.zeros(3)), detector="1")
 
 
 def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
@@ -109,9 +109,10 @@ def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
     read = read_hits(plain)
     np.testing.assert_allclose(read.hits.energy_kev, [1000, 500])
     assert read.steps_without_energy == 1
-    named = ["event", "Edep [eV]", "x [cm]", "y [cm]", "z [m]"]
+    named = ["event", "Edep [GeV]", "x [cm]", "y [cm]", "z [m]"]
+    rows = ["3,0.001,10,20,30", "5,0.0005,1,2,3"]
     hits = read_hits(csv_file(tmp_path, named, rows)).hits
-    np.testing.assert_allclose(hits.energy_kev, [1e-3, 5e-4])
+    np.testing.assert_allclose(hits.energy_kev, [1000, 500])
     np.testing.assert_allclose(hits.position_mm[0], [100, 200, 30_000])
 
 
@@ -138,7 +139,7 @@ def test_transform_to_the_crystal(tmp_path: Path) -> None:
     [
         (["event", "x", "y", "z"], ["1,2,3,4"], "no column for edep"),
         (["event", "Edep", "x", "y", "z"], ["1,2,3,4,5", "1,2"], "is it cut off"),
-        (["event", "Edep", "x", "y", "z"], ["1,2,3"], "3 numbers a line for 5 columns"),
+        (["event", "Edep", "x", "y", "z"], ["1,2,3"], "3 values a line for 5 columns"),
         (["event", "Edep", "x", "y", "z"], [], "holds no steps"),
         (["event", "Edep", "x", "y", "z"], ["8,-2,3,4,5"], "event 8: a step"),
         (["event", "Edep", "x", "y", "z"], ["8,nan,3,4,5"], "event 8: a step"),

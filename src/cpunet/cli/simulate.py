@@ -65,6 +65,14 @@ LengthUnit = Annotated[
 EnergyUnit = Annotated[
     str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
 ]
+TimeWindowUs = Annotated[
+    float,
+    typer.Option(
+        help="Hits of an event number that come later than this are another event.",
+        rich_help_panel=HITS,
+        callback=options.within(0, 1e12),
+    ),
+]
 Events = Annotated[
     str | None,
     typer.Option(
@@ -187,6 +195,7 @@ class HitFrame:
     flip_z: FlipZ = False
     length_unit: LengthUnit = None
     energy_unit: EnergyUnit = None
+    time_window_us: TimeWindowUs = 10.0
 
     def file(self, hits: Path, windows: Sequence[Window] = ()) -> HitFile:
         """The file, of which only events in `windows` are wanted if there are any."""
@@ -196,7 +205,14 @@ class HitFrame:
         x, y, z = parse_numbers("0,0,0" if self.origin is None else self.origin, 3, "--origin")
         transform = Transform((x, y, z), self.flip_z)
         units = self.length_unit, self.energy_unit
-        return HitFile(hits, self.hits_detector, transform, *units, tuple(windows))
+        return HitFile(
+            hits,
+            self.hits_detector,
+            transform,
+            *units,
+            tuple(windows),
+            time_window_us=self.time_window_us,
+        )
 
 
 @options.grouped

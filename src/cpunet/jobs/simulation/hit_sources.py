@@ -17,7 +17,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_readers import Transform, hit_parts
+from cpunet.simulation.hit_readers import TIME_WINDOW_US, Transform, hit_parts
 from cpunet.simulation.hit_readers.steps import require_some
 from cpunet.simulation.hits import Hits
 
@@ -94,6 +94,7 @@ class HitFile:
     energy_unit: str | None = None
     windows: tuple[Window, ...] = ()
     placed: bool = False
+    time_window_us: float = TIME_WINDOW_US
 
     def open(self, detector: Detector) -> OpenHits:
         """Read the file.
@@ -110,6 +111,7 @@ class HitFile:
             transform=self.transform,
             length_unit=self.length_unit,
             energy_unit=self.energy_unit,
+            time_window_us=self.time_window_us,
         )
 
         def chosen() -> Iterator[Hits]:
@@ -136,6 +138,7 @@ class HitFile:
             "table": self.table,
             "origin_mm": list(self.transform.origin_mm),
             "flip_z": self.transform.flip_z,
+            "time_window_us": self.time_window_us,
             "windows_kev": _by_name(self.windows),
         }
 

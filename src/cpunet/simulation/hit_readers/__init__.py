@@ -1,6 +1,7 @@
-"""Readers of hits: remage LH5, Geant4 and g4simple CSV and HDF5, NPZ."""
+"""Readers of hits: remage LH5, CSV and HDF5 of Geant4 and g4simple, NPZ."""
 
 from cpunet.simulation.hit_readers.reading import (
+    TIME_WINDOW_US,
     hit_detectors,
     hit_parts,
     holds_hits,
@@ -8,4 +9,12 @@ from cpunet.simulation.hit_readers.reading import (
 )
 from cpunet.simulation.hit_readers.steps import ReadHits, Transform
 
-__all__ = ["ReadHits", "Transform", "hit_detectors", "hit_parts", "holds_hits", "read_hits"]
+__all__ = [
+    "TIME_WINDOW_US",
+    "ReadHits",
+    "Transform",
+    "hit_detectors",
+    "hit_parts",
+    "holds_hits",
+    "read_hits",
+]

@@ -66,6 +66,6 @@ def read_hit_table(path: Path, units: Units) -> Steps:
         raise CpunetError(
             f"{path}: {TABLE} has no hit of event {events[without][0]}; simulate it again"
         )
-    position = [values[a] * units.to_mm(path, f"{TABLE}/{a}", named[a]) for a in _AXES]
-    energy = values["edep"] * units.to_kev(path, f"{TABLE}/edep", named["edep"])
+    position = [values[a] * units.factor(a, path, f"{TABLE}/{a}", named[a]) for a in _AXES]
+    energy = values["edep"] * units.factor("edep", path, f"{TABLE}/edep", named["edep"])
     return Steps(number, np.stack(position, axis=1), energy)

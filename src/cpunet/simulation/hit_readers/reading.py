@@ -7,24 +7,32 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.simulation.hit_readers.csv_ntuple import read_csv
-from cpunet.simulation.hit_readers.g4simple import NTUPLE, read_g4simple
+from cpunet.simulation.hit_readers.csv_ntuple import csv_detectors, read_csv
 from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
-from cpunet.simulation.hit_readers.remage import detectors_of, parts_of, read_remage
 from cpunet.simulation.hit_readers.steps import (
     ReadHits,
     Steps,
     Transform,
     Units,
+    require_physics,
     require_some,
     to_hits,
     whole_numbers,
+)
+from cpunet.simulation.hit_readers.tables import (
+    NTUPLES,
+    STEPS,
+    detectors_of,
+    holds_tables,
+    largest_number,
+    parts_of,
+    read_table,
+    table_of,
 )
 from cpunet.simulation.hits import Hits
 
@@ -32,6 +40,8 @@ _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
 _AS_IN_THE_FILE = Transform()
+# The interval after which charge is another event: that of remage
+TIME_WINDOW_US = 10.0
 _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")  # arrays of an NPZ
 
 
@@ -42,40 +52,48 @@ def read_hits(
     transform: Transform = _AS_IN_THE_FILE,
     length_unit: str | None = None,
     energy_unit: str | None = None,
+    time_window_us: float = TIME_WINDOW_US,
 ) -> ReadHits:
     """Read the energy deposits of one detector.
 
     Formats: the hits stored with simulated pulses (``geds/hits``), remage LH5 (``stp``
-    tables; the origin in ``detector_origins`` is subtracted), g4simple HDF5 and CSV
-    ntuples (Geant4 units, MeV and mm), other Geant4 CSV ntuples, and NPZ with ``x_mm``,
-    ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``.
+    tables; the origin in ``detector_origins`` is subtracted), HDF5 and CSV ntuples of
+    g4simple (MeV and mm), remage and other programs with Geant4, and NPZ with ``x_mm``,
+    ``y_mm``, ``z_mm``, ``edep_keV``, ``offsets``. Units are those of the column's attribute or
+    name (``edep_in_keV``, ``x [mm]``). Times without a unit are in ns.
+
+    Events are the deposits of a detector with one event number that follow each other within
+    `time_window_us`, so that the decays of a chain are events of their own. Where numbering
+    starts anew, as in joined jobs, so do events. If a number comes back it is replaced by one
+    above the largest.
 
     Parameters
     ----------
     path
         Path of the file.
     detector
-        Detector to read: the name of the table in remage files, the number of the volume in
-        g4simple files, the number of the detector in other CSV files. Not needed if there is
-        only one.
+        Detector to read, one of `hit_detectors`: the name of the table, or the number or name
+        in the column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). Not
+        needed if there is only one.
     transform
         Transformation from the frame of the file to that of the crystal (z = 0 at the point
         contact).
     length_unit, energy_unit
         Units of columns that name none. An unknown or missing unit is an error.
+    time_window_us
+        Longest interval in us between deposits of an event; that of remage by default.
 
     Raises
     ------
     CpunetError
         If the file cannot be read, has an unknown format, lacks a column, a unit or the
-        detector, or contains no energy deposit.
+        detector, contains no energy deposit, or has energies of another unit.
     """
-    return _whole(Path(path), detector, Units(length_unit, energy_unit), transform)
-
-
-def _whole(path: Path, detector: str | None, units: Units, transform: Transform) -> ReadHits:
-    found = to_hits(path, _steps(path, detector, units), transform)
-    require_some(path, found.hits.n_events)
+    file = Path(path)
+    steps = _steps(file, detector, Units(length_unit, energy_unit))
+    found = to_hits(file, steps, transform, time_window_us)
+    require_some(file, found.hits.n_events)
+    require_physics(file, found.hits.energy_kev)
     return found
 
 
@@ -86,11 +104,12 @@ def hit_parts(
     transform: Transform = _AS_IN_THE_FILE,
     length_unit: str | None = None,
     energy_unit: str | None = None,
+    time_window_us: float = TIME_WINDOW_US,
 ) -> Callable[[], Iterator[Hits]]:
     """Like `read_hits`, but in parts if possible, so that memory does not grow with the file.
 
-    Tables of remage are read in parts, unless the rows of an event are not adjacent. All other
-    files are read once and kept in memory.
+    Tables in HDF5 are read in parts, unless the rows of an event are not adjacent or several
+    detectors share the table. All other files are read once and kept in memory.
 
     Returns
     -------
@@ -98,15 +117,29 @@ def hit_parts(
         Returns an iterator over the parts, from the first one, each time it is called.
     """
     file = Path(path)
-    units = Units(length_unit, energy_unit)
-    parts = parts_of(file, detector) if _is_remage(file) else None
-    if parts is None or len(parts) < 2:
-        whole = _whole(file, detector, units, transform).hits
+    table = table_of(file, detector) if _has_tables(file) else None
+    parts = parts_of(file, table) if table else None
+    if table is None or parts is None or len(parts) < 2:
+        whole = read_hits(
+            file,
+            detector=detector,
+            transform=transform,
+            length_unit=length_unit,
+            energy_unit=energy_unit,
+            time_window_us=time_window_us,
+        ).hits
         return lambda: iter([whole])
+    units, largest = Units(length_unit, energy_unit), largest_number(file, table)
 
     def read() -> Iterator[Hits]:
+        free, energies = largest + 1, []
         for rows in parts:
-            yield to_hits(file, read_remage(file, detector, units, rows), transform).hits
+            steps = read_table(file, table, units, rows)
+            hits = to_hits(file, steps, transform, time_window_us, free).hits
+            free += int((hits.event_number >= free).sum())
+            energies.append(hits.energy_kev)
+            yield hits
+        require_physics(file, np.concatenate(energies))
 
     return read
 
@@ -120,7 +153,7 @@ def holds_hits(path: Path | str) -> bool:
     start = _start(file)
     if start.startswith(_HDF5_MAGIC):
         with opened(file) as content:
-            return any(isinstance(content.get(name), h5py.Group) for name in ("stp", NTUPLE))
+            return holds_tables(content)
     if start.startswith(_ZIP_MAGIC):
         with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
             return {"x_mm.npy", "offsets.npy"} <= set(archive.namelist())
@@ -129,8 +162,11 @@ def holds_hits(path: Path | str) -> bool:
 
 
 def hit_detectors(path: Path | str) -> list[str]:
-    """Names of the detectors of a remage file; empty for other formats."""
-    return detectors_of(Path(path)) if _is_remage(Path(path)) else []
+    """Names of the detectors of a file; empty if it names none."""
+    file = Path(path)
+    if _start(file) == _CSV_MAGIC:
+        return csv_detectors(file)
+    return list(detectors_of(file)) if _has_tables(file) else []
 
 
 def _start(path: Path) -> bytes:
@@ -142,13 +178,11 @@ def _start(path: Path) -> bytes:
         return b""
 
 
-def _is_remage(path: Path) -> bool:
+def _has_tables(path: Path) -> bool:
     if not _start(path).startswith(_HDF5_MAGIC):
         return False
     with opened(path) as file:
-        return isinstance(file.get("stp"), h5py.Group) and not isinstance(
-            file.get(NTUPLE), h5py.Group
-        )
+        return holds_tables(file)
 
 
 def _steps(path: Path, detector: str | None, units: Units) -> Steps:
@@ -172,17 +206,15 @@ def _steps(path: Path, detector: str | None, units: Units) -> Steps:
 
 def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
     with opened(path) as file:
-        if isinstance(file.get(NTUPLE), h5py.Group):
-            return read_g4simple(path, file[NTUPLE], detector)
-        is_remage, is_kept = isinstance(file.get("stp"), h5py.Group), TABLE in file
-    if is_remage:
-        return read_remage(path, detector, units)
+        is_kept = TABLE in file
+    if _has_tables(path):
+        return read_table(path, table_of(path, detector), units)
     if is_kept:
         _without_detectors(path, detector)
         return read_hit_table(path, units)
     raise CpunetError(
-        f"{path}: HDF5 without hits; expected stp (remage), {TABLE} (cpunet simulate) or "
-        f"{NTUPLE} (g4simple)"
+        f"{path}: HDF5 without hits; expected {STEPS} (remage), {TABLE} (cpunet simulate) or "
+        f"{NTUPLES} (Geant4, g4simple)"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.hit_readers.grouping import event_of_step
 from cpunet.simulation.hits import FARTHEST_MM, MAX_KEV, Hits
 
 FloatArray = npt.NDArray[np.float64]
@@ -17,6 +18,9 @@ FloatArray = npt.NDArray[np.float64]
 _MAX_NUMBER = 2.0**62
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
+_NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
+# the largest deposit of any source is above the first, the median event below the second
+_LEAST_KEV, _MOST_KEV = 5.0, 1e5
 
 
 @dataclass(frozen=True)
@@ -45,22 +49,54 @@ class Units:
     length: str | None = None
     energy: str | None = None
 
-    def to_mm(self, path: Path, column: str, named: str | None) -> float:
-        """Conversion factor from the unit of a column to mm."""
-        return _factor(path, column, named or self.length, _MM, "length_unit")
+    def factor(self, role: str, path: Path, column: str, named: str) -> float:
+        """Conversion factor of a column with the unit `named` to keV, ns or mm.
 
-    def to_kev(self, path: Path, column: str, named: str | None) -> float:
-        """Conversion factor from the unit of a column to keV."""
-        return _factor(path, column, named or self.energy, _KEV, "energy_unit")
+        `role` is ``"edep"``, ``"time"`` or an axis. Times without a unit are in ns, Geant4's
+        own.
+
+        Raises
+        ------
+        CpunetError
+            If the unit is unknown, or nobody tells it.
+        """
+        given, known, option = {
+            "edep": (self.energy, _KEV, "energy_unit"),
+            "time": ("ns", _NS, ""),
+        }.get(role, (self.length, _MM, "length_unit"))
+        unit = named or given
+        if unit is None:
+            raise CpunetError(
+                f"{path}: column {column} names no unit; give {option} "
+                f"(--{option.replace('_', '-')}): {', '.join(known)}"
+            )
+        if unit not in known:
+            raise CpunetError(
+                f"{path}: column {column} is in {unit!r}; expected one of {', '.join(known)}"
+            )
+        return known[unit]
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps relative to the detector's origin in the frame of a file; events in any order."""
+    """Steps relative to the detector's origin in the frame of a file; events in any order.
+
+    `time_ns` is None where the file tells no times.
+    """
 
     event: npt.NDArray[np.int64]
     position_mm: FloatArray
     edep_kev: FloatArray
+    time_ns: FloatArray | None = None
+
+    def __getitem__(self, kept: npt.NDArray[np.bool_]) -> Steps:
+        """Steps that are `kept`."""
+        time = None if self.time_ns is None else self.time_ns[kept]
+        return Steps(self.event[kept], self.position_mm[kept], self.edep_kev[kept], time)
+
+    def moved(self, by_mm: FloatArray) -> Steps:
+        """Steps at positions shifted by a vector."""
+        return replace(self, position_mm=self.position_mm + by_mm)
 
 
 @dataclass(frozen=True)
@@ -71,45 +107,76 @@ class ReadHits:
     steps_without_energy: int
 
 
-def to_hits(path: Path, steps: Steps, transform: Transform) -> ReadHits:
-    """Group steps by event, in the order of the file, in the frame of the crystal.
+def to_hits(
+    path: Path,
+    steps: Steps,
+    transform: Transform,
+    window_us: float,
+    first_free: int | None = None,
+) -> ReadHits:
+    """Group steps by event (see `event_of_step`), in the order of the file.
+
+    Positions are moved to the frame of the crystal. An event whose number an earlier one has
+    gets a new one: `first_free` and those after it, by default from the largest on.
 
     Raises
     ------
     CpunetError
-        If a step has no finite position or energy, or a negative energy.
+        If a step has no finite position, time or energy, or a negative energy.
     """
     # written so that NaN fails
     placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
     bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MAX_KEV))
+    if steps.time_ns is not None:
+        bad |= ~np.isfinite(steps.time_ns)
     if bad.any():
         event = steps.event[np.argmax(bad)]
         raise CpunetError(
-            f"{path}: event {event}: a step has no finite position or no energy of at least 0 "
-            f"(nor may it lie {FARTHEST_MM / 1e6:g} km away or have {MAX_KEV / 1e9:g} TeV); "
-            "remove the event or simulate again"
+            f"{path}: event {event}: a step has no finite position or time, or no energy of at "
+            f"least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
+            f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
         )
-    kept = steps.edep_kev > 0
-    numbers, first, label = np.unique(steps.event[kept], return_index=True, return_inverse=True)
+    if first_free is None:
+        first_free = int(steps.event.max(initial=-1)) + 1
+    with_energy = steps.edep_kev > 0
+    kept = steps[with_energy]
+    found = event_of_step(kept.event, kept.time_ns, window_us)
+    _, first, label = np.unique(found, return_index=True, return_inverse=True)
     in_file = np.argsort(first)
     rank = np.empty_like(in_file)
     rank[in_file] = np.arange(len(in_file))
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(rank[label], kind="stable")
-    counts = np.bincount(rank[label], minlength=len(numbers))
+    counts = np.bincount(rank[label], minlength=len(first))
+    numbers = kept.event[first[in_file]]
+    again = np.ones(len(numbers), bool)
+    again[np.unique(numbers, return_index=True)[1]] = False
+    numbers[again] = first_free + np.arange(again.sum())
     hits = Hits.of(
-        transform.apply(steps.position_mm[kept][order]),
-        steps.edep_kev[kept][order],
+        transform.apply(kept.position_mm[order]),
+        kept.edep_kev[order],
         np.concatenate([[0], np.cumsum(counts)]),
-        numbers[in_file],
+        numbers,
     )
-    return ReadHits(hits, int((~kept).sum()))
+    return ReadHits(hits, int((~with_energy).sum()))
 
 
 def require_some(path: Path, n_events: int) -> None:
     """Raise a `CpunetError` if there is no event with a deposit."""
     if not n_events:
         raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
+
+
+def require_physics(path: Path, energy_kev: FloatArray) -> None:
+    """Raise a `CpunetError` if the energies of events are those of another unit."""
+    if len(energy_kev) and not (
+        energy_kev.max() >= _LEAST_KEV and np.median(energy_kev) <= _MOST_KEV
+    ):
+        raise CpunetError(
+            f"{path}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
+            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
+            "give energy_unit (--energy-unit) if it names none"
+        )
 
 
 def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -127,18 +194,3 @@ def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArra
     if not fit:
         raise CpunetError(f"{path}: {name} holds what is no whole number; write it again")
     return values.astype(np.int64)
-
-
-def _factor(
-    path: Path, column: str, unit: str | None, known: dict[str, float], option: str
-) -> float:
-    if unit is None:
-        raise CpunetError(
-            f"{path}: column {column} names no unit; give {option} "
-            f"(--{option.replace('_', '-')}): {', '.join(known)}"
-        )
-    if unit not in known:
-        raise CpunetError(
-            f"{path}: column {column} is in {unit!r}; expected one of {', '.join(known)}"
-        )
-    return known[unit]
