@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,15 @@ from cpunet.errors import CpunetError
 from cpunet.settings import Set, checked, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_crystal import LONGEST_MM, impurity_values
-from cpunet.simulation.legend_metadata import crystal_and_slice, why_missing
+from cpunet.simulation.legend_metadata import (
+    LIQUID_ARGON_K,
+    crystal_and_slice,
+    why_missing,
+)
 from cpunet.simulation.legend_metadata import detector_values as legend_values
 from cpunet.simulation.siggen_config import detector_values as siggen_values
+
+log = logging.getLogger(__name__)
 
 _FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
@@ -39,9 +46,10 @@ def read_detector(
         `Detector`, a LEGEND diode (YAML or JSON with a ``geometry``), or, with any other
         suffix, a siggen or fieldgen configuration.
     overrides
-        Values as ``"bias_V=3500"``. They also supply fields that a file lacks, such as
-        ``temperature_K`` of LEGEND diodes. ``"impurity_scale=depletion"`` (or in the file)
-        scales the impurities so that the detector depletes at its ``measured_depletion_V``.
+        Values as ``"bias_V=3500"``. They also supply fields that a file lacks. LEGEND diodes,
+        which tell no ``temperature_K``, are at that of liquid argon unless it is given.
+        ``"impurity_scale=depletion"`` (or in the file) scales the impurities so that the
+        detector depletes at its ``measured_depletion_V``.
     crystal
         LEGEND file of the crystal from which a diode was cut, with its impurities. By
         default ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``.
@@ -63,14 +71,18 @@ def read_detector(
         values = read_values(path, _FOLDER)
     else:
         values = siggen_values(read_text(path, _FOLDER), name)
+    given = key_values(overrides)
     if "geometry" in values:
         values, hints = _legend(values, Path(path), crystal)
+        if "temperature_K" not in given:
+            values["temperature_K"] = LIQUID_ARGON_K
+            log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
     elif crystal is not None:
         raise CpunetError(
             f"{name}: only LEGEND metadata take their impurities from another file; leave out "
             "`crystal`"
         )
-    values = {"name": Path(name).stem} | values | key_values(overrides)
+    values = {"name": Path(name).stem} | values | given
     by_depletion = values.get("impurity_scale") == "depletion"
     if by_depletion:
         del values["impurity_scale"]

@@ -54,6 +54,15 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
+# shapes of `geometry.extra`, and what they do to the crystal unless they are neutral
+_EXTRA = {
+    "crack": "cuts off a side; only axially symmetric crystals are simulated",
+    "topgroove": "is not simulated",
+    "top_cylinder": "is not simulated",
+    "bottom_cylinder": "is not simulated",
+}
+# of the argon around LEGEND's detectors
+LIQUID_ARGON_K = 87.0
 _NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
 _SIMULATED = ("icpc", "bege", "ppc")
 # closer points determine no slope
@@ -67,9 +76,7 @@ _IMPCC = (
 
 def why_missing(field: str) -> str:
     """Reason why a diode does not give a field of `Detector`; empty for optional fields."""
-    if field in _MEASURED:
-        return f"neither {' nor '.join(_MEASURED[field])} is above 0"
-    return "LEGEND diodes do not tell it" if field == "temperature_K" else ""
+    return f"neither {' nor '.join(_MEASURED[field])} is above 0" if field in _MEASURED else ""
 
 
 def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -84,7 +91,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     ------
     CpunetError
         If the geometry has an unknown key (for example, one without its unit), lacks one, or
-        is not axially symmetric.
+        has an ``extra`` shape that changes the crystal.
     """
     kind = diode.get("type")
     if kind is not None and kind not in _SIMULATED:
@@ -97,12 +104,15 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     for key in _REQUIRED:
         if key not in geometry:
             raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
+    _refuse_extra(diode["geometry"], name)
     values: dict[str, Any] = {"name": str(diode["name"])} if "name" in diode else {}
     for key, value in geometry.items():
+        if key.partition(".")[0] == "extra":
+            continue
         if key not in _GEOMETRY:
             raise CpunetError(
-                f"detector {name}: unknown key geometry.{key} (units belong to the key, "
-                "and only axially symmetric shapes are simulated); correct or remove it"
+                f"detector {name}: unknown key geometry.{key} (units belong to the key); "
+                "correct or remove it"
             )
         if field := _GEOMETRY[key]:
             values[field] = value
@@ -120,6 +130,32 @@ def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
     """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
     diode_name = str(diode.get("name", name))
     return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
+
+
+def _refuse_extra(geometry: Mapping[str, Any], name: str) -> None:
+    """Refuse the shapes of ``geometry.extra``, but for those that change nothing."""
+    shapes = geometry.get("extra") or {}
+    for shape in shapes:
+        if shape not in _EXTRA:
+            raise CpunetError(
+                f"detector {name}: geometry.extra.{shape} is an unknown shape; remove it"
+            )
+        radius, height, transition, depth, width = (
+            _at(shapes, f"{shape}.{size}_in_mm")
+            for size in ("radius", "height", "transition", "depth", "width")
+        )
+        as_crystal = radius == geometry["radius_in_mm"]
+        neutral = {
+            "crack": width == 0,
+            "topgroove": depth == 0 or radius == (_at(geometry, "borehole.radius_in_mm") or 0),
+            "top_cylinder": height == 0 or as_crystal,
+            "bottom_cylinder": (height == 0 and not transition) or as_crystal,
+        }
+        if not neutral[shape]:
+            raise CpunetError(
+                f"detector {name}: geometry.extra.{shape} {_EXTRA[shape]}; remove it to "
+                "simulate the crystal without it"
+            )
 
 
 def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:

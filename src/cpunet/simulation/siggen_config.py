@@ -1,11 +1,19 @@
-"""Configuration files of siggen and fieldgen: lines with a key and a number."""
+"""Configuration files of siggen and fieldgen: lines with a key and a number.
+
+They are read as siggen does: a key stands at the beginning of its line (others are
+comments), the last line of a key counts, a ``_diam`` is twice the ``_radius``, and sizes that do
+not fit in each other are cut.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
 from cpunet.errors import CpunetError
+
+log = logging.getLogger(__name__)
 
 _FIELDS = {
     "xtal_length": "crystal_length",
@@ -14,7 +22,6 @@ _FIELDS = {
     "bottom_bullet_radius": "bottom_bullet_radius",
     "pc_length": "point_contact_length",
     "pc_radius": "point_contact_radius",
-    "taper_length": "bottom_taper_length",
     "bottom_taper_length": "bottom_taper_length",
     "wrap_around_radius": "wrap_around_radius",
     "ditch_depth": "ditch_depth",
@@ -40,6 +47,9 @@ _FIELDS = {
 }
 # alternative or neutral values, evaluated below
 _DERIVED = ("hole_length_gap", "outer_taper_width", "inner_taper_width", "bulletize_PC")
+# of siggen's version in three dimensions
+_OFFSETS = ("pc_offset_", "hole_offset_")
+_LEAST_POWER = 0.1
 # settings of the drift, and names of the program's files
 _NOT_OF_THE_DETECTOR = (
     "drift_name",
@@ -67,7 +77,7 @@ def detector_values(text: str, name: str) -> dict[str, Any]:
     Raises
     ------
     CpunetError
-        If a key is unknown or has no number.
+        If a key is unknown or has no number, or an offset makes the detector asymmetric.
 
     Examples
     --------
@@ -76,33 +86,66 @@ def detector_values(text: str, name: str) -> dict[str, Any]:
     """
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#")[0].split()
-        if not words or words[0] in _NOT_OF_THE_DETECTOR:
+        if not line.strip() or line[0] in " \t#" or line.split()[0] in _NOT_OF_THE_DETECTOR:
             continue
-        if words[0] not in _FIELDS and words[0] not in _DERIVED:
+        words = line.split("#")[0].split()
+        key = words[0].replace("_diam", "_radius")
+        key = "bottom_taper_length" if key == "taper_length" else key
+        if key not in (*_FIELDS, *_DERIVED) and not key.startswith(_OFFSETS):
             raise CpunetError(
                 f"detector {name}: line {number}: unknown key {words[0]}; "
                 "neither siggen nor fieldgen has it"
             )
         try:
-            values[words[0]] = float(words[1])
+            values[key] = float(words[1]) / (2 if key != words[0] else 1)
         except (IndexError, ValueError) as error:
             raise CpunetError(
                 f"detector {name}: line {number}: {words[0]} has no number; give one"
             ) from error
-    fields = {_FIELDS[key]: value for key, value in values.items() if key in _FIELDS}
+        if key.startswith(_OFFSETS) and values.pop(key):
+            raise CpunetError(
+                f"detector {name}: line {number}: {key} is not 0; only axially symmetric "
+                "detectors are simulated"
+            )
+        if key == "hole_length_gap":
+            values["hole_length"] = values.get("xtal_length", math.nan) - values[key]
     if values.get("bulletize_PC"):
         raise CpunetError(
             f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
         )
-    if "hole_length_gap" in values and "hole_length" not in values:
-        length = values.get("xtal_length", math.nan)
-        fields["bore_length"] = length - values["hole_length_gap"]
-    for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
-        width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
-        if width and length and "taper_angle" not in values:
-            fields[angle] = math.degrees(math.atan(width / length))
+    _cut(values, name)
+    fields = {_FIELDS[key]: value for key, value in values.items() if key in _FIELDS}
+    # widths count only without an angle
+    if not values.get("taper_angle"):
+        for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
+            width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
+            if length:
+                fields[angle] = math.degrees(math.atan(width / length))
     # siggen keeps the radius and the rounding of a hole that does not exist
     if not fields.get("bore_length"):
         fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}
+    # without a power, fieldgen has no radial terms
+    if not values.get("impurity_rpower", 0.0) > _LEAST_POWER:
+        fields = {k: v for k, v in fields.items() if not k.startswith("impurity_radial")}
     return fields
+
+
+def _cut(values: dict[str, float], name: str) -> None:
+    """Cut sizes that do not fit in each other, as siggen does, with a word."""
+    around, ditch = values.get("wrap_around_radius", 0.0), values.get("ditch_thickness", 0.0)
+    most = {
+        "hole_bullet_radius": ("hole_radius", values.get("hole_radius", math.inf)),
+        "inner_taper_length": ("hole_length", values.get("hole_length", math.inf)),
+    }
+    if around and ditch and values.get("ditch_depth"):
+        inside = around - ditch
+        most["pc_radius"] = ("wrap_around_radius - ditch_thickness", inside)
+        if values.get("pc_radius") == 0:
+            values["pc_radius"] = inside
+    for key, (limit, size) in most.items():
+        if values.get(key, 0.0) > size:
+            log.info(f"detector {name}: {key} is {size:g} mm, as in siggen: at most {limit}")
+            values[key] = size
+    flat = values.get("xtal_radius", math.inf) - values.get("bottom_taper_length", 0.0)
+    if around >= flat and not values.get("ditch_depth"):
+        values["wrap_around_radius"] = 0.0  # no wrap-around: lithium ends at the wall
