@@ -31,6 +31,7 @@ __all__ = [
     "Translation",
     "__version__",
     "calibrate",
+    "check",
     "import_weights",
     "info",
     "load",
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
     from cpunet.simulation.hits import HitOptions
+    from cpunet.training.check import check
     from cpunet.training.published import import_weights
     from cpunet.training.run import Run
     from cpunet.training.train import train
@@ -72,6 +74,7 @@ _HOMES = {
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
     "simulation.hits": ("HitOptions",),
+    "training.check": ("check",),
     "training.published": ("import_weights",),
     "training.run": ("Run",),
     "training.train": ("train",),

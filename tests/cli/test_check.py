@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cpunet
+from cpunet.errors import CpunetError
 from cpunet.jobs.validation.validate import validate_run
+from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 
 N = 240
@@ -81,6 +84,19 @@ def test_sides_that_fit(sides, check):
     assert picture.read_bytes().startswith(b"\x89PNG")
     again = check(sides.write_sim(), sides.write_data(), "--out", picture)
     assert "exists" in again.err.splitlines()[-1]
+
+
+def test_pulses_in_memory_and_a_result_that_draws(sides):
+    sim, data = open_pulses(sides.write_sim()).read(), sides.write_data()
+    found = cpunet.check(sim, data)
+    assert found.ok
+    assert str(found).startswith("ok     every 16 ns")
+    assert repr(found).startswith("<CheckResult: ")
+    assert len(found.plot().axes) == 4
+    wrong = cpunet.check(data, data, peak="300-400")
+    assert not wrong.ok
+    with pytest.raises(CpunetError, match="no pulses of both sides"):
+        wrong.plot()
 
 
 def test_another_peak(sides, check):

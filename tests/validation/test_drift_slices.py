@@ -9,6 +9,7 @@ import pytest
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.validation.drift_slices import (
     Slices,
     slice_edges,
@@ -16,7 +17,6 @@ from cpunet.validation.drift_slices import (
     slice_table,
     sliced,
 )
-from cpunet.validation.paired import align_half_maximum
 from cpunet.validation.slice_figure import slice_figure
 from synthetic import require_drawn
 

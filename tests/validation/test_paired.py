@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.validation import paired
-from cpunet.validation.paired import align_half_maximum
 from synthetic import paired_scores
 
 TIME = np.arange(800.0)

@@ -7,14 +7,14 @@ import pytest
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.validation.paired import align_half_maximum
+from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.training.sides_figure import sides_figure
 from cpunet.validation.pulse_figures import (
     DataPulse,
     nearest,
     single_pulse_figure,
     spectrum_figure,
 )
-from cpunet.validation.sides_figure import sides_figure
 from synthetic import require_drawn
 
 DT, ALIGN = 16.0, 300

@@ -11,13 +11,13 @@ from scipy.special import ndtr
 from cpunet.errors import CpunetError
 from cpunet.plotting import SPARE_COLOURS, colours, label
 from cpunet.pulses.binning import data_axis
+from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.recipes import load_recipe
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
 from cpunet.validation.mean_pulse import MeanPulse
-from cpunet.validation.paired import align_half_maximum
 from synthetic import require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})

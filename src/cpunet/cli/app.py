@@ -24,6 +24,10 @@ _SHORT = {"settings": "set", "settings_file": "settings"}
 
 # Where the function of a command is, and what it does.
 COMMANDS = {
+    "check": (
+        "cpunet.training.check:check",
+        "Say whether simulated and measured pulses can be compared, and what to do if not.",
+    ),
     "import": (
         "cpunet.training.published:import_weights",
         "Make a run of the weights that the authors published.",

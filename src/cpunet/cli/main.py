@@ -14,7 +14,6 @@ from cpunet.cli.app import app as commands
 from cpunet.cli.app import run
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
-from cpunet.cli.check import check
 from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
@@ -66,7 +65,6 @@ for command in (
     demo,
     simulate,
     stand,
-    check,
     calibrate,
     tune,
     validate,

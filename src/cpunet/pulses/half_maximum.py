@@ -8,12 +8,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.errors import CpunetError
 from cpunet.pulses import _half_maximum_kernels as kernels
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
 BISECTIONS = 30  # of one sample: a precision of 1e-9
+BLOCK = 512  # pulses per block: bounds memory
 PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
 
@@ -70,3 +72,68 @@ def last_below_half(
     below &= np.arange(length) < top[:, np.newaxis]
     last = length - 1 - below[:, ::-1].argmax(axis=1)
     return finite & (height > 0) & below.any(axis=1), last
+
+
+def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
+    """Shift each pulse so that it crosses half of its maximum at sample `n_before`.
+
+    The crossing is the last upward one before the maximum, searched backward from it.
+    Its time and the shifted pulse are evaluated with the pulse's cubic spline; linear
+    interpolation would smooth the edge.  The maximum is the largest sample of the pulse.
+    Noise of relative RMS s on a flat top raises it by 2–3 s, and the level by 1–1.5 s.
+
+    Parameters
+    ----------
+    waveforms
+        Pulses of shape ``(n, length)`` with the baseline at 0.
+    n_before, n_after
+        Number of samples before the crossing, and from it on.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape ``(n, n_before + n_after)``; NaN outside the record, and all NaN
+        for a pulse without such a crossing or with a value that is not finite.
+
+    Raises
+    ------
+    CpunetError
+        If `waveforms` is not of shape (pulses, samples), or a pulse has fewer than 2 samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> time = np.arange(100)
+    >>> pulses = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40.3, 51.8)])
+    >>> align_half_maximum(pulses, 2, 3).round(3)
+    array([[0.339, 0.417, 0.5  , 0.583, 0.661],
+           [0.339, 0.417, 0.5  , 0.583, 0.661]], dtype=float32)
+    """
+    require_pulses(waveforms)
+    aligned = np.empty((len(waveforms), n_before + n_after), np.float32)
+    for first in range(0, len(waveforms), BLOCK):
+        rows = slice(first, first + BLOCK)
+        aligned[rows] = aligned_block(waveforms[rows], n_before, n_after)
+    return aligned
+
+
+def require_pulses(waveforms: FloatArray) -> None:
+    """Raise a `CpunetError` unless an array has the shape (pulses, samples)."""
+    if waveforms.ndim != 2 or waveforms.shape[1] < 2:
+        raise CpunetError(
+            f"waveforms have shape {waveforms.shape}; "
+            "expected (pulses, samples) with 2 samples or more"
+        )
+
+
+def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
+    """One block of `align_half_maximum`, in float64."""
+    moved = np.full((len(waveforms), n_before + n_after), np.nan)
+    usable, before = last_below_half(waveforms)
+    if usable.any():
+        pulses = waveforms[usable]
+        splines = Splines(pulses)
+        level = 0.5 * pulses.max(axis=1).astype(float)
+        times = splines.crossing(before[usable], level)
+        moved[usable] = splines.shifted(times, n_before, n_after)
+    return moved

@@ -8,15 +8,18 @@ equally), and current amplitudes (a readout only makes pulses slower).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.pulses.channels import ALL, Pair, paired
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import (
     InputSet,
@@ -28,9 +31,13 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Rejection
-from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.pulses.spectrum import line_near
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_N, FEW = 200, 1000  # pulses per side needed for a fit, and for a precise one
 # Ratios beyond which the detectors differ by more than a calibration can correct
@@ -43,6 +50,7 @@ LOOKED_AT = 2000  # maximum number of pulses per side for shapes
 RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
 OFF_LINE = 1.5  # keV, maximum deviation of a line
 DPI = 150
+MARKS = {"fine": "ok", "warning": "look", "error": "stop"}
 
 
 class Level(StrEnum):
@@ -55,7 +63,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check.
+    """Something that was checked.
 
     Parameters
     ----------
@@ -67,93 +75,189 @@ class Finding:
         What was found.
     remedy
         What to do; empty if nothing is to be done.
+    channel
+        Channel of the data, of several.
     """
 
     what: str
     level: Level
     text: str
     remedy: str = ""
+    channel: str = ""
 
     def __str__(self) -> str:
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
 
 @dataclass(frozen=True, eq=False)
-class Checked:
-    """Findings, and the prepared pulses of both sides if these could be read."""
+class CheckResult:
+    """Findings on two sets of pulses.
+
+    Parameters
+    ----------
+    findings
+        What was found, in order.
+    sides
+        Prepared pulses of ``"sim"`` and ``"data"``; none if they cannot be read, or are of
+        several channels.
+    """
 
     findings: list[Finding]
     sides: dict[str, InputSet] = field(default_factory=dict)
 
-    @classmethod
-    def refused(cls, side: str, error: CpunetError) -> Checked:
-        """The finding that one side, ``"sim"`` or ``"data"``, cannot be read."""
-        return cls([_refusal(f"{side} pulses", error)])
-
     @property
-    def level(self) -> Level:
-        """Level of the worst finding."""
-        levels = {finding.level for finding in self.findings}
-        return max(levels, key=list(Level).index, default=Level.FINE)
+    def ok(self) -> bool:
+        """Whether nothing must be changed before a training."""
+        return all(finding.level != Level.ERROR for finding in self.findings)
+
+    def plot(self) -> Figure:
+        """Pulses of both sides, and the distributions of two parameters.
+
+        Raises
+        ------
+        CpunetError
+            If the pulses of a side could not be read, or there are several channels.
+        """
+        from cpunet.training.sides_figure import sides_figure
+
+        if not self.sides:
+            raise CpunetError("there are no pulses of both sides to draw")
+        names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
+        sides = {name: self.sides[side] for name, side in names.items()}
+        return sides_figure(
+            {name: _of_height_one(one) for name, one in sides.items()},
+            {
+                "Time from 10 to 50 % [ns]": {n: _rise_ns(one) for n, one in sides.items()},
+                "Current amplitude [1/sample]": {
+                    n: _amplitudes(one) for n, one in sides.items()
+                },
+            },
+            self.sides["data"].dt_ns,
+            {name: len(one.prepared) for name, one in sides.items()},
+        )
+
+    def save(self, path: str | Path, force: bool = False) -> None:
+        """Draw the pulses of both sides into a file, see `plot`.
+
+        Raises
+        ------
+        CpunetError
+            If the file exists and `force` is off, or has an unknown format.
+        """
+        picture = Path(path)
+        _require_picture(picture)
+        refuse_existing(picture, force=force)
+        figure = self.plot()
+        with written_aside(picture) as aside:
+            figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=DPI)
+
+    def __str__(self) -> str:
+        lines, channel = [], ""
+        for finding in self.findings:
+            if finding.channel != channel:
+                channel = finding.channel
+                lines.append(f"{channel}:")
+            lines.append(f"{MARKS[finding.level]:<7}{finding}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        counts = Counter(MARKS[finding.level] for finding in self.findings)
+        told = ", ".join(f"{n} {mark}" for mark, n in counts.items())
+        return f"<{type(self).__name__}: {told}>"
 
 
-def check(sim: PulseFile, data: PulseFile, recipe: Recipe, peak: str) -> Checked:
-    """Read both sides as in a training, and check them.
+def check(
+    sim: Source,
+    data: Source,
+    *,
+    recipe: str | Path | Recipe = "fast",
+    settings: Sequence[str] | Mapping[str, Any] = (),
+    peak: str = "FEP",
+    read: ReadOptions = ReadOptions(),
+    out: str | Path | None = None,
+    force: bool = False,
+) -> CheckResult:
+    """Say whether simulated and measured pulses can be compared, and what to do if not.
+
+    Ends with status 1 if something must be changed before a training.
 
     Parameters
     ----------
-    sim, data
-        Simulated and measured pulses.
+    sim
+        Simulated pulses.
+    data
+        Measured pulses.
     recipe
-        Recipe with preparation and cuts.
+        ``fast``, ``cpunet``, ``paper``, or a YAML file.
+    settings
+        Override a value of the recipe, as ``preparation.length=600`` (repeatable).
     peak
-        Energies, as for a training.
+        Energies to train on: FEP, SEP, DEP or a range in keV, as ``300-``, or several.
+    read
+        How the files are read, if they do not tell themselves.
+    out
+        Picture to make: pulses of both sides; for all channels, with the name of each.
+    force
+        Replace existing output.
+
+    Returns
+    -------
+    CheckResult
+        What was found.
 
     Raises
     ------
     CpunetError
-        If `peak` cannot be understood.
+        If `peak` or the recipe cannot be understood, or `out` cannot be written.
+
+    Examples
+    --------
+    ``cpunet check --sim sim.lh5 --data raw.lh5 --out check.png``
+
+    ``cpunet check --sim sim.lh5 --data raw.lh5 --data-table all``
     """
+    both = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    picture = None if out is None else Path(out)
+    chosen, alone = load_recipe(recipe, settings), both[1].table != ALL
+    if picture is not None:
+        _require_picture(picture)
+        refuse_existing(picture, *both[0].files, *both[1].files, force=force or not alone)
+    if alone:
+        result = _checked(both, chosen, peak)
+        if picture is not None and result.sides:
+            result.save(picture, force)
+        return result
+    findings = []
+    for name, pair in paired(*both).items():
+        one = _checked(pair, chosen, peak)
+        findings += [replace(finding, channel=name) for finding in one.findings]
+        if picture is not None and one.sides:
+            one.save(picture.with_stem(f"{picture.stem}-{name}"), force)
+    return CheckResult(findings)
+
+
+def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
+    """Read both sides as in a training, and compare them."""
+    if isinstance(pair, CpunetError):
+        return CheckResult([_refusal("sim pulses", pair)])
     selection = parse_selection(peak, recipe.peaks)
     findings: list[Finding] = []
     sets: dict[str, InputSet] = {}
-    for side, load, file in (("sim", load_simulated, sim), ("data", load_measured, data)):
+    for side, load, file in zip(
+        ("sim", "data"), (load_simulated, load_measured), pair, strict=True
+    ):
         try:
             sets[side] = load(file, recipe, selection, tell=False)
         except CpunetError as error:
             findings.append(_refusal(f"{side} pulses", error))
     if len(sets) < 2:
-        return Checked(findings)
-    findings += compare_sides(sets["sim"], sets["data"], selection)
-    return Checked(findings, sets)
+        return CheckResult(findings)
+    return CheckResult([*findings, *compare_sides(sets["sim"], sets["data"], selection)], sets)
 
 
-def draw(checked: Checked, picture: Path, *, force: bool = False) -> None:
-    """Draw the pulses of both sides.
-
-    Raises
-    ------
-    CpunetError
-        If the picture exists or has an unknown format.
-    """
-    from cpunet.validation.sides_figure import sides_figure
-
+def _require_picture(picture: Path) -> None:
     if picture.suffix.lower() not in PICTURE_FORMATS:
         raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
-    refuse_existing(picture, force=force)
-    names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
-    sides = {name: checked.sides[side] for name, side in names.items()}
-    figure = sides_figure(
-        {name: _of_height_one(one) for name, one in sides.items()},
-        {
-            "Time from 10 to 50 % [ns]": {n: _rise_ns(one) for n, one in sides.items()},
-            "Current amplitude [1/sample]": {n: _amplitudes(one) for n, one in sides.items()},
-        },
-        checked.sides["data"].dt_ns,
-        {name: len(one.prepared) for name, one in sides.items()},
-    )
-    with written_aside(picture) as aside:
-        figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=DPI)
 
 
 def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[Finding]:
@@ -197,7 +301,7 @@ def _count(one: InputSet, side: str) -> Finding:
     if n >= FEW:
         return Finding("counts", Level.FINE, text)
     level = Level.ERROR if n < MIN_N else Level.WARNING
-    remedy = f"{FEW} or more are better: more files, or more energies (--peak)"
+    remedy = f"{FEW} or more are better: more files, or more energies (`peak`)"
     return Finding("counts", level, text, remedy)
 
 
@@ -205,7 +309,7 @@ REMEDIES = {
     Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
     Rejection.WINDOW_OUTSIDE_RECORD: (
         "the traces end too soon before or after the pulse; write longer ones, or allow more "
-        "padding (--set preparation.max_padding_before=…, max_padding_after)"
+        "padding (preparation.max_padding_before, max_padding_after in `settings`)"
     ),
     Rejection.TAIL_SLOPE: "tails differ: pile-up, or remains of earlier pulses",
     Rejection.BASELINE: "baselines differ: remains of earlier pulses (cpunet info tells them)",
@@ -248,7 +352,7 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
                 "calibration",
                 Level.WARNING,
                 f"{text}, {off:+.1f} keV from where it should be",
-                f"energies times {factor:.5f}, as by --kev-per-adc, would put it right",
+                f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right",
             )
 
 

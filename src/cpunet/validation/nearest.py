@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.pulses.container import FloatArray
-from cpunet.validation.paired import BLOCK, Values, align_half_maximum
+from cpunet.pulses.half_maximum import BLOCK, Values, align_half_maximum
 
 Indices = npt.NDArray[np.int64]
 

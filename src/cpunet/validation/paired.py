@@ -14,11 +14,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.half_maximum import Splines, last_below_half
+from cpunet.pulses.half_maximum import BLOCK, aligned_block, require_pulses
 
 Values = npt.NDArray[np.float64]
-
-BLOCK = 512  # pulses per block: bounds memory
 
 
 class PairedScores(TypedDict):
@@ -27,49 +25,6 @@ class PairedScores(TypedDict):
     rmse: float
     edge_rmse: float
     unaligned: int
-
-
-def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
-    """Shift each pulse so that it crosses half of its maximum at sample `n_before`.
-
-    The crossing is the last upward one before the maximum, searched backward from it.
-    Its time and the shifted pulse are evaluated with the pulse's cubic spline; linear
-    interpolation would smooth the edge.  The maximum is the largest sample of the pulse.
-    Noise of relative RMS s on a flat top raises it by 2–3 s, and the level by 1–1.5 s.
-
-    Parameters
-    ----------
-    waveforms
-        Pulses of shape ``(n, length)`` with the baseline at 0.
-    n_before, n_after
-        Number of samples before the crossing, and from it on.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32, shape ``(n, n_before + n_after)``; NaN outside the record, and all NaN
-        for a pulse without such a crossing or with a value that is not finite.
-
-    Raises
-    ------
-    CpunetError
-        If `waveforms` is not of shape (pulses, samples), or a pulse has fewer than 2 samples.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> time = np.arange(100)
-    >>> pulses = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40.3, 51.8)])
-    >>> align_half_maximum(pulses, 2, 3).round(3)
-    array([[0.339, 0.417, 0.5  , 0.583, 0.661],
-           [0.339, 0.417, 0.5  , 0.583, 0.661]], dtype=float32)
-    """
-    _check_shape(waveforms)
-    aligned = np.empty((len(waveforms), n_before + n_after), np.float32)
-    for first in range(0, len(waveforms), BLOCK):
-        rows = slice(first, first + BLOCK)
-        aligned[rows] = _aligned(waveforms[rows], n_before, n_after)
-    return aligned
 
 
 def pair_squares(
@@ -98,9 +53,9 @@ def pair_squares(
     CpunetError
         If the numbers of pulses differ, or the arrays do not have the shape of pulses.
     """
-    _check_shape(truth)
+    require_pulses(truth)
     for translated in methods.values():
-        _check_shape(translated)
+        require_pulses(translated)
         if len(translated) != len(truth):
             raise CpunetError(
                 f"{len(translated)} translated pulses cannot be paired with {len(truth)} true "
@@ -113,8 +68,8 @@ def pair_squares(
         for method, translated in methods.items():
             half = max(truth.shape[1], translated.shape[1])
             if half not in aligned:
-                aligned[half] = _aligned(truth[rows], half, half)
-            difference = _aligned(translated[rows], half, half)
+                aligned[half] = aligned_block(truth[rows], half, half)
+            difference = aligned_block(translated[rows], half, half)
             difference -= aligned[half]
             edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
             found[method][rows, :2] = _squares(difference)
@@ -153,27 +108,6 @@ def scores_of_squares(squares: Values) -> PairedScores:
         "edge_rmse": _root_mean(total[2:]),
         "unaligned": int((squares[:, 1] == 0).sum()),
     }
-
-
-def _check_shape(waveforms: FloatArray) -> None:
-    if waveforms.ndim != 2 or waveforms.shape[1] < 2:
-        raise CpunetError(
-            f"waveforms have shape {waveforms.shape}; "
-            "expected (pulses, samples) with 2 samples or more"
-        )
-
-
-def _aligned(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
-    """One block of `align_half_maximum`, in float64."""
-    moved = np.full((len(waveforms), n_before + n_after), np.nan)
-    usable, before = last_below_half(waveforms)
-    if usable.any():
-        pulses = waveforms[usable]
-        splines = Splines(pulses)
-        level = 0.5 * pulses.max(axis=1).astype(float)
-        times = splines.crossing(before[usable], level)
-        moved[usable] = splines.shifted(times, n_before, n_after)
-    return moved
 
 
 def _squares(difference: Values) -> Values:

@@ -18,8 +18,8 @@ from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, w
 from cpunet.errors import CpunetError
 from cpunet.plotting import DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.validation.nearest import nearest_pulses
-from cpunet.validation.paired import align_half_maximum
 
 Values = npt.NDArray[np.float64]
 

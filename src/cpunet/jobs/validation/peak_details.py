@@ -10,6 +10,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.plotting import NO_NOISE
+from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import Values
 from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
 from cpunet.validation.drift_slices import (
@@ -19,7 +20,6 @@ from cpunet.validation.drift_slices import (
     sliced,
 )
 from cpunet.validation.mean_pulse import MeanPulse
-from cpunet.validation.paired import align_half_maximum
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150

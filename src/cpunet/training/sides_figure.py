@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.plotting import COLOURS, DATA_FILL, label, styled
-from cpunet.validation.paired import align_half_maximum
+from cpunet.pulses.half_maximum import align_half_maximum
 
 Values = npt.NDArray[np.floating]
 
