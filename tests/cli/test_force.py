@@ -21,7 +21,6 @@ COMMANDS = {
         ("--detector icpc --hits D/link.lh5", "D/hits.lh5"),
         ("--detector D/my.yaml --events FEP=1", "D/my.yaml"),
         (f"{GAMMAS} --settings D/my.yaml", "D/my.yaml"),
-        (f"{GAMMAS} --crystal D/my.yaml", "D/my.yaml"),
     ],
     "stand": [
         ("--preset D/my.yaml", "D"),
