@@ -27,13 +27,13 @@ from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
 from cpunet.electronics.measured_noise import measured_noise
-from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.training.pulse_sets import PulseSets
 
 

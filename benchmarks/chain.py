@@ -24,9 +24,10 @@ import numpy as np
 from lgdo import Array, Table, VectorOfVectors
 from streaming import write_fast_run
 
-from cpunet.jobs.simulation.hit_sources import GammaSource, energy_windows
 from cpunet.recipes import load_recipe
+from cpunet.simulation.energy_windows import energy_windows
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
-from cpunet.jobs.simulation.hit_sources import GammaSource, Window
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift

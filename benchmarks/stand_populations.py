@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.chain import read_electronics
-from cpunet.jobs.simulation.hit_sources import Window
 from cpunet.jobs.simulation.stand_plan import Side, StandPlan
 from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
 
 FEP = Window("FEP", 2609.511, 2619.511)

@@ -38,6 +38,16 @@ order in which data flow.
 
 ::: cpunet.calibrate
 
+::: cpunet.simulate
+
+::: cpunet.Simulation
+
+::: cpunet.info
+
+::: cpunet.load
+
+::: cpunet.subtract_tails
+
 ::: cpunet.Run
 
 ::: cpunet.Translation
@@ -49,6 +59,16 @@ order in which data flow.
 ::: cpunet.PulseFile
 
 ::: cpunet.HitFile
+
+::: cpunet.Adc
+
+::: cpunet.import_weights
+
+::: cpunet.FileOptions
+
+::: cpunet.HitOptions
+
+::: cpunet.ReadOptions
 
 ::: cpunet.CpunetError
 

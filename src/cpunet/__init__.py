@@ -28,6 +28,7 @@ __all__ = [
     "ReadOptions",
     "Report",
     "Run",
+    "Simulation",
     "Translation",
     "__version__",
     "calibrate",
@@ -36,6 +37,7 @@ __all__ = [
     "info",
     "load",
     "open_pulses",
+    "simulate",
     "subtract_tails",
     "train",
     "translate",
@@ -48,11 +50,12 @@ if TYPE_CHECKING:
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
-    from cpunet.jobs.simulation.hit_sources import HitFile
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
+    from cpunet.simulation.hit_sources import HitFile
     from cpunet.simulation.hits import HitOptions
+    from cpunet.simulation.simulate import Simulation, simulate
     from cpunet.training.check import check
     from cpunet.training.published import import_weights
     from cpunet.training.run import Run
@@ -76,6 +79,7 @@ _HOMES = {
     "simulation.hits": ("HitOptions",),
     "training.check": ("check",),
     "training.published": ("import_weights",),
+    "simulation.simulate": ("Simulation", "simulate"),
     "training.run": ("Run",),
     "training.train": ("train",),
     "translation.options": ("Adc",),

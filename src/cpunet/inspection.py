@@ -217,9 +217,8 @@ def _look(
     if holds_hits(path):
         from cpunet.simulation.hit_description import describe_hits, hits_in_words
 
-        if isinstance(crystal, str | Path):
-            crystal = read_detector(crystal)
-        hits = describe_hits(Path(path), frame, recipe.peaks, crystal)
+        inside = None if crystal is None else read_detector(crystal)
+        hits = describe_hits(Path(path), frame, recipe.peaks, inside)
         return InfoResult(str(path), hits_in_words(hits), hits)
     return _file(pulse_file(path, read), recipe)
 

@@ -30,9 +30,9 @@ PLAIN = (
 def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
     """A small stand; made by the package's own job, in this process."""
     from cpunet.electronics.chain import Electronics, read_electronics
-    from cpunet.jobs.simulation.hit_sources import energy_windows
     from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe
+    from cpunet.simulation.energy_windows import energy_windows
     from cpunet.simulation.shifted import Shift
 
     make_stand(

@@ -21,9 +21,7 @@ COMMANDS = {
         ("--detector icpc --hits D/link.lh5", "D/hits.lh5"),
         ("--detector D/my.yaml --events FEP=1", "D/my.yaml"),
         (f"{GAMMAS} --settings D/my.yaml", "D/my.yaml"),
-        (f"{GAMMAS} --crystal D/my.yaml", "D/my.yaml"),
     ],
-    "fields": [("D/my.yaml", "D/my.yaml"), ("icpc --crystal D/my.yaml", "D/my.yaml")],
     "stand": [
         ("--preset D/my.yaml", "D"),
         ("--preset ornl --detector D/my.yaml", "D"),
@@ -85,7 +83,6 @@ COMMANDS = {
     "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
     "import": [("--ren D/fep_REN.pt", "D")],
 }
-OUT = {"info": "--without-remains"}  # in place of --out
 CASES = [
     pytest.param(name, words, out, id=f"{name} {words} {out}")
     for name, cases in COMMANDS.items()
@@ -152,8 +149,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize(("name", "words", "out"), CASES)
 def test_no_input_is_replaced(command, home, name, words, out):
     before = contents(home)
-    option = OUT.get(name, "--out")
-    outcome = command(*name.split(), *words.split(), option, out, "--force")
+    outcome = command(*name.split(), *words.split(), "--out", out, "--force")
     assert outcome.code == 2
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err

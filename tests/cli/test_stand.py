@@ -97,7 +97,7 @@ def test_it_is_replaced_with_force_only(command, made: Path):
         (("--preset", "ornl", "--events", "FEP=0"), "FEP=0: give at least 1 event"),
         (("--preset", "ornl", "--hum", "50"), "--hum 50: expected HZ=KEV"),
         (("--preset", "ornl", "--wander", "500=x"), "--wander 500=x: expected US=KEV"),
-        (("--preset", "ornl", "--events", "FEP"), "expected FEP=N"),
+        (("--preset", "ornl", "--events", "FEP"), "is no number of events"),
         (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
         (("--preset", "orln"), "legend200, ornl, ringing"),
         (("--preset", "ornl", "--shift", "bias_V=1"), "give --kind shifted"),

@@ -16,19 +16,20 @@ import pytest
 from cpunet.electronics.chain import read_electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation import stand_plan
-from cpunet.jobs.simulation.hit_sources import GammaSource, OpenHits, Window
 from cpunet.jobs.simulation.stand import make_stand, write_stand
 from cpunet.jobs.simulation.stand_plan import StandPlan
-from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.again import SameHits
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import GammaSource, OpenHits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
+from cpunet.simulation.stored_simulation import StoredSimulation
 
 # a small crystal: its library is built in a second
 DETECTOR = read_detector(

@@ -11,11 +11,12 @@ import pytest
 from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation import hit_sources
-from cpunet.jobs.simulation.hit_sources import HitFile, Window
+from cpunet.simulation import hit_sources
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import hit_parts, read_hits
 from cpunet.simulation.hit_readers.tables import parts_of, table_of
+from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.hits import Hits
 
 N = 53
@@ -113,7 +114,7 @@ def test_what_is_wrong_is_told_of_parts_too(tmp_path, monkeypatch):
     monkeypatch.setattr(parts_of, "__defaults__", (5,))
     detector = read_detector("icpc")
     file = write(tmp_path / "stp.lh5", np.arange(N))
-    with pytest.raises(CpunetError, match="no event in none; widen --window-kev"):
+    with pytest.raises(CpunetError, match="no event in none; widen window_kev"):
         HitFile(file, windows=(Window("none", 1e6, 2e6),)).open(detector)
     with pytest.raises(CpunetError, match=r"all \d+ hits lie outside .* z 1020 to 1030 mm"):
         HitFile(file, transform=hit_sources.Transform((0.0, 0.0, -1000.0))).open(detector)

@@ -65,5 +65,5 @@ rule fields:
         detector=lambda w: DETECTORS[w.detector]["simulate"]["detector"],
         options=lambda w: options(set=DETECTORS[w.detector]["simulate"].get("set")),
     shell:
-        "cpunet fields {params.options} --out {output:q} --force {params.detector:q}"
+        "cpunet info {params.detector:q} {params.options} --out {output:q} --force"
         " > {log:q} 2>&1"

@@ -16,13 +16,13 @@ from cpunet.errors import CpunetError
 from cpunet.html_pages import part
 from cpunet.jobs.calibration.calibrate import CALIBRATION, DETECTOR, SETTINGS, SIM, Calibration
 from cpunet.jobs.calibration.calibration_inputs import Freedom, Start
-from cpunet.jobs.simulation.hit_sources import HitFile
 from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run
 from cpunet.validation.calibration_figures import calibration_figures

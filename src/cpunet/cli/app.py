@@ -33,6 +33,10 @@ COMMANDS = {
         "Make a run of the weights that the authors published.",
     ),
     "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "simulate": (
+        "cpunet.simulation.simulate:simulate",
+        "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
+    ),
     "train": (
         "cpunet.training.train:train",
         "Train REN and IREN on simulated and measured pulses, unpaired.",
@@ -48,7 +52,8 @@ def _option(name: str) -> str:
     return _SHORT.get(name) or default_name_transform(name)
 
 
-def _with_options(text: str) -> str:
+def with_options(text: str) -> str:
+    """A text in which parameters in backticks are the options that they are."""
     return re.sub(r"`([a-z_]+)`", lambda name: f"--{_option(name[1])}", text)
 
 
@@ -85,7 +90,7 @@ def run(words: Sequence[str]) -> int:
         command = " ".join(["cpunet", *(error.command_chain or ())])
         raise CpunetError(told, f"see {command} --help") from error
     except CpunetError as error:
-        raise CpunetError(_with_options(str(error))) from error
+        raise CpunetError(with_options(str(error))) from error
     if result is not None:
-        tell(_with_options(str(result)))
+        tell(with_options(str(result)))
     return 0 if getattr(result, "ok", True) else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,12 +10,13 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import tell
-from cpunet.cli.simulate import HitFrame
+from cpunet.cli.values import parse_numbers
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
 if TYPE_CHECKING:
     from cpunet.jobs.calibration.calibration_inputs import Start
+    from cpunet.simulation.hit_sources import HitFile
 
 PHYSICS, HITS = "What is free", "Simulation"
 
@@ -105,6 +107,51 @@ Events = Annotated[
         help="Simulated events, at most, that are drifted again and again.",
     ),
 ]
+
+HitTable = Annotated[
+    str | None,
+    typer.Option(
+        "--hits-detector", help="Which of the file's detectors.", rich_help_panel=HITS
+    ),
+]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        help="X,Y,Z in mm: the point contact's centre in the file's frame.",
+        rich_help_panel=HITS,
+    ),
+]
+FlipZ = Annotated[
+    bool,
+    typer.Option("--flip-z", help="The file's point contact is on top.", rich_help_panel=HITS),
+]
+LengthUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+EnergyUnit = Annotated[
+    str | None, typer.Option(help="If the file names none.", rich_help_panel=HITS)
+]
+
+
+@dataclass(frozen=True)
+class HitFrame:
+    """How a file of hits is read."""
+
+    hits_detector: HitTable = None
+    origin: Origin = None
+    flip_z: FlipZ = False
+    length_unit: LengthUnit = None
+    energy_unit: EnergyUnit = None
+
+    def file(self, hits: Path) -> HitFile:
+        """The file."""
+        from cpunet.simulation.hit_readers import Transform
+        from cpunet.simulation.hit_sources import HitFile
+
+        x, y, z = parse_numbers("0,0,0" if self.origin is None else self.origin, 3, "--origin")
+        transform = Transform((x, y, z), self.flip_z)
+        units = self.length_unit, self.energy_unit
+        return HitFile(hits, self.hits_detector, transform, *units)
 
 
 @options.grouped

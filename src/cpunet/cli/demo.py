@@ -11,7 +11,6 @@ from cpunet.cli import options
 from cpunet.cli.messages import tell
 from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import Kind, KindOption, Preset
-from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
 
 EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
@@ -60,16 +59,18 @@ def demo(
     from cpunet.jobs.demo import demonstrate
     from cpunet.jobs.demo_parts import PARTS
     from cpunet.recipes import load_recipe
+    from cpunet.simulation.energy_windows import wanted_events
     from cpunet.simulation.geometry_readers import read_detector
 
     for part in PARTS:
         refuse_inputs(out_folder / part, preset, detector, recipe)
-    names, numbers = wanted_events(events or (FEW if quick else EVENTS))
+    loaded = load_recipe(recipe, set_values or ())
+    wanted = wanted_events(events or (FEW if quick else EVENTS), loaded.peaks, 0.5)
     metrics = demonstrate(
         read_electronics(preset),
         read_detector(detector),
-        load_recipe(recipe, set_values or ()),
-        dict(zip(names, numbers, strict=True)),
+        loaded,
+        {window.name: number for window, number in wanted.items()},
         out_folder,
         kind=kind.value,
         seed=seed,

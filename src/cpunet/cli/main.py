@@ -11,7 +11,7 @@ import typer
 
 import cpunet
 from cpunet.cli.app import app as commands
-from cpunet.cli.app import run
+from cpunet.cli.app import run, with_options
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
 from cpunet.cli.compare import compare
@@ -21,7 +21,6 @@ from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
-from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
@@ -63,7 +62,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 
 for command in (
     demo,
-    simulate,
     stand,
     calibrate,
     tune,
@@ -82,7 +80,7 @@ def main() -> None:
     end = words.index("--") if "--" in words else len(words)  # then names only
     debug = DEBUG in words[:end]  # known wherever it stands, also before anything is imported
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
-    with messages_to_stderr():
+    with messages_to_stderr(with_options):
         try:
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, stop)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -31,8 +31,12 @@ def fail(message: str) -> None:
 class _Lines(logging.Formatter):
     """One line for each record, which begins with its level if that is a warning or more."""
 
+    def __init__(self, worded: Callable[[str], str]) -> None:
+        super().__init__()
+        self.worded = worded
+
     def format(self, record: logging.LogRecord) -> str:
-        line = _one_line(super().format(record))
+        line = self.worded(_one_line(super().format(record)))
         if record.levelno < logging.WARNING:
             return line
         level = f"{record.levelname.lower()}:"
@@ -40,10 +44,10 @@ class _Lines(logging.Formatter):
 
 
 @contextmanager
-def messages_to_stderr() -> Iterator[None]:
-    """Print records of this package within the context, from level INFO up."""
+def messages_to_stderr(worded: Callable[[str], str] = str) -> Iterator[None]:
+    """Print records of this package within the context, from level INFO up, as `worded`."""
     logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Lines())
+    handler.setFormatter(_Lines(worded))
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

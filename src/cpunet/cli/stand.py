@@ -11,7 +11,6 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import tell
-from cpunet.cli.values import wanted_events
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 
@@ -110,16 +109,16 @@ def stand(
     Example: cpunet stand --preset ornl --kind shifted --shift bias_V=20 --out stand2
     """
     from cpunet.electronics.chain import read_electronics
-    from cpunet.jobs.simulation.hit_sources import energy_windows
     from cpunet.jobs.simulation.stand import make_stand
     from cpunet.recipes import load_recipe
     from cpunet.settings import read_settings
+    from cpunet.simulation.energy_windows import wanted_events
     from cpunet.simulation.geometry_readers import read_detector
     from cpunet.simulation.settings import SimulationSettings, split_overrides
     from cpunet.simulation.shifted import Shift
 
     refuse_inputs(out_folder, preset, detector, crystal, settings_file, *(shift or ()))
-    names, numbers = wanted_events(events)
+    wanted = wanted_events(events, load_recipe("fast").peaks, window_kev)
     overrides, values = split_overrides(set_values or ())
     electronics = read_electronics(preset).disturbed(
         rate_khz, pile_up_khz, wanted_hum(hum), wanted_wander(wander)
@@ -127,8 +126,8 @@ def stand(
     summary = make_stand(
         electronics,
         read_detector(detector, overrides, crystal),
-        tuple(energy_windows(",".join(names), load_recipe("fast").peaks, window_kev)),
-        numbers,
+        tuple(wanted),
+        tuple(wanted.values()),
         out_folder,
         kind=kind.value,
         shift=Shift.of(shift) if shift else None,

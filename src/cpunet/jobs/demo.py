@@ -8,7 +8,6 @@ from typing import Any
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
-from cpunet.jobs.simulation.hit_sources import energy_windows
 from cpunet.jobs.simulation.stand import write_stand
 from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
 from cpunet.jobs.validation.evaluation import ValidateOptions
@@ -16,6 +15,7 @@ from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
+from cpunet.simulation.energy_windows import energy_windows
 from cpunet.simulation.geometry import Detector
 from cpunet.training.train import train
 

@@ -35,7 +35,7 @@ def detector_names() -> list[str]:
 
 
 def read_detector(
-    path: str | Path, overrides: Set = (), crystal: str | Path | None = None
+    path: str | Path | Detector, overrides: Set = (), crystal: str | Path | None = None
 ) -> Detector:
     """Read a detector and apply overrides.
 
@@ -44,7 +44,7 @@ def read_detector(
     path
         Name of a preset (see `detector_names`), a YAML or JSON file with the fields of
         `Detector`, a LEGEND diode (YAML or JSON with a ``geometry``), or, with any other
-        suffix, a siggen or fieldgen configuration.
+        suffix, a siggen or fieldgen configuration. Or a detector, for overrides.
     overrides
         Values as ``"bias_V=3500"``. They also supply fields that a file lacks. LEGEND diodes,
         which tell no ``temperature_K``, are at that of liquid argon unless it is given.
@@ -65,13 +65,17 @@ def read_detector(
     >>> detector.crystal_length, detector.bias_V
     (96.0, 3500.0)
     """
+    given = key_values(overrides)
+    if isinstance(path, Detector):
+        if not given:
+            return path
+        return _completed(path.model_dump(), given, path.name, {})
     name = str(path)
     hints: _Hints = {}
     if name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
         values = read_values(path, _FOLDER)
     else:
         values = siggen_values(read_text(path, _FOLDER), name)
-    given = key_values(overrides)
     if "geometry" in values:
         values, hints = _legend(values, Path(path), crystal)
         if "temperature_K" not in given:
@@ -82,7 +86,14 @@ def read_detector(
             f"{name}: only LEGEND metadata take their impurities from another file; leave out "
             "`crystal`"
         )
-    values = {"name": Path(name).stem} | values | given
+    return _completed({"name": Path(name).stem} | values, given, name, hints)
+
+
+def _completed(
+    values: dict[str, Any], given: dict[str, Any], name: str, hints: _Hints
+) -> Detector:
+    """The detector of some values, overridden by those given; see `read_detector`."""
+    values = values | given
     by_depletion = values.get("impurity_scale") == "depletion"
     if by_depletion:
         del values["impurity_scale"]

@@ -34,6 +34,8 @@ class HitOptions:
         Unit of lengths, if the file names none: mm, cm, m or um.
     energy_unit
         Unit of energies, if the file names none: keV, MeV, eV or GeV.
+    time_window_us
+        Hits of an event number that come later than this are another event.
     """
 
     hits_detector: str | None = None
@@ -41,6 +43,7 @@ class HitOptions:
     flip_z: bool = False
     length_unit: str | None = None
     energy_unit: str | None = None
+    time_window_us: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)

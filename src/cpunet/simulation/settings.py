@@ -1,4 +1,4 @@
-"""Settings of the pulse simulation: time steps, charge cloud, grid of the library."""
+"""Settings of the simulation: source, hits, time steps, charge cloud, grid of the library."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from cpunet.settings import Config, Set, key_values
+from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.velocity import VelocityFactors
 
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
@@ -51,6 +52,16 @@ class SimulationSettings(Config):
     electron_trapping_per_us, hole_trapping_per_us
         Rate of permanent trapping, the inverse of the lifetime in us. A trapped charge induces
         no further signal, which lowers the collected energy.
+    cluster_mm
+        Hits nearer than this are merged; 0 merges none. Charge repels within what is merged.
+    window_kev
+        Half-width about a peak in which events are wanted; wider ones bring the continuum with
+        them.
+    source_height_mm, source_radius_mm
+        Height above the crystal and radius of the source of gammas, a disc.
+    mode
+        ``"exact"`` drifts every hit, ``"library"`` interpolates between pulses of a grid;
+        ``"auto"`` takes the library from 200,000 hits on.
     library_grid_mm, library_halvings
         Spacing in r and z of the coarsest pre-computed pulses in mm, and the maximum number of
         times a cell is halved where the interpolation is not accurate enough.
@@ -81,6 +92,11 @@ class SimulationSettings(Config):
     hole_velocity_high_factor: _Factor = 1.0
     electron_trapping_per_us: _PerUs = 0.0
     hole_trapping_per_us: _PerUs = 0.0
+    cluster_mm: Annotated[float, Field(ge=0, le=100)] = MERGING_MM
+    window_kev: Annotated[float, Field(gt=0, le=1e4)] = 0.5
+    source_height_mm: Annotated[float, Field(gt=0, le=1e4)] = 20.0
+    source_radius_mm: Annotated[float, Field(ge=0, le=1e4)] = 5.0
+    mode: Literal["auto", "exact", "library"] = "auto"
     library_grid_mm: Annotated[float, Field(ge=0.1, le=100)] = 2.0
     library_halvings: Annotated[int, Field(ge=0, le=6)] = 4
     library_angles: Annotated[int, Field(ge=2, le=181)] = 6

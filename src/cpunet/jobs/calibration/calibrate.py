@@ -33,8 +33,6 @@ from cpunet.jobs.calibration.calibration_inputs import (
     known_depletion,
     read_sides,
 )
-from cpunet.jobs.simulation.hit_sources import HitFile
-from cpunet.jobs.simulation.simulate import simulate_file
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import FolderKind, folder_written_aside
@@ -43,7 +41,9 @@ from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import simulate
 from cpunet.training.chain import train_chain
 from cpunet.training.job import TrainingJob
 from cpunet.training.pulse_sets import PulseSets
@@ -276,12 +276,11 @@ def _simulate_calibrated(calibrated: Calibrated, sides: Sides, folder: Path, see
     parameters = calibrated.problem.parameters
     detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
     _write_physics(folder, detector, settings)
-    simulate_file(
-        detector,
-        HitFile(sides.sim_path, placed=True),
+    simulate(
         folder / SIM,
-        settings,
-        cluster_mm=0.0,
+        detector=detector,
+        hits=HitFile(sides.sim_path, placed=True),
+        settings_file=settings,
         seed=seed,
     )
     sides.forget()

@@ -12,9 +12,6 @@ import numpy as np
 
 from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.hit_sources import HitFile
-from cpunet.jobs.simulation.simulate import simulate_file
-from cpunet.jobs.simulation.stored_simulation import StoredSimulation
 from cpunet.pulses.loading import (
     InputSet,
     load_measured,
@@ -27,7 +24,10 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import simulate
+from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.superposition import solve
 
 log = logging.getLogger(__name__)
@@ -216,8 +216,13 @@ def _simulated(start: Start, path: Path, dt_ns: float) -> Path:
     """Simulate the pulses of hits with the given physics."""
     assert start.hits is not None
     assert start.detector is not None
-    settings = start.settings or SimulationSettings(dt_ns=dt_ns)
-    simulate_file(start.detector, start.hits, path, settings, cluster_mm=start.cluster_mm)
+    simulate(
+        path,
+        detector=start.detector,
+        hits=start.hits,
+        settings_file=start.settings or SimulationSettings(dt_ns=dt_ns),
+        settings={"cluster_mm": start.cluster_mm},
+    )
     return path
 
 

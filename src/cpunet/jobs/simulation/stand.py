@@ -17,7 +17,6 @@ from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.errors import CpunetError
 from cpunet.jobs.simulation.growing_archive import GrowingArchive
-from cpunet.jobs.simulation.hit_sources import Window
 from cpunet.jobs.simulation.stand_plan import (
     LABELS,
     OTHER,
@@ -31,6 +30,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.simulation.clustering import MERGING_MM
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
 from cpunet.simulation.hit_readers.hit_table import hit_columns
@@ -86,7 +86,7 @@ def make_stand(
 
     The folder contains ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
     digitiser's period; ``geds/hits``: their hits; the attribute ``simulation`` of the
-    former: detector and settings, as in files of `cpunet.jobs.simulation.simulate`),
+    former: detector and settings, as in files of `cpunet.simulation.simulate`),
     ``data.lh5`` (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the
     noise-free trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
     ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped

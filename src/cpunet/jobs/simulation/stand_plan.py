@@ -12,13 +12,14 @@ from pydantic import ValidationError
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.hit_sources import GammaSource, Window
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.clustering import MERGING_MM, merge_hits
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import TIME_WINDOW_US, Transform, hit_parts
@@ -33,58 +32,12 @@ _MAX_WORKERS = 8
 _STRAY, _MISPLACED = 1e-3, 0.9
 
 
-class Window(NamedTuple):
-    """Energies (keV) from `low_kev` to `high_kev`, both included, under a name."""
-
-    name: str
-    low_kev: float
-    high_kev: float
-
-
-def energy_windows(
-    text: str, peaks: Mapping[str, PeakConfig], half_width_kev: float
-) -> list[Window]:
-    """Windows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
-
-    Parameters
-    ----------
-    text
-        Names and ranges, separated by commas.
-    peaks
-        Known gamma lines.
-    half_width_kev
-        Half-width of the windows around the lines.
-
-    Raises
-    ------
-    CpunetError
-        If a part is neither a known line nor a range, or the half-width is not above 0.
-
-    Examples
-    --------
-    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
-    >>> [tuple(window) for window in energy_windows("FEP,1500-1580", lines, 0.5)]
-    [('FEP', 2614.0, 2615.0), ('1500-1580', 1500.0, 1580.0)]
-    """
-    if not half_width_kev > 0:
-        raise CpunetError(f"--window-kev {half_width_kev}: give a half-width above 0")
-    windows = []
-    for name in (part.strip() for part in text.split(",")):
-        chosen = parse_selection(name, peaks)
-        if chosen.chosen:
-            line = peaks[name].energy_kev
-            windows.append(Window(name, line - half_width_kev, line + half_width_kev))
-        else:
-            windows.append(Window(name, *chosen.ranges_kev[0]))
-    return windows
-
-
 @dataclass(frozen=True)
 class HitFile:
     """Hits of a file, see `cpunet.simulation.hit_readers.read_hits`.
 
     With `windows`, only events with a deposited energy in one of them are used.  `placed` hits
-    have been checked against the crystal and are not checked again.
+    are those of a simulation: they have been checked against the crystal and merged.
     """
 
     path: Path
@@ -126,7 +79,7 @@ class HitFile:
                 astray.add(hits)
         if not n_events and self.windows:
             names = ", ".join(window.name for window in self.windows)
-            raise CpunetError(f"{self.path}: no event in {names}; widen --window-kev")
+            raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
         require_some(self.path, n_events)
         warning = "" if self.placed else astray.told(self.path)
         return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
@@ -176,10 +129,10 @@ class _Astray:
         )
         if n > _MISPLACED * total:
             raise CpunetError(
-                f"{text}move them with --origin and --flip-z, or choose others with "
-                "--hits-detector"
+                f"{text}move them with `origin` and `flip_z`, or choose others with "
+                "`hits_detector`"
             )
-        return f"{text}their energy is lost; check --origin, --flip-z and --hits-detector"
+        return f"{text}their energy is lost; check `origin`, `flip_z` and `hits_detector`"
 
 
 def _regrouped(parts: Iterator[Hits], size: int) -> Iterator[Hits]:
@@ -219,7 +172,7 @@ class GammaSource:
         """
         total = sum(self.events)
         if total < 1:
-            raise CpunetError("--events: no event is wanted; give at least 1")
+            raise CpunetError("`events`: no event is wanted; give at least 1")
         return OpenHits(total, self._blocks(detector, -(-total // _ROUND_EVENTS)))
 
     def provenance(self) -> dict[str, Any]:

@@ -13,15 +13,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.hit_sources import (
-    GammaSource,
-    HitFile,
-    OpenHits,
-    Window,
-    energy_windows,
-)
 from cpunet.jobs.simulation.pulse_shape_library import write_library
-from cpunet.jobs.simulation.simulate import Resolution, simulate_file
 from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
@@ -29,11 +21,14 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
 from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.energy_windows import Window, energy_windows
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import Transform, read_hits
+from cpunet.simulation.hit_sources import GammaSource, HitFile, OpenHits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import simulate
 
 SETTINGS = SimulationSettings(length_ns=1600)
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
@@ -71,8 +66,9 @@ def gammas(**changed: object) -> GammaSource:
 
 def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     out = tmp_path / "sim.lh5"
-    source = gammas()
-    summary = simulate_file(ppc, source, out, SETTINGS, windows=source.windows)
+    events = {"FEP": 30, "SEP": 3, "DEP": 3}
+    summary = simulate(out, detector=ppc, events=events, settings_file=SETTINGS, seed=4)
+    assert summary.pulses == PulseFile(out)
     assert (summary.n_events, summary.mode) == (36, "exact")
     assert summary.n_written + summary.without_signal == 36
     assert summary.hits < summary.hits_before_merging
@@ -91,15 +87,15 @@ def test_events_do_not_depend_on_threads_but_on_the_seed(ppc, monkeypatch):
     def numbers(source: GammaSource) -> list[float]:
         return np.concatenate([b.edep_kev for b in source.open(ppc).blocks]).tolist()
 
-    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._ROUND_EVENTS", 10)
+    monkeypatch.setattr("cpunet.simulation.hit_sources._ROUND_EVENTS", 10)
     many = numbers(gammas())
-    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._MAX_WORKERS", 1)
+    monkeypatch.setattr("cpunet.simulation.hit_sources._MAX_WORKERS", 1)
     assert numbers(gammas()) == many
     assert numbers(gammas(seed=5)) != many
 
 
 def test_rounds_add_up_and_number_events_anew(ppc, monkeypatch):
-    monkeypatch.setattr("cpunet.jobs.simulation.hit_sources._ROUND_EVENTS", 10)
+    monkeypatch.setattr("cpunet.simulation.hit_sources._ROUND_EVENTS", 10)
     hits = Hits.concatenate(list(gammas().open(ppc).blocks))
     energy = np.round(hits.energy_kev - 0.011, 1)
     assert [int((energy == e).sum()) for e in (2614.5, 2103.5, 1592.5)] == [30, 3, 3]
@@ -108,7 +104,9 @@ def test_rounds_add_up_and_number_events_anew(ppc, monkeypatch):
 
 def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
-    summary = simulate_file(ppc, source, out, SETTINGS, cluster_mm=0)
+    summary = simulate(
+        out, detector=ppc, hits=source, settings_file=SETTINGS, settings={"cluster_mm": 0}
+    )
     # of the events with numbers 0 to 3 the last two leave no charge that moves
     assert (summary.n_events, summary.n_written, summary.without_signal) == (4, 2, 2)
     assert (summary.hits_outside, summary.hits_in_contacts) == (1, 2)
@@ -123,21 +121,21 @@ def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
 
 def test_kept_hits_read_back_as_they_were(ppc, source, tmp_path: Path):
     out, again = tmp_path / "sim.lh5", tmp_path / "again.lh5"
-    simulate_file(ppc, source, out, SETTINGS)
+    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS)
     kept = read_hits(out).hits
     assert np.array_equal(kept.position_mm, HITS[:2].position_mm)
     assert np.array_equal(kept.edep_kev, HITS[:2].edep_kev)
     assert np.array_equal(kept.offsets, HITS[:2].offsets)
     table = lh5.read("geds/hits", str(out))
     assert table["x"].attrs["units"] == "mm"
-    simulate_file(ppc, HitFile(out), again, SETTINGS)
+    simulate(again, detector=ppc, hits=HitFile(out), settings_file=SETTINGS)
     first, second = (next(open_pulses(path).blocks()) for path in (out, again))
     assert np.array_equal(first.waveforms, second.waveforms)
 
 
 def test_the_file_tells_how_it_was_made(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
-    simulate_file(ppc, source, out, SETTINGS, seed=11)
+    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS, seed=11)
     with h5py.File(out) as file:
         attributes = dict(file["geds/sim"].attrs)
     made = json.loads(attributes["simulation"])
@@ -149,8 +147,8 @@ def test_the_file_tells_how_it_was_made(ppc, source, tmp_path: Path):
 
 def test_resolution_changes_energies_and_nothing_else(ppc, source, tmp_path: Path):
     sharp, broad = tmp_path / "sharp.lh5", tmp_path / "broad.lh5"
-    simulate_file(ppc, source, sharp, SETTINGS)
-    simulate_file(ppc, source, broad, SETTINGS, resolution=Resolution(1.0, 0.01))
+    simulate(sharp, detector=ppc, hits=source, settings_file=SETTINGS)
+    simulate(broad, detector=ppc, hits=source, settings_file=SETTINGS, resolution=(1.0, 0.01))
     first, second = (next(open_pulses(path).blocks()) for path in (sharp, broad))
     assert np.array_equal(first.waveforms, second.waveforms)
     assert np.all(first.energy_kev != second.energy_kev)
@@ -171,19 +169,32 @@ def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
 def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
     ppc, tmp_path: Path
 ):
-    out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
-    simulate_file(ppc, gammas(events=(10, 0, 5)), out, SETTINGS, cluster_mm=0)
-    simulate_file(ppc, gammas(events=(10, 0, 5)), merged, SETTINGS, cluster_mm=0.05)
+    out, merged, few = tmp_path / "exact.lh5", tmp_path / "merged.lh5", "FEP=10,DEP=5"
+    simulate(
+        out,
+        detector=ppc,
+        events=few,
+        seed=4,
+        settings_file=SETTINGS,
+        settings={"cluster_mm": 0},
+    )
+    simulate(
+        merged,
+        detector=ppc,
+        events=few,
+        seed=4,
+        settings_file=SETTINGS,
+        settings={"cluster_mm": 0.05},
+    )
     first, second = (next(open_pulses(path).blocks()) for path in (out, merged))
     assert np.abs(first.waveforms - second.waveforms).max() < 1e-3
     assert first.energy_kev == pytest.approx(second.energy_kev)
 
 
 def test_only_events_in_the_windows_of_a_file(ppc, source, tmp_path: Path):
-    window = Window("low", 900, 1100)
-    chosen = replace(source, windows=(window,))
-    summary = simulate_file(ppc, chosen, tmp_path / "sim.lh5", SETTINGS, windows=(window,))
-    assert (summary.n_events, summary.lines) == (1, {"low": 1})
+    out = tmp_path / "sim.lh5"
+    summary = simulate(out, detector=ppc, hits=source, events="900-1100")
+    assert (summary.n_events, summary.lines) == (1, {"900-1100": 1})
     with pytest.raises(CpunetError, match="no event in none"):
         replace(source, windows=(Window("none", 1, 2),)).open(ppc)
 
@@ -195,12 +206,12 @@ def test_hits_all_outside_say_where_they_are(ppc, source):
 
 
 def test_hits_outside_are_told(ppc, source, tmp_path: Path, caplog):
-    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS)
+    simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings_file=SETTINGS)
     # one of five, at z = 300 mm
     assert caplog.messages == [
         f"{source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
         "mm); they span x 0 to 12, y 0 to 3, z 20 to 300 mm; their energy is lost; check "
-        "--origin, --flip-z and --hits-detector"
+        "`origin`, `flip_z` and `hits_detector`"
     ]
 
 
@@ -223,51 +234,53 @@ def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
 def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path, caplog):
     caplog.set_level("INFO", "cpunet")
     out = tmp_path / "sim.lh5"
-    known = ppc.model_copy(update={"measured_depletion_V": 2100.0})
-    simulate_file(known, source, out, SETTINGS, impurity_from="depletion")
+    values = {"measured_depletion_V": 2100.0, "impurity_scale": "depletion"}
+    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS, settings=values)
     made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])
     scale = made["detector"]["impurity_scale"]
-    assert (made["impurity_from"], made["depletion_V"]) == (
-        "depletion",
-        pytest.approx(2100, abs=1),
-    )
+    assert made["depletion_V"] == pytest.approx(2100, abs=1)
     assert scale > 1.05
     assert any(f"impurities times {scale:.4g}" in note for note in caplog.messages)
-    # what is kept is the detector that was simulated
-    again = tmp_path / "again.lh5"
-    simulate_file(Detector.model_validate(made["detector"]), source, again, SETTINGS)
-    first, second = (next(open_pulses(path).blocks()) for path in (out, again))
-    assert np.array_equal(first.waveforms, second.waveforms)
-    plain = json.loads(h5py.File(again)["geds/sim"].attrs["simulation"])
-    assert plain["impurity_from"] == "file"
 
 
 def test_no_event_with_a_signal(ppc, tmp_path: Path):
     dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
     with pytest.raises(CpunetError, match="none of 1 events gives a signal"):
-        simulate_file(ppc, dead, tmp_path / "sim.lh5", SETTINGS)
+        simulate(tmp_path / "sim.lh5", detector=ppc, hits=dead, settings_file=SETTINGS)
     assert not (tmp_path / "sim.lh5").exists()
 
 
-class Interrupted:
-    """Hits of two blocks, the second of which never comes."""
+def test_an_interrupted_run_leaves_nothing(ppc, tmp_path: Path, monkeypatch):
+    def blocks() -> Iterator[Hits]:
+        yield HITS
+        raise KeyboardInterrupt
 
-    def open(self, detector: Detector) -> OpenHits:
-        def blocks() -> Iterator[Hits]:
-            yield HITS
-            raise KeyboardInterrupt
-
-        return OpenHits(8, blocks())
-
-
-def test_an_interrupted_run_leaves_nothing(ppc, tmp_path: Path):
+    monkeypatch.setattr(GammaSource, "open", lambda *_: OpenHits(8, blocks()))
     with pytest.raises(KeyboardInterrupt):
-        simulate_file(ppc, Interrupted(), tmp_path / "sim.lh5", SETTINGS)
+        simulate(tmp_path / "sim.lh5", detector=ppc, events="FEP=8", settings_file=SETTINGS)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_diffusion_constant_is_kept_and_widens_the_edge(ppc, source, tmp_path: Path):
+    out = tmp_path / "sim.lh5"
+    steepest = {}
+    for constant in ("temperature", 0.12, "siggen"):
+        values = {"dt_ns": 1, "diffusion_constant": constant}
+        simulate(out, detector=ppc, hits=source, settings=values, force=True)
+        with h5py.File(out) as file:
+            made = json.loads(file["geds/sim"].attrs["simulation"])
+        assert made["settings"]["diffusion_constant"] == constant
+        steepest[constant] = np.diff(next(open_pulses(out).blocks()).waveforms).max()
+    # kT/e is 0.073 V mm/cm at 85 K; siggen counts up the cloud's duration
+    assert steepest["siggen"] < steepest[0.12] < steepest["temperature"]
+    simulate(
+        out, detector=ppc, hits=source, settings={"diffusion": False, "dt_ns": 1}, force=True
+    )
+    assert steepest["siggen"] < np.diff(next(open_pulses(out).blocks()).waveforms).max()
+
+
 def test_progress_reaches_the_number_of_events(ppc, source, tmp_path: Path, stages):
-    simulate_file(ppc, source, tmp_path / "sim.lh5", SETTINGS)
+    simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings_file=SETTINGS)
     assert stages["Simulating ppc"] == [4, 4]
 
 

@@ -1,0 +1,358 @@
+"""Simulate the pulses of hits in a detector, for the simulated side of a training."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_inputs
+from cpunet.progress import stage
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.writing import PulseWriter
+from cpunet.recipes import load_recipe
+from cpunet.settings import Set, read_settings
+from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.energy_windows import Window, energy_windows, wanted_events
+from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.gammas import with_resolution
+from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_readers import Transform
+from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hit_readers.hit_table import hit_columns
+from cpunet.simulation.hit_sources import GammaSource, HitFile, HitSource
+from cpunet.simulation.hits import HitOptions, Hits
+from cpunet.simulation.library import build_library
+from cpunet.simulation.settings import SimulationSettings, split_overrides
+
+log = logging.getLogger(__name__)
+
+# Building the library takes as long as drifting this many hits. For more hits it is faster,
+# but its pulses deviate by up to `library_tolerance`.
+LIBRARY_FROM_HITS = 200_000
+
+Resolution = tuple[float, float]
+
+
+@dataclass(repr=False)
+class Simulation:
+    """A file of simulated pulses, with counts over all of its events.
+
+    Hits are counted as merged, energies are in keV. ``lines`` counts, by window, the pulses
+    whose collected energy is still in it; ``not_collected`` the hits whose charge was not all
+    collected within the record; ``seconds`` is the time spent on each step.
+    """
+
+    path: Path
+    detector: Detector
+    settings: SimulationSettings
+    mode: str = ""
+    n_events: int = 0
+    n_written: int = 0
+    hits_before_merging: int = 0
+    hits: int = 0
+    hits_outside: int = 0
+    hits_in_contacts: int = 0
+    not_collected: int = 0
+    energy_kev: float = 0.0
+    lost_kev: float = 0.0
+    trapped_kev: float = 0.0
+    events_with_loss: int = 0
+    lines: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pulses(self) -> PulseFile:
+        """The pulses, in their file."""
+        return PulseFile(self.path)
+
+    @property
+    def without_signal(self) -> int:
+        """Number of events that were not written because none of their hits gives a signal."""
+        return self.n_events - self.n_written
+
+    def __repr__(self) -> str:
+        return f"<Simulation {self.path}: {self.n_written} pulses of {self.detector.name}>"
+
+    def __str__(self) -> str:
+        seconds = sum(self.seconds.values())
+        spent = ", ".join(f"{name} {s:.1f}" for name, s in self.seconds.items())
+        lines = ", ".join(f"{n} {name}" for name, n in self.lines.items())
+        told = [
+            f"{self.n_written} of {self.n_events} events written ({lines} by collected "
+            f"energy); {self.without_signal} without any signal",
+            f"{self.hits} hits ({self.hits_before_merging} before merging): "
+            f"{self.hits_in_contacts} in contacts and the lithium layer, "
+            f"{self.hits_outside} outside the crystal",
+            f"{self.lost_kev / self.energy_kev:.2%} of the energy lost there, in "
+            f"{self.events_with_loss} events",
+        ]
+        if self.not_collected:
+            told.append(f"{self.not_collected} hits not collected in full; raise length_ns")
+        if self.trapped_kev:
+            told.append(f"{self.trapped_kev / self.energy_kev:.2%} of the energy trapped")
+        speed = f"{self.n_events / seconds:.0f} events/s, {seconds:.1f} s"
+        told.append(f"{self.mode} pulses, {speed}: {spent}")
+        return "\n".join(f"{self.path}: {line}" for line in told)
+
+
+def simulate(
+    out: str | Path,
+    *,
+    detector: str | Path | Detector = "icpc",
+    events: str | Mapping[str, int] | None = None,
+    hits: str | Path | HitFile | None = None,
+    frame: HitOptions = HitOptions(),
+    settings: Set = (),
+    settings_file: str | Path | SimulationSettings | None = None,
+    resolution: Resolution | None = None,
+    seed: int = 0,
+    force: bool = False,
+) -> Simulation:
+    """Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.
+
+    The table ``geds/sim`` of the file holds ``waveform`` in units of the collected charge,
+    collected ``energy`` (keV), ``event_number``, ``lost_energy`` (keV, deposited where it gives
+    no signal), ``n_hits``, with trapping ``trapped_energy`` (keV, deposited elsewhere but not
+    collected), and with a resolution ``true_energy``. Its attribute ``simulation`` is the
+    provenance in JSON. ``geds/hits`` contains the hits of the pulses in the frame of the
+    crystal.
+
+    Parameters
+    ----------
+    out
+        LH5 file to write; it appears when it is complete.
+    detector
+        icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.
+    events
+        Without hits: N events of each peak, or FEP=10000,SEP=3000,1500-1580=500 (keV). With
+        them: only events in FEP,SEP,1500-1580; else all.
+    hits
+        File of hits: remage LH5, g4simple or Geant4 CSV/HDF5, NPZ, or an earlier output.
+    frame
+        How a file of hits is read.
+    settings
+        Override a value of the detector or of the settings: bias_V=3500 (repeatable).
+    settings_file
+        YAML file of settings of the simulation.
+    resolution
+        A and B: smear the energies written, FWHM² = A + B E in keV, as 0.5 0.0018.
+    seed
+        Seed of all random numbers.
+    force
+        Replace an existing file.
+
+    Raises
+    ------
+    CpunetError
+        If the file exists, the detector is not depleted, the hits cannot be used, or none
+        gives a signal.
+
+    Examples
+    --------
+    cpunet simulate --detector icpc --events FEP=10000,DEP=3000 --out sim.lh5
+
+    cpunet simulate --detector V01.yaml --hits stp.lh5 --flip-z --out sim.lh5
+    """
+    out = Path(out)
+    of_detector, of_settings = split_overrides(settings)
+    files = [f for f in (detector, settings_file) if isinstance(f, str | Path)]
+    files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
+    refuse_inputs(out, *files)
+    if isinstance(settings_file, SimulationSettings):
+        of_settings = settings_file.model_dump() | of_settings
+        settings_file = None
+    physics = read_settings(SimulationSettings, settings_file, of_settings)
+    peaks = load_recipe("fast").peaks
+    windows = tuple(energy_windows(",".join(peaks), peaks, physics.window_kev))
+    source: HitSource
+    if hits is not None:
+        source = hits if isinstance(hits, HitFile) else _hit_file(hits, frame)
+        if events is not None:
+            names = events if isinstance(events, str) else ",".join(events)
+            windows = tuple(energy_windows(names, peaks, physics.window_kev))
+            source = replace(source, windows=windows)
+    elif events is not None:
+        wanted = wanted_events(events, peaks, physics.window_kev)
+        windows = tuple(wanted)
+        height, radius = physics.source_height_mm, physics.source_radius_mm
+        source = GammaSource(windows, tuple(wanted.values()), height, radius, seed)
+    else:
+        raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
+    simulation = Simulation(out, read_detector(detector, of_detector), physics)
+    writer = PulseWriter(
+        out, attrs={"made_by": f"cpunet simulate {cpunet.__version__}"}, force=force
+    )
+    _simulate(simulation, source, windows, writer, resolution, seed)
+    return simulation
+
+
+def _hit_file(path: str | Path, frame: HitOptions) -> HitFile:
+    return HitFile(
+        Path(path),
+        frame.hits_detector,
+        Transform(frame.origin, frame.flip_z),
+        frame.length_unit,
+        frame.energy_unit,
+        time_window_us=frame.time_window_us,
+    )
+
+
+def _simulate(
+    simulation: Simulation,
+    source: HitSource,
+    windows: tuple[Window, ...],
+    writer: PulseWriter,
+    resolution: Resolution | None,
+    seed: int,
+) -> None:
+    """Write the pulses, and count them."""
+    detector, settings = simulation.detector, simulation.settings
+    clock = _Clock()
+    if resolution is not None:
+        _smeared(np.zeros(0), resolution, seed)  # wrong ones are told before any work
+    opened = source.open(detector)
+    clock.lap("reading")
+    if opened.warning:
+        log.warning(opened.warning)
+    with stage(f"Fields of {detector.name}"):
+        fields = compute_fields(detector)
+    clock.lap("fields")
+    merged = isinstance(source, HitFile) and source.placed
+    blocks = _merged(
+        opened.blocks, detector, 0.0 if merged else settings.cluster_mm, simulation
+    )
+    first = next(blocks)
+    clock.lap("first hits")
+    mode = _mode(settings, len(first.edep_kev) / len(first) * opened.n_events)
+    simulation.mode = mode
+    library = build_library(fields, settings) if mode == "library" else None
+    clock.lap("library")
+    with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
+        for block in chain([first], blocks):
+            clock.lap("waiting for hits")
+            events = simulate_events(fields, block, settings, mode, library)
+            clock.lap("pulses")
+            _count(simulation, block, events, windows)
+            _append(writer, block, events, settings, resolution, seed)
+            clock.lap("writing")
+            bar.update(len(block))
+        if not writer.n_pulses:
+            raise CpunetError(
+                f"{simulation.path}: none of {simulation.n_events} events gives a signal: "
+                f"their hits lie outside {detector.name} or in its contacts; check their frame"
+            )
+        simulation.seconds = clock.seconds
+        made = _made(simulation, source, resolution, seed) | {"depletion_V": fields.depletion_V}
+        writer.annotate({"simulation": json.dumps(made)})
+
+
+def _mode(settings: SimulationSettings, expected_hits: float) -> Literal["exact", "library"]:
+    if settings.mode != "auto":
+        return settings.mode
+    return "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
+
+
+def _smeared(energy_kev: Any, resolution: Resolution, seed: int) -> Any:
+    noise, fano = resolution
+    return with_resolution(energy_kev, noise_kev2=noise, fano_kev=fano, seed=seed)
+
+
+def _merged(
+    blocks: Iterator[Hits], detector: Detector, distance_mm: float, simulation: Simulation
+) -> Iterator[Hits]:
+    for block in blocks:
+        simulation.hits_before_merging += len(block.edep_kev)
+        yield merge_hits(block, detector, distance_mm)
+
+
+def _count(
+    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[Window, ...]
+) -> None:
+    """Count a block of events."""
+    """Count a block of events."""
+    r = np.hypot(hits.x_mm, hits.y_mm)
+    inside = simulation.detector.inside(r, hits.z_mm)
+    contacts = np.isin(simulation.detector.region(r, hits.z_mm), (POINT_CONTACT, LI_CONTACT))
+    collected = events.collected_kev
+    simulation.n_events += len(hits)
+    simulation.n_written += int((collected > 0).sum())
+    simulation.hits += len(hits.edep_kev)
+    simulation.hits_outside += int((~inside).sum())
+    simulation.hits_in_contacts += int((inside & contacts).sum())
+    simulation.not_collected += events.counts["hits not collected within the record"]
+    simulation.energy_kev += float(events.energy_kev.sum())
+    simulation.lost_kev += float(events.lost_kev.sum())
+    simulation.trapped_kev += float(events.trapped_kev.sum())
+    simulation.events_with_loss += int((events.lost_kev > 0).sum())
+    for window in windows:
+        within = (collected >= window.low_kev) & (collected <= window.high_kev)
+        simulation.lines[window.name] += int(within.sum())
+
+
+def _append(
+    writer: PulseWriter,
+    hits: Hits,
+    events: EventPulses,
+    settings: SimulationSettings,
+    resolution: Resolution | None,
+    seed: int,
+) -> None:
+    kept = events.collected_kev > 0
+    pulses = events.pulses()
+    columns: dict[str, tuple[Any, str]] = {
+        "lost_energy": (events.lost_kev[kept], "keV"),
+        "n_hits": (np.diff(hits.offsets)[kept], ""),
+    }
+    if any(settings.trapping_per_ns):
+        columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
+    if resolution is not None:
+        columns["true_energy"] = (pulses.energy_kev, "keV")
+        # each block has its own seed, from the number of pulses before it in the file
+        block_seed = int(np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)[0])
+        pulses = replace(pulses, energy_kev=_smeared(pulses.energy_kev, resolution, block_seed))
+    writer.append(pulses, columns)
+    writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))
+
+
+def _made(
+    simulation: Simulation, source: HitSource, resolution: Resolution | None, seed: int
+) -> dict[str, Any]:
+    """Provenance of the file, to be stored in it."""
+    return {
+        "cpunet": cpunet.__version__,
+        "detector": simulation.detector.model_dump(mode="json"),
+        "settings": simulation.settings.model_dump(mode="json"),
+        "hits": source.provenance(),
+        "mode": simulation.mode,
+        "resolution": resolution,
+        "seed": seed,
+        "events": simulation.n_events,
+        "events_without_signal": simulation.without_signal,
+    }
+
+
+class _Clock:
+    """Time spent on each step, in seconds."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Add the time since the last lap, or the start, to that of a step."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
