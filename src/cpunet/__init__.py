@@ -19,6 +19,7 @@ __all__ = [
     "REN",
     "Adc",
     "CalibratedRun",
+    "Comparison",
     "CpunetError",
     "FileOptions",
     "HitFile",
@@ -31,6 +32,7 @@ __all__ = [
     "Translation",
     "__version__",
     "calibrate",
+    "compare",
     "import_weights",
     "info",
     "load",
@@ -43,7 +45,6 @@ __all__ = [
 
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
-    from cpunet.calls.reports import Report, validate
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
@@ -59,11 +60,13 @@ if TYPE_CHECKING:
     from cpunet.translation.translate import translate
     from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
+    from cpunet.validation.compare import Comparison, compare
+    from cpunet.validation.report import Report
+    from cpunet.validation.validate import validate
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
-    "calls.reports": ("Report", "validate"),
     "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
@@ -79,6 +82,9 @@ _HOMES = {
     "translation.translate": ("translate",),
     "translation.translation": ("Translation",),
     "translation.translator": ("IREN", "REN"),
+    "validation.compare": ("Comparison", "compare"),
+    "validation.report": ("Report",),
+    "validation.validate": ("validate",),
 }
 
 

@@ -9,7 +9,6 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import tell
-from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import Kind, KindOption, Preset
 from cpunet.cli.values import wanted_events
 from cpunet.outputs import refuse_inputs
@@ -65,7 +64,7 @@ def demo(
     for part in PARTS:
         refuse_inputs(out_folder / part, preset, detector, recipe)
     names, numbers = wanted_events(events or (FEW if quick else EVENTS))
-    metrics = demonstrate(
+    report = demonstrate(
         read_electronics(preset),
         read_detector(detector),
         load_recipe(recipe, set_values or ()),
@@ -77,5 +76,4 @@ def demo(
         force=force,
         quick=quick,
     )
-    print_scores(metrics, leave_out=("FEP",))
-    tell(f"{out_folder / 'report' / 'report.html'}")
+    tell("\n".join(report.lines(leave_out=("FEP",))))

@@ -15,7 +15,6 @@ from cpunet.cli.app import run
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
 from cpunet.cli.check import check
-from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
@@ -25,7 +24,6 @@ from cpunet.cli.response import response
 from cpunet.cli.simulate import simulate
 from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
-from cpunet.cli.validate import validate
 from cpunet.installation import other_package
 
 log = logging.getLogger(__name__)
@@ -69,8 +67,6 @@ for command in (
     check,
     calibrate,
     tune,
-    validate,
-    compare,
     response,
     export,
 ):
