@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.train import train
+from cpunet.validation.evaluation import evaluate
 
 FAILED = 0.9
 
@@ -38,12 +38,9 @@ def scores_of(
             run,
             sim,
             data,
-            ValidateOptions(
-                truth=truth if truth.exists() else None,
-                baselines=rivals,
-                seed=seed,
-                device="auto",
-            ),
+            truth=truth if truth.exists() else None,
+            baselines=rivals,
+            seed=seed,
         ).metrics
 
 

@@ -76,7 +76,7 @@ def main() -> None:
             source = getattr(given, side)
             repeated(source, folder / f"{side}.lh5", given.pulses, noise=noise)
         files = ["--sim", folder / "sim.lh5", "--data", folder / "data.lh5"]
-        files += ["--most", str(given.most)]
+        files += ["--max-pulses", str(given.most)]
         call("validate", given.run, *files, "--no-baselines", "--out", folder / "report")
         scores = json.loads((folder / "report" / "metrics.json").read_text("utf-8"))
         print(scores["rejections"])

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.outputs import written_aside
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.train import train
+from cpunet.validation.evaluation import evaluate
 
 FAILED = 0.9
 PEAKS = ("SEP", "DEP")
@@ -41,12 +41,9 @@ def one_seed(
         metrics = evaluate(
             run,
             *files,
-            ValidateOptions(
-                truth=truth if truth.exists() and sim == stand else None,
-                baselines=False,
-                seed=seed,
-                device="auto",
-            ),
+            truth=truth if truth.exists() and sim == stand else None,
+            baselines=False,
+            seed=seed,
         ).metrics
     found: dict[str, Any] = {"seed": seed, "seconds": run.seconds, "cpu": cpu}
     for peak in PEAKS:

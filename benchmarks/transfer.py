@@ -16,13 +16,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cpunet.jobs.validation.evaluation import ValidateOptions, evaluate
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.train import train
+from cpunet.validation.evaluation import evaluate
 
 
 def few_of(data: PulseFile, pulses: int, folder: Path) -> PulseFile:
@@ -70,9 +70,9 @@ def main() -> None:
                 made,
                 sim,
                 data,
-                ValidateOptions(
-                    truth=arguments.stand / "truth.npz", baselines=False, seed=0, device="cpu"
-                ),
+                truth=arguments.stand / "truth.npz",
+                baselines=False,
+                device="cpu",
             )
             rows[title] = (made.seconds, scored.metrics)
     show(rows)

@@ -80,8 +80,8 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
-    patch.setattr("cpunet.jobs.validation.validate._drawn", lambda _drawing, _bar: Figure())
-    patch.setattr("cpunet.validation.report.figure_png", lambda _figure: b"")
+    patch.setattr("cpunet.validation.report._drawn", lambda _drawing, _bar: Figure())
+    patch.setattr("cpunet.validation.report_page.figure_png", lambda _figure: b"")
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def all_undrawn() -> Iterator[None]:
 def few_sums() -> Iterator[None]:
     """Scores compare the translations of a few sums: two hundred take seconds each time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.jobs.validation.evaluation.PAIRS", 20)
+        patch.setattr("cpunet.validation.evaluation.PAIRS", 20)
         yield
 
 

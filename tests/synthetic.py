@@ -9,8 +9,9 @@ import hashlib
 import io
 import resource
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
 from cpunet.validation.paired import PairedScores, pair_squares, scores_of_squares
+from cpunet.validation.report import Report
 from cpunet.validation.truth import Responses
 
 Values = npt.NDArray[np.float64]
@@ -244,3 +246,14 @@ def interrupted_in(iteration: int) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Step, "__call__", interrupted)
         yield
+
+
+def write_report(
+    folder: Path,
+    metrics: dict[str, Any],
+    figures: dict[str, Any] | None = None,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write a report of these metrics and figures into a folder."""
+    drawn = {name: partial(lambda one: one, one) for name, one in (figures or {}).items()}
+    Report(metrics, {}, None, drawn, notes).write(folder)

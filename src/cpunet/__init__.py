@@ -19,6 +19,7 @@ __all__ = [
     "REN",
     "Adc",
     "CalibratedRun",
+    "Comparison",
     "CpunetError",
     "FileOptions",
     "HitFile",
@@ -33,6 +34,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "check",
+    "compare",
     "import_weights",
     "info",
     "load",
@@ -46,7 +48,6 @@ __all__ = [
 
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
-    from cpunet.calls.reports import Report, validate
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
@@ -64,11 +65,13 @@ if TYPE_CHECKING:
     from cpunet.translation.translate import translate
     from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
+    from cpunet.validation.compare import Comparison, compare
+    from cpunet.validation.report import Report
+    from cpunet.validation.validate import validate
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
-    "calls.reports": ("Report", "validate"),
     "electronics.flattening": ("subtract_tails",),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
@@ -86,6 +89,9 @@ _HOMES = {
     "translation.translate": ("translate",),
     "translation.translation": ("Translation",),
     "translation.translator": ("IREN", "REN"),
+    "validation.compare": ("Comparison", "compare"),
+    "validation.report": ("Report",),
+    "validation.validate": ("validate",),
 }
 
 

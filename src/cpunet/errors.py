@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class CpunetError(Exception):
     """Bad input, described in one line: which file, which event, what to do.
@@ -22,3 +25,16 @@ class CpunetError(Exception):
 
     def __str__(self) -> str:
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
+
+
+def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
+    """A value by name.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such value; the message lists the known names.
+    """
+    if name not in values:
+        raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")
+    return values[name]

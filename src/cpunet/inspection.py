@@ -23,9 +23,9 @@ from cpunet.tables import Lines, aligned, text_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from cpunet.calls.reports import Report
     from cpunet.recipes.schema import Recipe
     from cpunet.training.run import Run
+    from cpunet.validation.report import Report
 
     Loaded: TypeAlias = Run | Report | PulseFile
 
@@ -187,7 +187,7 @@ def load(path: str | Path) -> Loaded:
     if (path / INFO).is_file():
         return Run.load(path)
     if (path / "metrics.json").is_file():
-        from cpunet.calls.reports import Report
+        from cpunet.validation.report import Report
 
         return Report.load(path)
     stand = "a stand, whose sim.lh5 and data.lh5 can be opened; "

@@ -51,12 +51,6 @@ def run(home) -> cpunet.Run:
     return cpunet.train(*sides, home / "run", settings=SHORT, seed=2, device="cpu")
 
 
-@pytest.fixture(scope="module")
-def report(home, run, all_undrawn) -> cpunet.Report:
-    sides = home / "sim.lh5", cpunet.PulseFile(str(home / "raw.lh5"))
-    return run.validate(*sides, home / "report", rivals=False, device="cpu")
-
-
 def test_importing_is_light_and_all_is_there():
     heavy = "('torch', 'matplotlib', 'numba', 'scipy', 'h5py', 'hist')"
     code = f"import cpunet, sys; print([m for m in {heavy} if m in sys.modules])"
@@ -116,7 +110,7 @@ def test_a_run_is_read_once(home, run, tmp_path):
     sides = home / "sim.lh5", home / "raw.lh5"
     for act in (
         lambda: cpunet.translate(run.folder, sides[0], tmp_path / "t.lh5", adc=True),
-        lambda: cpunet.validate(run.folder, *sides, tmp_path / "report", rivals=False),
+        lambda: cpunet.validate(run.folder, *sides, tmp_path / "report", baselines=False),
     ):
         opened.clear()
         act()
@@ -168,53 +162,6 @@ def test_raw_traces(home, run):
     assert len(twice.pulses) == twice.counts["read"] == 2 * N
     back = run.translate(home / "raw.lh5", inverse=True, noise=False)
     assert back.counts["translated"] > N // 2
-
-
-def test_a_report(home, report):
-    assert report.folder == home / "report"
-    assert (report.folder / "report.html").is_file()
-    assert "FEP" in report.values
-    data = report.values["FEP"]["data"]["current_amplitude"]
-    histogram = report.hist("FEP")
-    scored = report.metrics["peaks"]["FEP"]["parameters"]["current_amplitude"]["axis"]
-    assert histogram.axes[1].size == scored["bins"]
-    assert histogram.axes[1].edges[[0, -1]].tolist() == [scored["low"], scored["high"]]
-    assert report.hist("FEP", max_bins=3).axes[1].size == 3
-    assert list(histogram.axes["method"]) == [
-        m for m, v in report.values["FEP"].items() if "current_amplitude" in v
-    ]
-    assert histogram[{"method": "data"}].sum(flow=True) == np.isfinite(data).sum()
-    row = next(r for r in report.scores if r["method"] == "ren")
-    compared = report.metrics["peaks"]["FEP"]["parameters"][row["parameter"]]
-    assert row["iou"] == compared["iou"]["ren"]
-    assert row["ceiling"] == compared["iou"]["ceiling"]
-    assert report.verdicts == report.metrics["verdicts"]["summary"]
-    html = report._repr_html_()
-    assert "current amplitude" in html
-    assert "report.html" in html
-    assert repr(report) == f"<Report {report.folder}: FEP, SEP, DEP>"
-    assert report.figures["FEP mean pulse"].axes
-    with pytest.raises(cpunet.CpunetError, match="no scored peak 'SEP'; there are FEP"):
-        report.hist("SEP")
-
-
-def test_a_report_again(report):
-    again = cpunet.Report.load(report.folder)
-    before, after = (one.hist("FEP", "drift_time") for one in (report, again))
-    drawn = {"data", "raw", "ren"}
-    for method in drawn:
-        same = before[{"method": method}].values(), after[{"method": method}].values()
-        assert np.array_equal(*same)
-    assert (again.folder / "FEP_mean_pulse.png").is_file()
-
-
-def test_nothing_is_written_without_a_folder(home, run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    sides = home / "sim.lh5", home / "raw.lh5"
-    made = cpunet.validate(run, *sides, rivals=False, device="cpu")
-    assert made.folder is None
-    assert not list(tmp_path.iterdir())
-    assert "FEP" in made.values
 
 
 def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):

@@ -13,9 +13,9 @@ import pytest
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.validation.validate import validate
 
 N = 240
 FEP = 2614.511
@@ -228,11 +228,11 @@ def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch
     (run / "run.json").write_text(json.dumps(info))
     seen: list[PulseFile] = []
 
-    def evaluated(_run: Path, sim: PulseFile, data: PulseFile, *_: object) -> None:
+    def evaluated(_run: Path, sim: PulseFile, data: PulseFile, **_: object) -> None:
         seen.extend([sim, data])
         raise SeenError
 
-    monkeypatch.setattr("cpunet.jobs.validation.validate.evaluate", evaluated)
+    monkeypatch.setattr("cpunet.validation.evaluation.evaluate", evaluated)
     sim = PulseFile(stand.sim)
     other = Path(shutil.copy(stand.data, tmp_path / "other.lh5"))
     for data, expected in (
@@ -241,7 +241,7 @@ def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch
         (PulseFile(other), PulseFile(other)),
     ):
         with pytest.raises(SeenError):
-            validate_run(run, sim, data, tmp_path / "report")
+            validate(run, sim, data, tmp_path / "report")
         assert seen[-2:] == [sim, expected]
     assert sim.options == {}
     assert expected.options == {}

@@ -15,12 +15,12 @@ import yaml
 from matplotlib.figure import Figure
 
 from cpunet.cli.main import main
-from cpunet.jobs.validation import validate
-from cpunet.jobs.validation.drawings import drawings
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import mark
 from cpunet.training.run import RUN
-from cpunet.validation.report_folder import REPORT
+from cpunet.validation import drawings
+from cpunet.validation import report as reports
+from cpunet.validation.report import REPORT
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 
@@ -123,18 +123,18 @@ def report(request, trained, stand, tmp_path_factory):
         # translations of which all parameters can be determined
         patched.setattr(PositionalUNet, "forward", lambda _, pulses, **_options: pulses)
         if some:
-            draw, left = validate._drawn, []
+            draw, left, every = reports._drawn, [], drawings.drawings
 
             def found(evaluation):
-                made = drawings(evaluation)
+                made = every(evaluation)
                 left.extend(d for name, d in made.items() if drawn_elsewhere(name))
                 return made
 
             def drawn(drawing, advance):
                 return Figure() if drawing in left else draw(drawing, advance)
 
-            patched.setattr(validate, "drawings", found)
-            patched.setattr(validate, "_drawn", drawn)
+            patched.setattr(drawings, "drawings", found)
+            patched.setattr(reports, "_drawn", drawn)
         patched.setattr(sys, "argv", ["cpunet", *map(str, words)])
         with pytest.raises(SystemExit) as stop:
             main()

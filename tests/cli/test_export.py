@@ -111,10 +111,6 @@ def test_import_weights(command, tmp_path):
         (["library", "expand", "FINE"], "no library of components"),
         (["export", "RUN", "--to", "legend-pars"], "no response in closed form"),
         (["export", "RUN", "--to", "legend-pars", "--inverse"], "those of REN"),
-        (
-            ["validate", "RUN", "--sim", "a", "--data", "b", "--ae-range", "2350,900"],
-            "give two energies",
-        ),
         (["export", "RUN", "--detector", "V01"], "those of --to legend-pars; add it"),
     ],
 )

@@ -15,6 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.jobs.demo import demonstrate
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.validation.report import Report
 from synthetic import SMALL_NETWORK
 
 TINY = (
@@ -50,7 +51,7 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, all_undrawn: None) -> It
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """A demonstration and its scores; do not change it."""
     out = tmp_path_factory.mktemp("whole") / "demo"
-    return out, demonstrate(**OPTIONS, out=out)
+    return out, demonstrate(**OPTIONS, out=out).to_dict()
 
 
 @pytest.fixture
@@ -148,9 +149,9 @@ def test_parts_made_with_other_options_are_not_mixed(
 def test_the_description_of_a_recipe_does_not_matter(
     interrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cpunet.jobs.demo.validate_run", lambda *_, **__: {"kept": True})
+    monkeypatch.setattr("cpunet.jobs.demo.validate", lambda *_, **__: Report({}, {}, drawn={}))
     other = RECIPE.model_copy(update={"description": "another text"})
-    assert demonstrate(**{**OPTIONS, "recipe": other}, out=interrupted) == {"kept": True}
+    assert demonstrate(**{**OPTIONS, "recipe": other}, out=interrupted).folder
 
 
 @pytest.mark.thorough
@@ -187,7 +188,7 @@ def test_force_removes_nothing_but_what_a_demonstration_made(interrupted: Path) 
 
 @pytest.mark.thorough
 def test_force_makes_all_anew(interrupted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cpunet.jobs.demo.validate_run", lambda *_, **__: {})
+    monkeypatch.setattr("cpunet.jobs.demo.validate", lambda *_, **__: Report({}, {}, drawn={}))
     made = (interrupted / "stand" / "data.lh5").read_bytes()
     demonstrate(**OPTIONS, out=interrupted, seed=1, force=True)
     assert (interrupted / "stand" / "data.lh5").read_bytes() != made

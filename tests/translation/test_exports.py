@@ -22,8 +22,7 @@ from cpunet.recipes import load_recipe
 from cpunet.translation.exports import FORMATS, export
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.comparisons import compare
-from cpunet.validation.report import write_report
-from synthetic import write_run
+from synthetic import write_report, write_run
 
 
 def write_chain(folder: Path, *overrides: str) -> Path:

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from browser import browser, run_page
 from cpunet.plotting import line_look, styled
-from cpunet.validation.report import write_report
+from synthetic import write_report
 
 SELFTEST = """<script>
 const shown = (method) => [...document.querySelectorAll(`[data-method="${method}"]`)]

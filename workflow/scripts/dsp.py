@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cpunet.errors import CpunetError
 from cpunet.jobs.inspection.chain_description import describe_responses
+
+from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.settings import read_values
 

@@ -45,6 +45,14 @@ COMMANDS = {
         "cpunet.translation.translate:translate",
         "Translate pulses with a trained run, keeping the rows and columns of their files.",
     ),
+    "validate": (
+        "cpunet.validation.validate:validate",
+        "Score a run per peak and write a report.",
+    ),
+    "compare": (
+        "cpunet.validation.compare:compare",
+        "Put the scores of several validations beside each other.",
+    ),
 }
 
 

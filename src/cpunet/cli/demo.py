@@ -9,7 +9,6 @@ import typer
 
 from cpunet.cli import options
 from cpunet.cli.messages import tell
-from cpunet.cli.scores import print_scores
 from cpunet.cli.stand import Kind, KindOption, Preset
 from cpunet.outputs import refuse_inputs
 
@@ -66,7 +65,7 @@ def demo(
         refuse_inputs(out_folder / part, preset, detector, recipe)
     loaded = load_recipe(recipe, set_values or ())
     wanted = wanted_events(events or (FEW if quick else EVENTS), loaded.peaks, 0.5)
-    metrics = demonstrate(
+    report = demonstrate(
         read_electronics(preset),
         read_detector(detector),
         loaded,
@@ -78,5 +77,4 @@ def demo(
         force=force,
         quick=quick,
     )
-    print_scores(metrics, leave_out=("FEP",))
-    tell(f"{out_folder / 'report' / 'report.html'}")
+    tell("\n".join(report.lines(leave_out=("FEP",))))

@@ -14,7 +14,6 @@ from cpunet.cli.app import app as commands
 from cpunet.cli.app import run, with_options
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
-from cpunet.cli.compare import compare
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
@@ -23,7 +22,6 @@ from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
 from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
-from cpunet.cli.validate import validate
 from cpunet.installation import other_package
 
 log = logging.getLogger(__name__)
@@ -65,8 +63,6 @@ for command in (
     stand,
     calibrate,
     tune,
-    validate,
-    compare,
     response,
     export,
 ):

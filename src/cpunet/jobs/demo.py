@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
 from cpunet.jobs.simulation.stand import write_stand
 from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
-from cpunet.jobs.validation.evaluation import ValidateOptions
-from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.energy_windows import energy_windows
 from cpunet.simulation.geometry import Detector
 from cpunet.training.train import train
+from cpunet.validation.report import Report
+from cpunet.validation.validate import validate
 
 _PEAK = "FEP"  # peak of the training
+GLANCE = ("mean pulse", "current_amplitude", "single pulse")  # figures of a quick look
+QUICK_LOOK = (
+    "This is a quick look: with so few events the response is not well learned, and scores "
+    "scatter by several points. The whole demonstration has more events and all figures."
+)
 _HALF_WINDOW_KEV = 0.5  # half-width of the deposited energies around each line
 
 
@@ -35,7 +40,7 @@ def demonstrate(
     device: str = "auto",
     force: bool = False,
     quick: bool = False,
-) -> dict[str, Any]:
+) -> Report:
     """Make a stand, train on its FEP, and score every method on all its lines.
 
     Parameters
@@ -52,14 +57,14 @@ def demonstrate(
     force
         Whether to make all parts again.
     quick
-        Whether the report is a quick look, see `ValidateOptions`.
+        Whether the report is a quick look, with a few figures only, and a note that says so.
     seed, device
         See `cpunet.train`.
 
     Returns
     -------
-    dict
-        Content of the report's ``metrics.json``.
+    Report
+        The report, in its folder.
 
     Raises
     ------
@@ -95,10 +100,18 @@ def demonstrate(
             resume=recipe.training.method == "cyclegan" and not force,
             force=force,
         )
-    return validate_run(
-        run,
-        sim,
-        data,
-        report,
-        ValidateOptions(stand / "truth.npz", seed=seed, device=device, quick=quick),
-    )
+    truth = stand / "truth.npz"
+    made = validate(run, sim, data, truth=truth, seed=seed, device=device)
+    assert isinstance(made, Report)  # the stand has one channel
+    if quick:
+        made = at_a_glance(made)
+    made.save(report)
+    return replace(made, folder=report)
+
+
+def at_a_glance(report: Report) -> Report:
+    """A quick look: a few figures of the first peak that took no part in the training."""
+    peak = next((peak for peak in report.values if peak != _PEAK), _PEAK)
+    names = [f"{peak} {what}" for what in GLANCE]
+    drawn = {name: draw for name, draw in (report.drawn or {}).items() if name in names}
+    return replace(report, drawn=drawn, notes=(QUICK_LOOK, *report.notes))

@@ -15,7 +15,7 @@ from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json
 from cpunet.training.run import INFO, RUN, Run
-from cpunet.validation.report_folder import METRICS, REPORT
+from cpunet.validation.report import METRICS, REPORT
 
 # parts in the order of creation, each with a file that exists when it is complete
 PARTS = {"stand": MARKER, "run": INFO, "report": METRICS}

@@ -42,10 +42,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from cpunet.calls.reports import Report
     from cpunet.pulses.channels import Outcome
     from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
+    from cpunet.validation.report import Report
 
 FORMAT = 2
 """Format of run folders; those of other versions cannot be loaded."""
@@ -326,9 +326,9 @@ class Run(Part):
 
     def validate(  # type: ignore[override]  # pydantic's own is deprecated
         self, sim: Any, data: Any, out: str | Path | None = None, **how: Any
-    ) -> Report:
+    ) -> Report | Outcome[Report]:
         """Validate this run, see `cpunet.validate`."""
-        from cpunet.calls.reports import validate
+        from cpunet.validation.validate import validate
 
         return validate(self, sim, data, out, **how)
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.errors import CpunetError
+from cpunet.errors import CpunetError, named
 from cpunet.html_pages import notebook_picture, part
 from cpunet.plotting import COLOURS, styled
 from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
@@ -196,16 +196,3 @@ class Translation:
         small = self.kept is not None  # a file may be large
         drawn = notebook_picture(self.plot()) if small and self.counts["translated"] else ""
         return part("object", "cpunet translation", told, picture=drawn)
-
-
-def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
-    """A value by name.
-
-    Raises
-    ------
-    CpunetError
-        If there is no such value; the message lists the known names.
-    """
-    if name not in values:
-        raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")
-    return values[name]

@@ -90,8 +90,8 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         about += (
             " Since there are too few events between the lines, SEP and FEP are fitted too, "
             "although most of their events have several sites: slopes can be compared, but "
-            "only approximate that of single sites. With --ae-range 900,2350 the continuum is "
-            "read, if the files have it."
+            "only approximate that of single sites. A range of the recipe's "
+            "scores.continuum_kev, as 900 to 2350, is read, if the files have it."
         )
     drawn = part("grid", "figures", [figure] if figure else [])
     return joined([part("p", about), html_table(head, rows, words={0}), drawn])

@@ -1,185 +1,321 @@
-"""Results of a validation as files: ``metrics.json``, figures and an HTML page.
-
-The page is self-contained: figures and script are embedded, and its content security policy
-blocks all requests.
-"""
+"""The result of a validation: scores, values, figures, and the folder that holds them."""
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
-from markupsafe import Markup
-from matplotlib.figure import Figure
+import numpy as np
 
-from cpunet.html_pages import (
-    asset,
-    figure_html,
-    figure_png,
-    joined,
-    part,
-    rendered,
+from cpunet.errors import CpunetError, named
+from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.progress import Stage, stage
+from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.settings import plain, read_json
+from cpunet.tables import text_table
+from cpunet.validation.verdicts import judged_scores
+from cpunet.validation.when_asked import WhenAsked
+
+if TYPE_CHECKING:
+    import hist
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
+REPORT = FolderKind(
+    name="report",
+    command="cpunet validate",
+    known_by=METRICS,
+    own=r"metrics\.json|report\.html|parameters\.npz",
 )
-from cpunet.plotting import colours, label
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.settings import plain
-from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
-from cpunet.validation.ae_energy_figure import ae_energy_html
-from cpunet.validation.nested_tables import nested_html, number
-from cpunet.validation.report_folder import METRICS
-from cpunet.validation.report_tables import (
-    pairs_table,
-    peak_html,
-    survival_html,
-    verdicts_html,
-)
-
-FIRST = 2  # figures of mean pulses at the top of the page, and of noise
-# section of a figure by the end of its name; all others are under Details
-PLACES = {
-    "A over E survival": "ae",
-    "A over E and drift time": "ae_drift",
-    "A over E": "ae_drift",
-    "mean pulse": "first",
-    "superpulses": "slices",
-    "noise": "noise",
-    "single pulse": "pulses",
-    "further parameters": "further",
-    **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
+# methods of the printed table, in the order of the page; those without noise are in the metrics
+_METHODS = {
+    "raw": "raw",
+    "rc": "rc",
+    "gauss_exp": "gauss_exp",
+    "superpulse": "superpulse",
+    "ren": "REN",
+    "truth": "truth",
+    "ceiling": "ceiling",
 }
-MANY = 4  # a larger number of figures is collapsed
-
-# parts of the metrics that are shown as nested tables
-DETAILS = {
-    "ae_details": "A/E in detail",
-    "drift_slices": "Slices of rise time, 1 to 90 %",
-    "linearity": "Linearity",
-    "noise": "Noise",
+_NAMES = {
+    "current_amplitude": "I_max",
+    "drift_time": "T_drift",
+    "tail_slope": "tail slope",
 }
+_SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
 
 
-def write_report(
-    folder: Path,
-    metrics: Mapping[str, Any],
-    figures: Mapping[str, Figure],
-    notes: Sequence[str],
-) -> None:
-    """Write ``metrics.json``, a PNG per figure and ``report.html`` into a folder.
+@dataclass(frozen=True, eq=False, repr=False)
+class Report:
+    """Scores of a run, as returned by `cpunet.validate`.
+
+    ``report["SEP"]`` are the scores of a peak, a row for each parameter and method.
 
     Parameters
     ----------
-    folder
-        An existing folder, see `outputs.folder_written_aside`.
     metrics
-        ``peaks``: by peak, ``n_sim``, ``n_data``, ``not_prepared`` (counts by method),
-        ``parameters`` (result of `comparisons.compare`), ``two_sample`` (classifier test by
-        method) and, if the truth is known, ``paired`` (result of `paired.scores_of_squares` by
-        method); or ``missing`` with the reason why the peak is not scored.
-        ``verdicts``: ``summary``, a list of sentences, and ``table``, see
-        `verdicts.verdict_table`.  ``ae_survival``, ``ae_details``,
-        ``drift_slices``, ``linearity``, ``noise``: nested values, shown as tables.
-        ``compared``: names and values of the compared inputs.  ``training``: how the network
-        was trained.  ``rejections``: counts by reason, possibly nested.  ``ae_energy``: result
-        of `ae_energy.against_energy`.  Non-finite numbers are written as ``null``.
-    figures
-        Figures by name; the names become file names and captions.
+        The content of ``metrics.json``.
+    values
+        Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
+    folder
+        Folder of the report; None if none was written.
+    drawn
+        Functions that draw the figures, by name; none for a report that was opened.
     notes
-        Paragraphs of plain text for the top of the page.
+        Paragraphs for the top of the page.
     """
-    metrics = plain(metrics)
-    text = json.dumps(metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-    drawn = {}
-    for name, figure in figures.items():
-        (folder / f"{_file_stem(name)}.png").write_bytes(figure_png(figure))
-        drawn[name] = figure_html(name.replace("_", " "), figure)
-    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
-    placed = _placed(drawn, metrics.get("training", {}).get("peak"))
-    judged = metrics.get("verdicts", {}).get("table", {})
-    scores = joined(
-        peak_html(name, scores, judged.get(name))
-        for name, scores in metrics.get("peaks", {}).items()
-    )
-    html = rendered(
-        "report.html",
-        title="CPU-Net validation",
-        compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
-        first=_gallery(placed["first"]),
-        notes=notes,
-        verdicts=verdicts_html(metrics.get("verdicts")),
-        methods=_methods([*drawn.values(), scores]),
-        scores=scores or part("gap", "no peak was scored"),
-        distributions=part("grid", "figures", placed["distributions"]),
-        further=_folded("Further parameters of every peak", placed["further"], screen=True),
-        slices=part("grid", "figures", placed["slices"]),
-        pulses=part("grid", "single", placed["pulses"]),
-        survival=survival_html(metrics.get("ae_survival", {})),
-        ae=joined(
+
+    metrics: Mapping[str, Any]
+    values: Mapping[str, Mapping[str, Mapping[str, Values]]] = field(default_factory=dict)
+    folder: Path | None = None
+    drawn: Mapping[str, Callable[[], Any]] | None = None
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Report:
+        """Open the folder of a report; its figures are the PNG files beside it.
+
+        Raises
+        ------
+        CpunetError
+            If the folder is not a report, or cannot be read.
+        """
+        remedy = "give the folder of a report, or make one with cpunet.validate"
+        metrics = read_metrics(Path(folder) / METRICS, remedy)
+        values: dict[str, dict[str, dict[str, Values]]] = {}
+        try:
+            with np.load(Path(folder) / VALUES, allow_pickle=False) as stored:
+                for key in stored:
+                    peak, method, name = key.rsplit("/", 2)
+                    values.setdefault(peak, {}).setdefault(method, {})[name] = stored[key]
+        except (OSError, ValueError, BadZipFile) as error:
+            raise CpunetError(
+                f"{Path(folder) / VALUES}: cannot be read ({error})", "validate again"
+            ) from error
+        return cls(metrics, values, Path(folder))
+
+    @cached_property
+    def scores(self) -> DataFrame:
+        """A row per peak, parameter and method.
+
+        ``iou`` is the overlap with data in percent, ``ceiling`` that of data with data.
+        """
+        from pandas import DataFrame
+
+        index = ["peak", "parameter", "method"]
+        columns = [*index, "iou", "iou_std", "ceiling", "ks", "wasserstein"]
+        return DataFrame(self._rows(), columns=columns).set_index(index)
+
+    def __getitem__(self, peak: str) -> DataFrame:
+        found: DataFrame = self.scores.loc[named(self._scored(), peak, "scored peak")]
+        return found
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Verdicts on the translation in words, peak by peak."""
+        return list(self.metrics["verdicts"]["summary"])
+
+    @property
+    def figures(self) -> Mapping[str, Figure]:
+        """Figures by name, drawn on every access."""
+        return WhenAsked(self.drawn or {})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The metrics, ready for JSON: numbers that are not finite are None."""
+        return dict(plain(self.metrics))
+
+    def hist(
+        self, peak: str, parameter: str = "current_amplitude", max_bins: int | None = None
+    ) -> hist.Hist[Any]:
+        """Distributions of a parameter by method.
+
+        Parameters
+        ----------
+        peak, parameter
+            Names of both.
+        max_bins
+            Maximum number of bins; None for the bins in which the parameter is scored.
+
+        Returns
+        -------
+        hist.Hist
+            Axes ``method`` (categories) and the parameter.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such peak or parameter.
+        """
+        import hist
+
+        from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
+
+        of_peak = named(self.values, peak, "scored peak")
+        data = named(of_peak["data"], parameter, "parameter")
+        there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
+        told = self._compared(peak).get(parameter, {}).get("axis", {})
+        axis = (
+            hist.axis.Regular(int(told["bins"]), told["low"], told["high"])
+            if max_bins is None and told.get("bins")
+            else data_axis(data, max_bins or MAX_BINS)
+        )
+        methods = hist.axis.StrCategory(list(there), name="method")
+        made: hist.Hist[Any] = hist.Hist(methods, labelled(axis, parameter))
+        for method, values in there.items():
+            made.fill(method, values[np.isfinite(values)])
+        return made
+
+    def plot(self, peak: str, parameter: str = "current_amplitude") -> Figure:
+        """Draw the distributions of a parameter by method, with its scores.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such peak, or no such parameter is scored there.
+        """
+        from cpunet.validation.drawings import DRAWN
+        from cpunet.validation.run_figures import parameter_histograms
+
+        of_peak = named(self.values, peak, "scored peak")
+        compared = named(self._compared(peak), parameter, "scored parameter")
+        values = {m: of_peak[m][parameter] for m in DRAWN if m in of_peak}
+        axis = self.hist(peak, parameter).axes[1]
+        return parameter_histograms(values, axis, parameter, peak, compared)
+
+    def save(self, folder: str | Path, force: bool = False) -> None:
+        """Write the report to a folder: page, metrics, values and figures.
+
+        Raises
+        ------
+        CpunetError
+            If the folder exists and `force` is off, or is not a report; or if this report was
+            opened from one.
+        """
+        with folder_written_aside(Path(folder), REPORT, force=force) as aside:
+            self.write(aside)
+
+    def write(self, folder: Path) -> None:
+        """Write the report into an existing folder, see `save`."""
+        from cpunet.validation.report_page import write_page
+
+        if self.drawn is None:
+            raise CpunetError(f"{self.folder}: is a report already", "copy the folder")
+        metrics = self.to_dict()
+        text = json.dumps(
+            metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False
+        )
+        (folder / METRICS).write_text(text + "\n", encoding="utf-8")
+        parameters = {
+            f"{peak}/{method}/{name}": of_method[name]
+            for peak, of_peak in self.values.items()
+            for method, of_method in of_peak.items()
+            for name in PARAMETERS
+            if name in of_method
+        }
+        np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
+        with stage("Drawing", len(self.drawn)) as bar:
+            figures = {name: partial(_drawn, one, bar) for name, one in self.drawn.items()}
+            write_page(folder, metrics, WhenAsked(figures), self.notes)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def lines(self, leave_out: Sequence[str] = ()) -> list[str]:
+        """What is printed: a table of IoU, peaks without scores, the page.
+
+        Parameters
+        ----------
+        leave_out
+            Peaks that are not shown.
+        """
+        head, rows = self._table(_METHODS, leave_out)
+        names = [_METHODS.get(name, name) for name in head]
+        rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
+        lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
+        for peak, scores in self.metrics["peaks"].items():
+            if "missing" in scores and peak not in leave_out:
+                lines.append(f"{peak}: not scored, {scores['missing']}")
+        return lines if self.folder is None else [*lines, str(self.folder / PAGE)]
+
+    def __repr__(self) -> str:
+        where = "" if self.folder is None else f" {self.folder}"
+        off, judged = judged_scores(self.metrics, "ren")
+        return f"<Report{where}: {f'{off} of {judged} scores off' if judged else 'not judged'}>"
+
+    def _repr_html_(self) -> str:
+        from cpunet.html_pages import part
+
+        (_, _, *methods), rows = self._table(_SHOWN)
+        rows = [[peak, name.replace("_", " "), *cells] for peak, name, *cells in rows]
+        head = ["peak", "overlap with data (%)", *methods]
+        where = {"page": None if self.folder is None else self.folder / PAGE}
+        return part("object", "cpunet report", where, head, rows, self.verdicts)
+
+    def _compared(self, peak: str) -> Mapping[str, Any]:
+        return dict(self.metrics["peaks"][peak]["parameters"])
+
+    def _scored(self) -> dict[str, str]:
+        peaks = self.metrics["peaks"]
+        return {peak: peak for peak in peaks if peaks[peak]["parameters"]}
+
+    def _rows(self) -> list[list[Any]]:
+        return [
             [
-                _gallery(placed["ae"]),
-                _folded("A/E and drift time of every peak, as figures", placed["ae_drift"]),
+                *(peak, parameter, method, iou, compared["iou_std"].get(method)),
+                *(compared["iou"].get("ceiling"), compared["ks"].get(method)),
+                compared["wasserstein"].get(method),
             ]
-        ),
-        ae_energy=ae_energy,
-        noise=_gallery(placed["noise"]),
-        details=_details_html(metrics),
-        figures=_gallery(placed["others"]) or part("gap", "no figures were drawn"),
-        rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
-        training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
-        script=Markup(asset("report.js")),
-    )
-    (folder / "report.html").write_text(html, encoding="utf-8")
+            for peak in self.metrics["peaks"]
+            for parameter, compared in self._compared(peak).items()
+            for method, iou in compared["iou"].items()
+            if method != "ceiling"
+        ]
+
+    def _table(
+        self, methods: Iterable[str], leave_out: Sequence[str] = ()
+    ) -> tuple[list[str], list[list[str]]]:
+        """IoU by peak and parameter, of the methods that have any."""
+        of_all = {
+            (peak, parameter): compared["iou"]
+            for peak in self.metrics["peaks"]
+            if peak not in leave_out
+            for parameter, compared in self._compared(peak).items()
+        }
+        shown = [m for m in methods if any(m in iou for iou in of_all.values())]
+        rows = [
+            [*place, *(_number(iou.get(m)) for m in shown)] for place, iou in of_all.items()
+        ]
+        return ["peak", "parameter", *shown], rows
 
 
-def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
-    """Figures by their place on the page, see `PLACES`.
+def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str, Any]:
+    """Read a ``metrics.json``; `remedy` says what to do if that fails.
 
-    Mean pulses and noise are shown for a few peaks, preferably not those of the training.
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read or does not contain the scores of a validation.
     """
-    trained = tuple(f"{peak} " for peak in [trained_on, *str(trained_on).split(",")])
-    names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
-    for name in drawn:
-        told = name.replace("_", " ")
-        end = next((end for end in PLACES if told.endswith(end)), None)
-        names[PLACES[end] if end else "others"].append(name)
-    for place in ("first", "noise"):
-        held_out = [name for name in names[place] if not name.startswith(trained)]
-        few = (held_out or names[place])[:FIRST]
-        names["others"] += [name for name in names[place] if name not in few]
-        names[place] = few
-    return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
+    content = read_json(file, remedy)
+    if not isinstance(content.get("peaks"), dict):
+        raise CpunetError(
+            f"{file}: holds no scores by peak", "give a report of cpunet validate"
+        )
+    return content
 
 
-def _methods(drawn: Iterable[str]) -> list[dict[str, str]]:
-    """Name, label and colour of each method that is drawn, for the page's legend."""
-    names = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn)))
-    return [{"name": m, "label": label(m), "colour": c} for m, c in colours(names).items()]
+def _drawn(drawing: Callable[[], Figure], bar: Stage) -> Figure:
+    """Draw a figure and report progress."""
+    figure = drawing()
+    bar.update(1)
+    return figure
 
 
-def _folded(title: str, drawn: Sequence[Markup], *, screen: bool = False) -> Markup:
-    figures = part("grid", "figures", drawn)
-    return part("folded", title, figures, screen=screen) if drawn else Markup()
-
-
-def _details_html(metrics: Mapping[str, Any]) -> Markup:
-    """Return those parts of the metrics that are shown as nested tables, if any."""
-    return joined(
-        part("folded", title, nested_html(metrics[name]), screen=True)
-        for name, title in DETAILS.items()
-        if metrics.get(name)
-    )
-
-
-def _gallery(drawn: Sequence[Markup]) -> Markup:
-    gallery = part("grid", "figures", drawn)
-    if len(drawn) <= MANY:
-        return gallery
-    return part("folded", f"{len(drawn)} figures, also as PNG beside this page", gallery)
-
-
-def _file_stem(name: str) -> str:
-    """Name of the figure, with characters that file systems may refuse replaced."""
-    return re.sub(r"[^\w.-]+", "_", name)
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f}"

@@ -13,6 +13,7 @@ from cpunet.validation.verdicts import number, part
 
 Metrics = Mapping[str, Any]
 
+FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
 NO_VALUE = "–"
 CEILING = " (ceiling)"
 

@@ -8,10 +8,8 @@ from typing import Any
 from cpunet.html_pages import rendered
 from cpunet.plotting import label
 from cpunet.validation.forest_plot import forest_plot
-from cpunet.validation.side_by_side import Metrics, SideBySide
+from cpunet.validation.side_by_side import FEW, Metrics, SideBySide
 from cpunet.validation.verdicts import judged_scores, part, summary
-
-FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
 
 
 def side_by_side_page(

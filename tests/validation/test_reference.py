@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cpunet.jobs.validation.evaluation import ValidateOptions
-from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.train import train
+from cpunet.validation.validate import validate
 
 pytestmark = pytest.mark.slow
 
@@ -21,13 +20,8 @@ def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_p
     folder = reference_data / "closure"
     sim, data = PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5")
     train(sim, data, tmp_path / "run", recipe=load_recipe("fast"), device="cpu")
-    metrics = validate_run(
-        tmp_path / "run",
-        sim,
-        data,
-        tmp_path / "report",
-        ValidateOptions(truth=folder / "truth.npz"),
-    )
+    truth = folder / "truth.npz"
+    metrics = validate(tmp_path / "run", sim, data, tmp_path / "report", truth=truth).metrics
     worse = []
     for peak in ("SEP", "DEP"):
         scores = metrics["peaks"][peak]
@@ -62,7 +56,7 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
     made = train(sim, data, tmp_path / "run", recipe=recipe, peak="300-", device="cpu")
     assert 200 < made.data.used < 1000
-    metrics = validate_run(tmp_path / "run", sim, data, tmp_path / "report")
+    metrics = validate(tmp_path / "run", sim, data, tmp_path / "report").metrics
     scores = metrics["peaks"]["300-"]
     assert scores["n_data"] == made.data.used
     assert set(scores["parameters"]) == {"current_amplitude", "drift_time", "tail_slope"}

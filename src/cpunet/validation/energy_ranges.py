@@ -20,13 +20,11 @@ Range = tuple[float, float]
 CUT_PEAK = "DEP"  # defines the A/E cuts
 
 
-def validation_selection(
-    names: Sequence[str], recipe: Recipe, more_kev: Sequence[Range] = ()
-) -> EnergySelection:
+def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelection:
     """Select named peaks and ranges, together with all sidebands and continua."""
     chosen = parse_selection(",".join(names), recipe.peaks)
     more = [band for _, bands in _lines(recipe).values() for band in bands]
-    more += [*recipe.scores.continuum_kev.values(), *more_kev]
+    more += recipe.scores.continuum_kev.values()
     return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
@@ -46,7 +44,7 @@ def range_survivals(
     amplitudes
         Current amplitudes of these pulses by method, and of the ``"data"``.
     ae_survival
-        Cuts by method, see `cpunet.jobs.validation.pulse_tests.survivals`.
+        Cuts by method, see `cpunet.validation.scoring.survivals`.
     recipe
         Recipe with the energy ranges.
 

@@ -16,7 +16,7 @@ from cpunet.html_pages import DPI, figure_png
 from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
 from cpunet.validation.nested_tables import nested_html
-from cpunet.validation.report import write_report
+from synthetic import write_report
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 VOID = {"meta", "img", "link", "br"}
@@ -79,6 +79,7 @@ def test_files_of_the_report(report):
         "Co-60_1_losses.png",
         "SEP_drift_time.png",
         "metrics.json",
+        "parameters.npz",
         "report.html",
     ]
 

@@ -12,18 +12,6 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.baseline_methods import fit_baseline_methods
-from cpunet.jobs.validation.energy_ranges import (
-    Range,
-    ae_against_energy,
-    range_survivals,
-    validation_selection,
-)
-from cpunet.jobs.validation.peak_details import PeakDetails, peak_details
-from cpunet.jobs.validation.peak_sets import PeakSets, current_amplitudes, peak_sets
-from cpunet.jobs.validation.pulse_tests import survivals
-from cpunet.jobs.validation.scoring import ByMethod, score_peak
-from cpunet.jobs.validation.translations import translate_all
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.loading import (
@@ -38,12 +26,21 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
+from cpunet.validation.energy_ranges import (
+    ae_against_energy,
+    range_survivals,
+    validation_selection,
+)
 from cpunet.validation.linearity import linearity_residual
+from cpunet.validation.methods import fit_baseline_methods, translate_all
+from cpunet.validation.peak_details import PeakDetails, peak_details
+from cpunet.validation.peak_sets import PeakSets, current_amplitudes, peak_sets
+from cpunet.validation.scoring import ByMethod, score_peak, survivals
 from cpunet.validation.truth import Responses
 from cpunet.validation.verdicts import summaries, verdict_table
 
 PAIRS = 200  # pairs of pulses in the test of linearity
-MOST_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
+MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +51,8 @@ class Evaluation:
     ----------
     ren, iren
         Translators of the run.
-    info, losses
-        Provenance and training records of the run.
+    run
+        The run.
     sim, data
         Prepared pulses of both sides.
     sets, values, details
@@ -75,57 +72,31 @@ class Evaluation:
     details: Mapping[str, PeakDetails]
     metrics: dict[str, Any]
 
-    def forget_noisy(self) -> None:
-        """Free translated windows with noise: half of the memory, needed only for scores."""
-        for peak in self.sets:
-            peak.made.noisy.clear()
-
-
-@dataclass(frozen=True)
-class ValidateOptions:
-    """How to validate a run.
-
-    Parameters
-    ----------
-    truth
-        ``.npz`` file with ``response``: the noise-free trace of each simulated pulse.
-    baselines
-        Whether to fit the baseline methods, which takes most of the time.
-    seed
-        Seed of noise and bootstraps.
-    ae_range_kev
-        Further energies to read on both sides for A/E against energy, such as 900 to 2350.
-    most
-        Maximum number of pulses per side; of larger sets, a random sample is compared.
-    device
-        ``"cpu"``, ``"cuda"`` or ``"auto"``.
-    quick
-        Whether the report is a quick look: with a few figures only, and a note that says so.
-    """
-
-    truth: Path | None = None
-    baselines: bool = True
-    seed: int = 0
-    ae_range_kev: Range | None = None
-    most: int = MOST_PULSES
-    device: str = "auto"
-    quick: bool = False
-
 
 @one_thread_for_matrices()
-def evaluate(run: Run, sim: PulseFile, data: PulseFile, how: ValidateOptions) -> Evaluation:
-    """Translate, compare and score; see `cpunet.jobs.validation.validate.validate_run`.
+def evaluate(
+    run: Run,
+    sim: PulseFile,
+    data: PulseFile,
+    *,
+    truth: Path | None = None,
+    baselines: bool = True,
+    max_pulses: int = MAX_PULSES,
+    seed: int = 0,
+    device: str = "auto",
+) -> Evaluation:
+    """Translate, compare and score; see `cpunet.validation.validate.validate`.
 
     Raises
     ------
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    device, recipe, trained_on = resolve_device(how.device), run.recipe, run.peak
+    device, recipe, trained_on = resolve_device(device), run.recipe, run.peak
     ren, iren = REN.of(run, device), IREN.of(run, device)
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
-    sim_set, data_set = _load_both(ren, sim, data, names, how)
-    responses = None if how.truth is None else Responses(how.truth, sim_set)
+    sim_set, data_set = _load_both(ren, sim, data, names, max_pulses)
+    responses = None if truth is None else Responses(truth, sim_set)
     others = fit_baseline_methods(
         sim_set,
         data_set,
@@ -133,20 +104,20 @@ def evaluate(run: Run, sim: PulseFile, data: PulseFile, how: ValidateOptions) ->
         parse_selection(trained_on, recipe.peaks),
         recipe,
         remains=ren.remains,
-        fitted=how.baselines,
+        fitted=baselines,
     )
-    made = translate_all(ren, others, sim_set, responses, how.seed)
+    made = translate_all(ren, others, sim_set, responses, seed)
     amplitudes = current_amplitudes(sim_set, data_set, made)
     sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
-    values, peaks = _scores(sets, recipe, how.seed)
+    values, peaks = _scores(sets, recipe, seed)
     scored = [peak for peak in sets if values[peak.name]]
     if not scored:
         raise CpunetError(
-            f"{data_set.path}: no peak has pulses on both sides; "
-            "check the calibration (--kev-per-adc, --data-energy)"
+            f"{data_set.path}: no peak has pulses on both sides",
+            "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    details = _details(scored, values, recipe, how.seed)
-    kept = survivals(values, how.seed)
+    details = _details(scored, values, recipe, seed)
+    kept = survivals(values, seed)
     known = None if run.fit is None else run.fit.remains
     metrics = {
         "compared": _compared(run, sim_set, data_set),
@@ -166,9 +137,7 @@ def evaluate(run: Run, sim: PulseFile, data: PulseFile, how: ValidateOptions) ->
         "ae_energy": ae_against_energy(sim_set, data_set, amplitudes, recipe),
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
-        "linearity": _linearity(
-            ren, max(scored, key=lambda peak: len(peak.sim_rows)), how.seed
-        ),
+        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
         "rivals": {
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
@@ -195,13 +164,11 @@ def _load_both(
     sim: PulseFile,
     data: PulseFile,
     names: list[str],
-    how: ValidateOptions,
+    max_pulses: int,
 ) -> tuple[InputSet, InputSet]:
-    most = how.most
-    more_kev = () if how.ae_range_kev is None else (how.ae_range_kev,)
-    selection = validation_selection(names, ren.recipe, more_kev)
-    sim_set = load_simulated(sim, ren.recipe, selection, most=most)
-    data_set = load_measured(data, ren.recipe, selection, most=most)
+    selection = validation_selection(names, ren.recipe)
+    sim_set = load_simulated(sim, ren.recipe, selection, most=max_pulses)
+    data_set = load_measured(data, ren.recipe, selection, most=max_pulses)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(

@@ -10,9 +10,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from cpunet.jobs.validation.evaluation import Evaluation
-from cpunet.jobs.validation.peak_details import PeakDetails
-from cpunet.jobs.validation.peak_sets import PeakSets
 from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
@@ -23,6 +20,9 @@ from cpunet.validation.ae_energy_figure import ae_energy_figure
 from cpunet.validation.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.validation.baseline_spectra import spectrum_of_noise
 from cpunet.validation.comparisons import Comparison
+from cpunet.validation.evaluation import Evaluation
+from cpunet.validation.peak_details import PeakDetails
+from cpunet.validation.peak_sets import PeakSets
 from cpunet.validation.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
 from cpunet.validation.remains_figure import sizes_figure
 from cpunet.validation.run_figures import (

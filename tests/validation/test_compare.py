@@ -1,4 +1,4 @@
-"""The page over many reports: what is off, who is missing, where the links lead."""
+"""Reports side by side: printed, as a page, with some missing or damaged."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from urllib.parse import unquote
 
 import pytest
 
+from cpunet.cli.app import run
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.compare import compare_reports
+from cpunet.validation.compare import compare
 from cpunet.validation.forest_plot import span, ticks
+from cpunet.validation.report import Report
 from cpunet.validation.side_by_side import Cell
 
 
@@ -43,7 +45,7 @@ def page_of(folder: Path, runs: dict[str, tuple[float, ...]], **more: Any) -> st
             (folder / name / "report" / "metrics.json").write_text(text)
             (folder / name / "report" / "report.html").write_text("<p>here</p>")
     out = folder / "pages" / "index.html"
-    compare_reports([folder / name / "report" for name in runs], out=out, **more)
+    compare(*(folder / name / "report" for name in runs), out=out, **more)
     return out.read_text("utf-8")
 
 
@@ -69,7 +71,7 @@ def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
 def test_missing_reports_are_listed_if_allowed(tmp_path):
     runs: dict[str, tuple[float, ...]] = {"V01/p03": (87.0,), "V01/p04": ()}
     with pytest.raises(
-        CpunetError, match=r"p04/report: no metrics.json in it; .* --missing-ok"
+        CpunetError, match=r"p04/report: no metrics.json in it; .* `missing_ok`"
     ):
         page_of(tmp_path / "a", runs)
     page = page_of(tmp_path / "b", runs, missing_ok=True)
@@ -108,3 +110,96 @@ def test_span_of_equal_values_is_not_empty():
     for value in (0.0, 5.0):
         low, high = span([Cell("", value), Cell("", value), Cell()])
         assert low < value < high
+
+
+def report(folder: Path, iou: float, **more: int) -> Path:
+    folder.mkdir(parents=True)
+    content = metrics(iou)
+    content["peaks"]["SEP"] |= more
+    (folder / "metrics.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def two(tmp_path) -> list[Path]:
+    return [report(tmp_path / "first", 80.0), report(tmp_path / "second", 85.0)]
+
+
+def header(compared: object) -> list[str]:
+    return str(compared).splitlines()[1].split()
+
+
+def test_two_reports_are_printed(two):
+    told = str(compare(*two))
+    assert header(told) == ["peak", "score", "first", "second"]
+    assert "80.0 ± 2.5 (88.0)" in told
+    assert "85.0 ± 2.5 (88.0)*" in told
+    assert "note" not in told
+
+
+def test_a_report_in_memory_is_compared(two):
+    run = {"compared": {"run": "kept"}} | metrics(70.0)
+    assert header(compare(Report(run, {}), two[0])) == ["peak", "score", "kept", "first"]
+
+
+def test_demo_folders_and_files(two, tmp_path):
+    report(tmp_path / "demo" / "report", 70.0)
+    made = compare(tmp_path / "demo", two[0] / "metrics.json")
+    assert made.table.names == ("demo", "first")
+
+
+def test_names_are_made_unique(tmp_path):
+    folders = [report(tmp_path / run / "report", 80.0) for run in ("a", "b")]
+    assert compare(*folders).table.names == ("a", "b")
+    assert compare(folders[0], folders[0]).table.names == ("report (1)", "report (2)")
+
+
+def test_different_data_are_noted(two, tmp_path):
+    other = report(tmp_path / "third", 85.0, n_data=7)
+    told = str(compare(two[0], other))
+    assert "note: first and third were scored on different pulses" in told
+
+
+def test_the_command(two, tmp_path, capsys):
+    page = tmp_path / "new" / "[bold]compare.html"
+    words = ["compare", *map(str, two), "--out", str(page)]
+    assert run(words) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(page)
+    assert [path.name for path in page.parent.iterdir()] == [page.name]
+    first = page.read_text()
+    assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in first
+    with pytest.raises(CpunetError, match="exists already"):
+        run(words)
+    assert run([*words, "--method", "ren", "--force"]) == 0
+    assert page.read_text() == first
+    with pytest.raises(CpunetError, match=r"no metrics.json in it; .*, or --missing-ok"):
+        run(["compare", words[1], str(tmp_path)])
+
+
+DEFECTS = {
+    "no-json": (b"{", "damaged"),
+    "no-text": (b"\xff\xfe\xff", "damaged"),
+    "a-list": (b"[1]", "damaged (no mapping)"),
+    "no-peaks": (b'{"peaks": 3}', "holds no scores by peak"),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_bad_metrics_are_told(two, tmp_path, defect):
+    content, words = DEFECTS[defect]
+    bad = two[1] / "metrics.json"
+    bad.write_bytes(content)
+    with pytest.raises(CpunetError, match=re.escape(f"{bad}: {words}")):
+        compare(*two, out=tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_folder_is_no_page(two, tmp_path):
+    with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
+        compare(*two, out=tmp_path, force=True)
+
+
+def test_an_unknown_method_is_told(two):
+    words = "first, second: no score of the method magic; there are ren"
+    with pytest.raises(CpunetError, match=words):
+        compare(*two, method="magic")

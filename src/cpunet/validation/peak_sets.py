@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.jobs.validation.translations import Translations
-from cpunet.jobs.validation.when_asked import WhenAsked
 from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.validation.methods import Translations
 from cpunet.validation.paired import PairedScores, scores_of_squares
+from cpunet.validation.when_asked import WhenAsked
 
 MIN_N = 10  # minimum number of pulses of a distribution
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.peak_sets import PeakSets
-from cpunet.jobs.validation.scoring import ByMethod
 from cpunet.plotting import NO_NOISE
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import Values
@@ -20,6 +18,8 @@ from cpunet.validation.drift_slices import (
     sliced,
 )
 from cpunet.validation.mean_pulse import MeanPulse
+from cpunet.validation.peak_sets import PeakSets
+from cpunet.validation.scoring import ByMethod
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150
@@ -61,7 +61,7 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     peak
         Pulses of the peak.
     values
-        Parameters by method, see `cpunet.jobs.validation.scoring.score_peak`; methods
+        Parameters by method, see `cpunet.validation.scoring.score_peak`; methods
         without noise are left out.
     bootstraps, seed
         Number and seed of the bootstraps for the errors.

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import cpunet
 from cpunet.errors import CpunetError
-from cpunet.jobs.validation.drawings import drawings
-from cpunet.jobs.validation.energy_ranges import validation_selection
-from cpunet.jobs.validation.evaluation import Evaluation, ValidateOptions, _compared, evaluate
-from cpunet.jobs.validation.validate import validate_run
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.reading.files import PulseFile
@@ -21,8 +19,12 @@ from cpunet.recipes import load_recipe
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
+from cpunet.validation.drawings import drawings
 from cpunet.validation.drift_slices import slice_edges
+from cpunet.validation.energy_ranges import validation_selection
+from cpunet.validation.evaluation import Evaluation, _compared, evaluate
 from cpunet.validation.paired import pair_squares, scores_of_squares
+from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, phased_edges
 
 RECIPE = load_recipe(
@@ -74,12 +76,7 @@ def run(files, tmp_path_factory) -> Run:
 
 
 def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:
-    return evaluate(
-        run,
-        sim,
-        data,
-        ValidateOptions(truth=None, baselines=False, seed=0, device="cpu"),
-    )
+    return evaluate(run, sim, data, baselines=False, device="cpu")
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +92,8 @@ def test_peaks_sidebands_and_continua_are_loaded() -> None:
 
 @pytest.mark.thorough
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
-    few = evaluate(
-        run,
-        files["sim"],
-        files["data"],
-        ValidateOptions(truth=None, baselines=False, seed=0, device="cpu", most=250),
-    )
+    how = {"baselines": False, "device": "cpu", "max_pulses": 250}
+    few = evaluate(run, files["sim"], files["data"], **how)
     assert len(few.sim.prepared) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
     assert len(few.data.energies_kev) == 380
@@ -158,16 +151,11 @@ def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(
-        "cpunet.jobs.validation.validate.drawings", lambda found: {}
-    )  # drawn above
-    metrics = validate_run(
-        run,
-        files["sim"],
-        files["no DEP"],
-        tmp_path / "report",
-        ValidateOptions(baselines=False, device="cpu"),
-    )
+    monkeypatch.setattr("cpunet.validation.drawings.drawings", lambda found: {})  # above
+    sides = files["sim"], files["no DEP"]
+    report = validate(run, *sides, tmp_path / "report", baselines=False, device="cpu")
+    metrics = report.metrics
+    assert f"DEP: not scored, {metrics['peaks']['DEP']['missing']}" in str(report)
     assert metrics["peaks"]["DEP"]["missing"].startswith("no measured pulses")
     assert "DEP" in metrics["ae_survival"]["missing"]
     assert "no A/E cut" in metrics["ae_details"]["survival by energy range"]["missing"]
@@ -188,12 +176,7 @@ def found(run, files, tmp_path_factory):
     path = tmp_path_factory.mktemp("truth") / "truth.npz"
     n = files["sim"].open().n_pulses
     np.savez(path, response=records(n, np.random.default_rng(1), 4000.0).astype(np.float32))
-    return evaluate(
-        run,
-        files["sim"],
-        files["data"],
-        ValidateOptions(truth=path, baselines=True, seed=0, device="cpu"),
-    )
+    return evaluate(run, files["sim"], files["data"], truth=path, device="cpu")
 
 
 @pytest.mark.thorough
@@ -231,3 +214,61 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
         generator=found.ren.seeded(0),
     )
     np.testing.assert_array_equal(pulses["ren"].waveforms, again[peak.sim_rows])
+
+
+@pytest.fixture(scope="module")
+def report(run, files, tmp_path_factory, all_undrawn) -> cpunet.Report:
+    out = tmp_path_factory.mktemp("report") / "report"
+    sides = str(files["sim"].path), files["data"]
+    return run.validate(*sides, out, baselines=False, device="cpu")
+
+
+def test_a_report(report):
+    assert sorted(report.values) == ["DEP", "FEP", "SEP"]
+    data = report.values["FEP"]["data"]["current_amplitude"]
+    histogram = report.hist("FEP")
+    scored = report.metrics["peaks"]["FEP"]["parameters"]["current_amplitude"]["axis"]
+    assert histogram.axes[1].size == scored["bins"]
+    assert histogram.axes[1].edges[[0, -1]].tolist() == [scored["low"], scored["high"]]
+    assert report.hist("FEP", max_bins=3).axes[1].size == 3
+    assert histogram[{"method": "data"}].sum(flow=True) == np.isfinite(data).sum()
+    compared = report.metrics["peaks"]["SEP"]["parameters"]["drift_time"]
+    row = report["SEP"].loc["drift_time", "ren"]
+    assert row["iou"] == compared["iou"]["ren"]
+    assert row["ceiling"] == compared["iou"]["ceiling"]
+    assert report.scores.loc["SEP", "drift_time", "ren"].equals(row)
+    assert report.verdicts == report.to_dict()["verdicts"]["summary"]
+    assert "current amplitude" in report._repr_html_()
+    assert repr(report).startswith(f"<Report {report.folder}: ")
+    assert report.figures["FEP mean pulse"].axes
+    with pytest.raises(CpunetError, match="no scored peak '1500'; there are FEP, SEP, DEP"):
+        report["1500"]
+    lines = str(report).splitlines()
+    assert lines[1].split() == ["peak", "parameter", "raw", "REN", "ceiling"]
+    ren = f"{compared['iou']['ren']:.1f}"
+    assert any(line.startswith("SEP") and "T_drift" in line and ren in line for line in lines)
+    assert lines[-1] == str(report.folder / "report.html")
+
+
+def test_a_report_again(report, tmp_path):
+    again = cpunet.Report.load(report.folder)
+    for method in ("data", "raw", "ren"):
+        one, other = (r.hist("FEP", "drift_time")[{"method": method}] for r in (report, again))
+        assert np.array_equal(one.values(), other.values())
+    assert again.plot("SEP", "drift_time").axes
+    assert again.scores.sort_index().equals(report.scores.sort_index())
+    assert (again.folder / "FEP_mean_pulse.png").is_file()
+    with pytest.raises(CpunetError, match="is a report already; copy the folder"):
+        again.save(tmp_path / "copy")
+
+
+def test_nothing_is_written_before_it_is_saved(run, files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = validate(run, files["sim"], files["data"], baselines=False, device="cpu")
+    assert made.folder is None
+    assert not list(tmp_path.iterdir())
+    few = dataclasses.replace(made, drawn={})
+    few.save("report")
+    with pytest.raises(CpunetError, match="report: exists already"):
+        few.save("report")
+    assert cpunet.Report.load("report").to_dict() == made.to_dict()

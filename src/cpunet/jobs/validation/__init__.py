@@ -1,1 +1,0 @@
-"""Validation of a run: scores, baseline methods, figures, reports, comparisons."""

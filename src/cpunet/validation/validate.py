@@ -1,0 +1,185 @@
+"""Validate a run: scores per peak, figures and a report."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from cpunet.errors import CpunetError
+from cpunet.outputs import folder_written_aside
+from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
+from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.training.run import INFO, Run, RunLike, as_run
+from cpunet.validation.compare import compared
+from cpunet.validation.report import REPORT, Report
+
+log = logging.getLogger(__name__)
+
+INDEX = "index.html"
+
+
+def validate(
+    run: RunLike,
+    sim: Source,
+    data: Source,
+    out: str | Path | None = None,
+    *,
+    truth: str | Path | None = None,
+    baselines: bool = True,
+    max_pulses: int = 50_000,
+    seed: int = 0,
+    device: str = "auto",
+    read: ReadOptions = ReadOptions(),
+    force: bool = False,
+) -> Report | Outcome[Report]:
+    """Score a run per peak and write a report: figures, metrics.json, report.html.
+
+    Every peak of the recipe is scored, and the energies of the training if they are not a
+    peak.  SEP and DEP take no part in a training on the FEP: they are the test.
+
+    Parameters
+    ----------
+    run
+        Folder of a training run, or of runs by channel.
+    sim
+        Simulated pulses.
+    data
+        Measured pulses.
+    out
+        Report folder to make; without one, nothing is written.
+    truth
+        Noise-free responses of the simulated pulses (.npz), if they are known.
+    baselines
+        Fit the baseline methods too, which takes most of the time.
+    max_pulses
+        Pulses of a side that are compared: of more, a random sample. Some 30 kB each.
+    seed
+        Seed of noise and bootstraps.
+    device
+        cpu, cuda, or auto: the GPU if there is one.
+    read
+        How the files are read.
+    force
+        Replace existing output.
+
+    Returns
+    -------
+    Report or Outcome
+        Scores, values, histograms and figures; with ``data_table="all"`` those of each
+        channel, whose reports are folders in `out`, with a page of all.
+
+    Raises
+    ------
+    CpunetError
+        If an argument cannot be used, or no peak can be scored.
+
+    Examples
+    --------
+    cpunet validate run --sim sim.lh5 --data raw.lh5 --out report
+
+    cpunet validate runs --sim sim.lh5 --data raw.lh5 --data-table all --out reports
+    """
+    if max_pulses < 100:
+        raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
+    sim, data = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    how = {"baselines": baselines, "max_pulses": max_pulses, "seed": seed, "device": device}
+    how["truth"] = None if truth is None else Path(truth)
+    folder = None if out is None else Path(out)
+    if data.table == ALL:
+        return _of_channels(run, sim, data, folder, how, force=force)
+    return _validated(as_run(run), sim, data, folder, how, force=force)
+
+
+def _validated(
+    run: Run,
+    sim: PulseFile,
+    data: PulseFile,
+    out: Path | None,
+    how: Mapping[str, Any],
+    *,
+    force: bool,
+) -> Report:
+    sim, data = run.sim.reading(sim), run.data.reading(data)
+    if out is None:
+        return _report(run, sim, data, how)
+    read = (run.folder, *sim.files, *data.files, how["truth"])
+    with folder_written_aside(out, REPORT, *read, force=force) as aside:
+        report = _report(run, sim, data, how)
+        report.write(aside)
+    return replace(report, folder=out)
+
+
+def _report(run: Run, sim: PulseFile, data: PulseFile, how: Mapping[str, Any]) -> Report:
+    """Scores, and functions that draw; translated pulses are forgotten."""
+    # imported late: not needed for the help of the command
+    from cpunet.validation.evaluation import evaluate
+
+    found = evaluate(run, sim, data, **how)
+
+    # nor is matplotlib while the pulses take most memory
+    from cpunet.validation.drawings import drawings
+
+    values = {peak: of_peak for peak, of_peak in found.values.items() if of_peak}
+    notes = _notes(run, found.metrics, how["truth"])
+    return Report(found.metrics, values, None, drawings(found), notes)
+
+
+def _of_channels(
+    runs: RunLike,
+    sim: PulseFile,
+    data: PulseFile,
+    out: Path | None,
+    how: Mapping[str, Any],
+    *,
+    force: bool,
+) -> Outcome[Report]:
+    """Validate the run of each channel of the data, with a page of all reports."""
+    if out is None:
+        raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
+
+    def report(name: str, pair: Pair, folder: Path) -> Report:
+        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+        return _validated(as_run(run), *pair, folder, how, force=force)
+
+    channels = paired(sim, data)
+    outcome = one_by_one(channels, out, report)
+    if outcome.done:
+        folders = [out / name for name in channels]
+        # without force, a channel with a report fails and keeps it
+        failed = [out / name for name in outcome.failed if force]
+        compared(folders, failed=failed, missing_ok=True).save(out / INDEX, force=True)
+        log.info(f"all channels: {out / INDEX}")
+    return outcome
+
+
+def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
+    notes = [
+        f"Peaks other than {run.peak} took no part in the training.",
+        "IoU is the overlap of two distributions in percent. Two samples of the same "
+        "distribution do not reach 100 at finite size: the ceiling is what data score "
+        "against data at these sizes.",
+    ]
+    notes += _of_remains(metrics)
+    if truth is None:
+        notes.append("No truth was given, so single pulses are not scored.")
+    return notes
+
+
+def _of_remains(metrics: Mapping[str, Any]) -> list[str]:
+    """Remarks on remains of earlier pulses in the data, if they are certain."""
+    told = metrics["remains"] or {}
+    if not told.get("rate_khz"):
+        return []
+    shares = ", ".join(
+        f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
+        for size, share in told["percent_above"].items()
+    )
+    return [
+        f"Traces of the training lie on remains of earlier pulses, {told['rate_khz']:.2f} ± "
+        f"{told['rate_error_khz']:.2f} kHz decaying with {told['decay_us']:.1f} µs: percent of "
+        f"the traces, measured (by the law), {shares}. All translations and the truth have "
+        "remains drawn by this law, as likely as they pass the quality cuts."
+    ]
