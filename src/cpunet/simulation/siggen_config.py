@@ -1,8 +1,8 @@
 """Configuration files of siggen and fieldgen: lines with a key and a number.
 
 They are read as siggen does: a key stands at the beginning of its line (others are
-comments), the last line of a key counts, a ``_diam`` is twice the ``_radius``, and sizes that do
-not fit in each other are cut.
+comments), the last line of a key counts, a ``_diam`` is twice the ``_radius``, and sizes that
+do not fit in each other are cut.
 """
 
 from __future__ import annotations
