@@ -23,8 +23,8 @@ def event_of_step(
     --------
     >>> event_of_step(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]), 10)
     array([0, 1, 2])
-    >>> event_of_step(np.array([0, 1, 2, 0, 1]), None, 10)
-    array([0, 2, 4, 1, 3])
+    >>> event_of_step(np.array([0, 1, 2, 0, 1, 2]), None, 10)
+    array([0, 2, 4, 1, 3, 5])
     """
     job = _job_of_step(number)
     keys = (job, number) if time_ns is None else (time_ns, job, number)
