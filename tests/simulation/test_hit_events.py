@@ -143,6 +143,13 @@ def test_events_that_threads_wrote_in_blocks_stay_whole(tmp_path: Path) -> None:
     assert np.diff(hits.offsets).tolist() == [3, 3, 6, 3, 3, 6, 3, 3, 3, 3]
 
 
+def test_rows_in_the_order_of_time_stay_together(tmp_path: Path) -> None:
+    mixed = np.random.default_rng(4).permutation(3 * N)
+    shuffled = {name: (values[mixed], units) for name, (values, units) in steps().items()}
+    hits = read_hits(written(tmp_path, "flat", shuffled)).hits
+    np.testing.assert_allclose(sorted(hits.energy_kev), sorted(SEEN_KEV))
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("change", [{"edep": (EDEP_KEV, "J")}, {"time": (TIME_NS, "min")}])
 def test_units_that_are_not_known_are_refused(tmp_path, layout, change) -> None:
