@@ -27,8 +27,12 @@ from cpunet.recipes import load_recipe
 from cpunet.training.run import RUN
 from synthetic import write_run
 
-TRAIN = "train --recipe fast --sim sim.lh5 --data data.lh5 --out out"
-SIMULATE = "simulate --detector ppc.yaml --hits hits.npz --out out"
+# Commands that are right, unless a mistake gives an option another value.
+NEEDED = {
+    "train": {"--recipe": "fast", "--sim": "sim.lh5", "--data": "data.lh5", "--out": "out"},
+    "simulate": {"--detector": "ppc.yaml", "--hits": "hits.npz", "--out": "out"},
+}
+TRAIN, SIMULATE = NEEDED
 WRITE = "library lithium --out out.lh5"
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -186,7 +190,7 @@ MISTAKES = {
         "export run --out out.onnx --detector V1", r"--detector .*--to legend-pars; add it"
     ),
     "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
-    "option left out": Mistake("train --sim sim.lh5", r"Missing option '--data'.*--help"),
+    "option left out": Mistake("validate run --sim sim.lh5", r".*--data.*--help"),
     "search without its extra": Mistake(
         "tune --sim sim.lh5 --data data.lh5 --out out",
         r"tuning needs optuna, which is not installed; pip install .*",
@@ -339,7 +343,10 @@ def test_a_mistake_ends_in_one_line_and_leaves_nothing(command, home, monkeypatc
     with monkeypatch.context() as patched:
         if mistake.patch is not None:
             mistake.patch(patched)
-        outcome = command(*shlex.split(mistake.words))
+        words = shlex.split(mistake.words)
+        needed = NEEDED.get(words[0], {}).items()
+        words += [word for key, value in needed if key not in words for word in (key, value)]
+        outcome = command(*words)
     lines = outcome.err.splitlines()
     assert outcome.code == mistake.status, outcome.err
     assert [line for line in lines if line.startswith("error: ")] == lines[-1:]
