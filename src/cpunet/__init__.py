@@ -39,6 +39,7 @@ __all__ = [
     "info",
     "load",
     "open_pulses",
+    "response",
     "simulate",
     "subtract_tails",
     "train",
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from cpunet.simulation.simulate import Simulation, simulate
     from cpunet.training.check import check
     from cpunet.training.published import import_weights
+    from cpunet.training.response import response
     from cpunet.training.run import Run
     from cpunet.training.train import train
     from cpunet.translation.options import Adc
@@ -83,6 +85,7 @@ _HOMES = {
     "training.check": ("check",),
     "training.published": ("import_weights",),
     "simulation.simulate": ("Simulation", "simulate"),
+    "training.response": ("response",),
     "training.run": ("Run",),
     "training.train": ("train",),
     "translation.options": ("Adc",),

@@ -71,7 +71,7 @@ COMMANDS = {
         ("sim.lh5 --detector D/my.yaml", "D/my.yaml"),
     ],
     "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
-    "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
+    "response": [("RUN", "RUN"), ("RUN --truth D", "D"), ("RUN", ".")],
     "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
     "library make": [
         ("--detector D/my.yaml", "D/my.yaml"),

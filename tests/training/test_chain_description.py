@@ -19,13 +19,11 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
-from cpunet.training.chain_description import (
-    chain_of,
-    describe_responses,
-    stand_electronics,
-)
+from cpunet.training.chain_description import chain_of
 from cpunet.training.closed_forms import learned_chain, true_chain_of, true_parameters
+from cpunet.training.response import Response, response
 from cpunet.training.response_figure import response_figure
 from cpunet.training.run import Run
 from synthetic import write_run
@@ -97,7 +95,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def values(*runs: Path) -> dict[str, float]:
-    return describe_responses(runs)["runs"][0]["values"]
+    return response(*runs).content["runs"][0]["values"]
 
 
 def test_a_single_pole_and_a_single_decay(tmp_path):
@@ -162,7 +160,7 @@ def test_noise_is_told_in_kev(tmp_path):
 
 
 def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
-    told = describe_responses([run], truth=electronics())
+    told = response(run, truth=electronics()).content
     truth = told["truth"]
     assert truth["name"] == "known"
     assert truth["values"].keys() - truth["difference"].keys() == {
@@ -179,7 +177,7 @@ def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
 
 
 def test_errors_go_with_the_poles_they_belong_to(run):
-    (told,) = describe_responses([run])["runs"]
+    (told,) = response(run).content["runs"]
     assert told["values"]["pole_1_ns"] == pytest.approx(55)
     assert told["errors"] == pytest.approx(
         {
@@ -195,7 +193,7 @@ def test_errors_go_with_the_poles_they_belong_to(run):
 
 
 def test_differences_in_units_of_the_error(run):
-    truth = describe_responses([run], truth=electronics(bandwidth_poles_ns=[50, 35]))["truth"]
+    truth = response(run, truth=electronics(bandwidth_poles_ns=[50, 35])).content["truth"]
     assert truth["difference"]["pole_1_ns"] == pytest.approx(5)
     assert truth["sigma"]["pole_1_ns"] == pytest.approx(5 / 2.75)
 
@@ -207,7 +205,7 @@ def test_mean_and_spread_of_several_runs(tmp_path):
         )
         for tau in (48, 50, 55)
     ]
-    told = describe_responses(runs, truth=electronics(bandwidth_poles_ns=[50]))
+    told = response(*runs, truth=electronics(bandwidth_poles_ns=[50])).content
     assert told["mean"]["pole_1_ns"] == pytest.approx(51)
     assert told["spread"]["pole_1_ns"] == pytest.approx(np.std([48, 50, 55], ddof=1))
     # the runs share their data, so that without errors of the fit nothing says how far it is
@@ -229,7 +227,7 @@ def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
         )
         for tau in (50, 50.01)
     ]
-    told = describe_responses(runs, truth=electronics(bandwidth_poles_ns=[49]))
+    told = response(*runs, truth=electronics(bandwidth_poles_ns=[49])).content
     sigma, spread = told["truth"]["sigma"], told["spread"]
     assert told["mean"]["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
     assert spread["noise_rms_kev"] < 1e-3
@@ -241,7 +239,7 @@ def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
     assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)  # of the fit, not of the seeds
     assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}
     # one run and two of the same data say the same
-    alone = describe_responses(runs[:1], truth=electronics(bandwidth_poles_ns=[49]))["truth"]
+    alone = response(*runs[:1], truth=electronics(bandwidth_poles_ns=[49])).content["truth"]
     assert alone["sigma"] == pytest.approx(sigma, rel=0.02)
 
 
@@ -279,7 +277,7 @@ def test_the_closed_form_is_the_chain_of_the_stand():
 
 def test_a_folder_with_numbers_and_figure(run, tmp_path):
     out = tmp_path / "out"
-    told = describe_responses([run], truth=electronics(), out=out)
+    told = response(run, truth=electronics(), out=out).content
     assert {file.name for file in out.iterdir()} == {
         ".cpunet.json",
         "response.json",
@@ -288,8 +286,8 @@ def test_a_folder_with_numbers_and_figure(run, tmp_path):
     assert json.loads((out / "response.json").read_text()) == told
     assert (out / "response.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(CpunetError, match="exists already"):
-        describe_responses([run], out=out)
-    describe_responses([run], out=out, force=True)
+        response(run, out=out)
+    response(run, out=out, force=True)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out", "run"]
 
 
@@ -326,12 +324,31 @@ def test_the_truth_of_a_stand(run, tmp_path):
     stand.mkdir()
     content = {"electronics": electronics().model_dump(mode="json")}
     (stand / "stand.json").write_text(json.dumps(content))
-    assert stand_electronics(stand) == electronics()
+    known = response(run, truth=electronics())
+    assert response(run, truth=stand).content == known.content
+    assert response(Run.load(run), truth="legend200").content["truth"]["name"] == "legend200"
     for text, fault in (("", "damaged"), ("{}", "electronics: ")):
         (stand / "stand.json").write_text(text)
-        one_line(lambda: stand_electronics(stand), f"stand.json: {fault}")
+        one_line(lambda: response(run, truth=stand), f"stand.json: {fault}")
     (stand / "stand.json").unlink()
-    one_line(lambda: stand_electronics(stand), "stand.json: cannot be read")
+    one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
+
+
+def test_a_result_shows_itself(run):
+    shown = response(run, truth=electronics())
+    assert repr(shown) == "<Response of run, beside known>"
+    assert list(shown.values) == [str(run), "truth"]
+    assert shown.values.loc["pole_1_ns", "truth"] == 55
+    assert shown.plot().axes
+
+
+@pytest.mark.parametrize("also", [{}, {"ringing_mhz": 5.0}, {"free_decays": True}])
+def test_every_parameter_has_a_row(also):
+    config = load_recipe("fast").matching[0].model_copy(update=also)
+    values = ElectronicsResponse(config, 16.0).describe()
+    values = {k: v for k, v in values.items() if not k.startswith("slow_")}  # told as a sum
+    shown = str(Response({"runs": [{"path": "run", "values": values, "errors": {}}]}, []))
+    assert len(shown.splitlines()) == 2 + len(values)
 
 
 def one_line(call: Any, *parts: str) -> None:
@@ -347,7 +364,7 @@ def test_runs_that_cannot_be_described(run, tmp_path):
     out = tmp_path / "out"
 
     def refused(*runs: Path, parts: tuple[str, ...], truth: Electronics | None = None) -> None:
-        one_line(lambda: describe_responses(runs, truth=truth, out=out), *parts)
+        one_line(lambda: response(*runs, truth=truth, out=out), *parts)
         assert not out.exists()
 
     refused(tmp_path / "none", parts=("none: no finished run", "cpunet train"))
@@ -365,7 +382,7 @@ def test_runs_that_cannot_be_described(run, tmp_path):
 def test_a_network_has_no_closed_form(tmp_path):
     write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), INFO | {"dt_ns": DT_NS})
     one_line(
-        lambda: describe_responses([tmp_path]),
+        lambda: response(tmp_path),
         f"{tmp_path}: recipe paper trains a punet",
         "cpunet validate",
     )
@@ -376,7 +393,7 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, 
     chain.write_text(yaml.safe_dump(electronics().model_dump(mode="json")))
     runs = [run.rename(tmp_path / "a run of a long name [1]")]
     runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
-    words = ["cpunet", "response", *map(str, runs), "--electronics", str(chain)]
+    words = ["cpunet", "response", *map(str, runs), "--truth", str(chain)]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as stop:
         main()
@@ -388,11 +405,6 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, 
     assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]
     assert "slow share of the charge [%]" in printed
     assert "…" not in printed
-    monkeypatch.setattr(sys, "argv", [*words, "--stand", str(tmp_path)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2
-    assert "give one of them" in capsys.readouterr().err
 
 
 def test_decays_of_free_times_are_printed(tmp_path, monkeypatch, capsys):
@@ -411,7 +423,7 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
 
     def doubts(fit: object) -> list[str]:
         (run / "run.json").write_text(json.dumps(info | {"fit": fit}))
-        return describe_responses([run])["runs"][0]["doubts"]
+        return response(run).content["runs"][0]["doubts"]
 
     assert doubts(FIT) == []
     poor = FIT | {
@@ -423,5 +435,5 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     assert said.endswith("the detector")
     assert doubts(None) == doubts({}) == []
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
-    (said,) = describe_responses([early])["runs"][0]["doubts"]
+    (said,) = response(early).content["runs"][0]["doubts"]
     assert said.startswith("60 % of the charge would arrive too early")

@@ -10,11 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cpunet.jobs.inspection.chain_description import describe_responses
-
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.settings import read_values
+from cpunet.training.chain_description import describe_chain
 
 
 def run_chain(
@@ -80,7 +79,7 @@ def _chain(config: Path) -> dict[str, Any]:
 
 def _decay_us(run: Path) -> float:
     try:
-        return float(describe_responses([run])["runs"][0]["values"]["decay_us"])
+        return float(describe_chain(run)["values"]["decay_us"])
     except CpunetError as error:
         raise CpunetError(f"{error}; or give events.tau_us") from error
 

@@ -33,6 +33,10 @@ COMMANDS = {
         "Make a run of the weights that the authors published.",
     ),
     "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "response": (
+        "cpunet.training.response:response",
+        "Say in terms of physics what readout was learned, beside the truth if it is known.",
+    ),
     "simulate": (
         "cpunet.simulation.simulate:simulate",
         "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",

@@ -19,7 +19,6 @@ from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
-from cpunet.cli.response import response
 from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
 from cpunet.installation import other_package
@@ -63,7 +62,6 @@ for command in (
     stand,
     calibrate,
     tune,
-    response,
     export,
 ):
     app.command()(command)

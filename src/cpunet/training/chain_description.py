@@ -1,30 +1,22 @@
-"""Describe fitted readout chains by physical quantities, and compare them with the truth."""
+"""A fitted readout chain by physical quantities."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import cpunet
-from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.settings import checked, read_json
 from cpunet.training.closed_forms import (
     learned_chain,
     slow_numbers,
-    true_chain_of,
-    true_parameters,
     with_noise,
 )
 from cpunet.training.diagnosis import beyond, stretched
@@ -35,19 +27,9 @@ from cpunet.training.response_figure import (
     align_ns,
     chain_numbers,
     noise_numbers,
-    response_figure,
 )
-from cpunet.training.run import FitInfo, Run, RunLike, as_run
+from cpunet.training.run import FitInfo, Run
 
-MARKER = "response.json"
-RESPONSE = FolderKind(
-    name="response",
-    command="cpunet response",
-    known_by=MARKER,
-    own=r"response\.json|response\.png",
-)
-
-_DPI = 150
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
 
@@ -61,72 +43,23 @@ class _Response:
     errors: Numbers
 
 
-def describe_responses(
-    given: Sequence[RunLike],
-    *,
-    truth: Electronics | None = None,
-    out: Path | None = None,
-    force: bool = False,
-) -> dict[str, Any]:
-    """Describe the fitted readout chains of trainings by physical quantities.
-
-    Parameters
-    ----------
-    given
-        Trainings of a readout chain, all with the same sampling and preparation.
-    truth
-        True chain of the data, if known (`stand_electronics`).
-    out
-        Folder to create, with ``response.json`` and ``response.png``; None for none.
-    force
-        Whether to replace an existing folder.
+def describe_chain(run: Run) -> dict[str, Any]:
+    """A readout chain in numbers.
 
     Returns
     -------
     dict
-        Content of ``response.json``.  ``runs``: for each run its ``values`` by name, with the
-        unit as suffix (shares of the full charge have none), ``errors`` of the fitted
-        quantities and of the noise, all ``parameters`` with their ``parameter_errors``, and
-        ``doubts``, reasons why these do not describe a readout alone.
-        ``mean`` and ``spread`` (standard deviation) of several runs.  ``truth``: the same
-        ``values`` of the true chain, the ``difference`` of the run or of the mean of the runs
-        from it, and ``sigma``, the difference divided by the error or the spread, whichever
-        is larger.  A quantity without an error has no sigma: the runs share their data, so
-        their spread shows how well they agree, not how accurate they are.
+        ``values`` by name, with the unit as suffix (shares of the full charge have none),
+        ``errors`` of the fitted quantities and of the noise, all ``parameters`` with their
+        ``parameter_errors``, and ``doubts``, reasons why these do not describe a readout
+        alone.
 
     Raises
     ------
     CpunetError
-        If a run has no readout chain, or runs or truth are incompatible.
+        If the run has no response in closed form.
     """
-    runs = [as_run(run) for run in given]
-    folders = [run.folder for run in runs]
-    if out is not None:
-        refuse_existing(out, *folders, force=force)
-    learned = [_response(run) for run in runs]
-    if not learned:
-        raise CpunetError("no run was given; give the folder of one")
-    first, preparation = runs[0], runs[0].recipe.preparation
-    require_alike([(run.name, run.dt_ns, run.recipe.preparation) for run in runs])
-    _require_sampling(first, truth)
-    told: dict[str, Any] = {
-        "cpunet": cpunet.__version__,
-        "dt_ns": first.dt_ns,
-        "runs": [_told(one) for one in learned],
-    }
-    true_chain = None if truth is None else true_chain_of(truth)
-    told |= _summary(told["runs"])
-    if truth is not None and true_chain is not None:
-        values = true_parameters(truth) | chain_numbers(true_chain, preparation, first.dt_ns)
-        told["truth"] = {"name": truth.name} | _compared(told, values)
-    if out is not None:
-        window = preparation.samples_after * first.dt_ns
-        figure = response_figure([r.chain for r in learned], true_chain, tail_ns=window)
-        with folder_written_aside(out, RESPONSE, *folders, force=force) as folder:
-            text = json.dumps(told, indent=1, ensure_ascii=False)
-            (folder / MARKER).write_text(text + "\n", encoding="utf-8")
-            figure.savefig(folder / "response.png", dpi=_DPI)
-    return told
+    return _told(_response(run))
 
 
 def chain_of(run: Run) -> Chain:
@@ -148,23 +81,10 @@ def noise_kev(run: Run) -> tuple[float, float | None]:
     CpunetError
         If the run has no response in closed form, or no noise.
     """
-    told = _told(_response(run))
+    told = describe_chain(run)
     if "noise_rms_kev" not in told["values"]:
         raise CpunetError(f"{run.name}: holds no noise; train on raw traces")
     return told["values"]["noise_rms_kev"], told["errors"].get("noise_rms_kev")
-
-
-def stand_electronics(stand: Path) -> Electronics:
-    """The true electronics of a virtual test stand, from its ``stand.json``.
-
-    Raises
-    ------
-    CpunetError
-        If the folder is not a virtual test stand.
-    """
-    path = Path(stand) / "stand.json"
-    content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
-    return checked(Electronics, content.get("electronics"), f"{path}: electronics")
 
 
 def _response(run: Run) -> _Response:
@@ -260,53 +180,3 @@ def _noise_error(found: _Response) -> Numbers:
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
-
-
-def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
-    """Mean and spread of several runs."""
-    if len(runs) < 2:
-        return {}
-    names = [name for name in runs[0]["values"] if all(name in r["values"] for r in runs)]
-    columns = {name: [run["values"][name] for run in runs] for name in names}
-    return {
-        "mean": {name: float(np.mean(column)) for name, column in columns.items()},
-        "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
-    }
-
-
-def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
-    """Truth, and the difference of the run or of the mean of the runs from it."""
-    runs = told["runs"]
-    found: Numbers = told.get("mean", runs[0]["values"])
-    spread: Numbers = told.get("spread", {})
-    difference = {n: found[n] - true for n, true in values.items() if n in found}
-    sigma = {}
-    for name, apart in difference.items():
-        errors = [run["errors"][name] for run in runs if name in run["errors"]]
-        if len(errors) == len(runs) and any(errors):
-            sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
-    return {"values": values, "difference": difference, "sigma": sigma}
-
-
-def require_alike(runs: Sequence[tuple[str, float, PreparationConfig]]) -> None:
-    """Raise a `CpunetError` unless all runs have the first's period (ns) and preparation."""
-    (first, first_ns, preparation), *others = runs
-    for run, dt_ns, other in others:
-        if not np.isclose(dt_ns, first_ns):
-            raise CpunetError(
-                f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
-                f"{first_ns:g} ns; describe them one by one"
-            )
-        if other != preparation:
-            raise CpunetError(
-                f"{run}: trained with another preparation than {first}; describe them one by "
-                "one"
-            )
-
-
-def _require_sampling(first: Run, truth: Electronics | None) -> None:
-    if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
-        raise CpunetError(
-            f"{first.name}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
-            f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
-        )

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.outputs import PICTURE_FORMATS, refuse_existing, refuse_inputs, written_aside
 from cpunet.pulses.channels import ALL, Pair, paired
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import (
@@ -218,10 +218,13 @@ def check(
     """
     both = pulse_file(sim, read.sim), pulse_file(data, read.data)
     picture = None if out is None else Path(out)
-    chosen, alone = load_recipe(recipe, settings), both[1].table != ALL
+    alone = both[1].table != ALL
     if picture is not None:
+        given = None if isinstance(recipe, Recipe) else recipe
+        refuse_inputs(picture, *both[0].files, *both[1].files, given)
         _require_picture(picture)
-        refuse_existing(picture, *both[0].files, *both[1].files, force=force or not alone)
+        refuse_existing(picture, force=force or not alone)
+    chosen = load_recipe(recipe, settings)
     if alone:
         result = _checked(both, chosen, peak)
         if picture is not None and result.sides:

@@ -295,9 +295,9 @@ class Run(Part):
         CpunetError
             If the run is not a readout chain.
         """
-        from cpunet.training.chain_description import describe_responses
+        from cpunet.training.chain_description import describe_chain
 
-        return dict(describe_responses([self])["runs"][0]["values"])
+        return dict(describe_chain(self)["values"])
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise of a readout chain; losses of networks.
@@ -356,7 +356,10 @@ class Run(Part):
         return part("object", "cpunet run", rows=self.summary(), picture=picture)
 
 
-RunLike: TypeAlias = Run | str | Path
+if TYPE_CHECKING:
+    RunLike: TypeAlias = str | Path | Run
+else:  # which commands read: there, a run is its folder
+    RunLike = str | Path
 
 
 def as_run(run: RunLike) -> Run:

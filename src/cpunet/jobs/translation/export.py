@@ -16,7 +16,7 @@ from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.settings import read_json
-from cpunet.training.chain_description import describe_responses
+from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import Run, RunLike, as_run
 from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export
 from cpunet.translation.graphs import Graph
@@ -172,7 +172,7 @@ def _fitted(run: Run, translator: Translator) -> list[str]:
     generator = translator.recipe.generator
     if generator.name != "response":
         return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
-    told = describe_responses([run])["runs"][0]
+    told = describe_chain(run)
     errors = told["parameter_errors"]
     numbers = [
         f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")

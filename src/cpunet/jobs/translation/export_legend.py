@@ -31,7 +31,7 @@ from cpunet.jobs.translation.simflow_checks import (
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
-from cpunet.training.chain_description import chain_of, describe_responses
+from cpunet.training.chain_description import chain_of, describe_chain
 from cpunet.training.run import RunLike, as_run
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ def export_legend_pars(
     run = as_run(run)
     given = (run.folder, report, library)
     refuse_existing(out, *given, force=force)
-    told = describe_responses([run])["runs"][0]
+    told = describe_chain(run)
     for doubt in told["doubts"]:
         log.warning(doubt)
     known = known_detector(run)

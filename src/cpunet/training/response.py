@@ -1,0 +1,316 @@
+"""`cpunet.response`: what readout was learned, beside the truth if it is known."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import cpunet
+from cpunet.electronics.chain import Electronics, read_electronics
+from cpunet.errors import CpunetError
+from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
+from cpunet.recipes.schema import PreparationConfig
+from cpunet.settings import checked, read_json
+from cpunet.tables import text_table
+from cpunet.training.chain_description import chain_of, describe_chain
+from cpunet.training.closed_forms import true_chain_of, true_parameters
+from cpunet.training.response_figure import Chain, Numbers, chain_numbers, response_figure
+from cpunet.training.run import Run, RunLike, as_run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+log = logging.getLogger(__name__)
+
+MARKER = "response.json"
+RESPONSE = FolderKind(
+    name="response",
+    command="cpunet response",
+    known_by=MARKER,
+    own=r"response\.json|response\.png",
+)
+_DPI = 150
+
+# What a name of `describe_chain` stands for, and its unit; shares are given in percent.
+ROWS = {
+    r"pole_(\d)_ns": (r"bandwidth pole \1", "ns"),
+    r"slow_share": ("slow share of the charge", "%"),
+    r"slow_time_ns": ("its mean time", "ns"),
+    r"ringing": ("ringing", "%"),
+    r"ringing_(sine|cosine)": (r"its \1", "%"),
+    r"ringing_mhz": ("ringing frequency", "MHz"),
+    r"ringing_damping_ns": ("ringing damping", "ns"),
+    r"drift_stretch": ("drift stretched by", "%"),
+    r"drift_stretch_per_us": ("and per µs by", "%"),
+    r"rise_(.*)_(.*)_ns": (r"rise \1–\2 %", "ns"),
+    r"missing_(.*)_ns": (r"still missing at \1 ns", "%"),
+    r"overshoot": ("overshoot", "%"),
+    r"decay_us": ("main decay", "µs"),
+    r"fast_decay_(\d)_us": (r"fast decay \1", "µs"),
+    r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
+    r"effective_decay_us": ("effective decay, tail", "µs"),
+    r"decay_(.*)_us": (r"share decaying with \1 µs", "%"),
+    r"droop_(.*)_us": (r"decayed at \1 µs", "%"),
+    r"noise_rms_kev": ("noise RMS", "keV"),
+    r"noise_corner_mhz": ("noise corner", "MHz"),
+    r"chi_square_per_moment": ("chi-square per moment", ""),
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Response:
+    """Readout chains of runs in terms of physics.
+
+    Parameters
+    ----------
+    content
+        ``runs``: for each run the result of
+        `cpunet.training.chain_description.describe_chain`.  ``mean`` and ``spread`` (standard
+        deviation) of several runs.  ``truth``: the same ``values`` of the true chain, the
+        ``difference`` of the run or of the mean of the runs from it, and ``sigma``, the
+        difference divided by the error or the spread, whichever is larger.  A quantity
+        without an error has no sigma: the runs share their data, so their spread shows how
+        well they agree, not how accurate they are.
+    runs
+        The runs.
+    truth
+        True chain, if known.
+    """
+
+    content: dict[str, Any]
+    runs: list[Run]
+    truth: Chain | None = None
+
+    @property
+    def values(self) -> DataFrame:
+        """A row per quantity, a column per run, and ``mean``, ``spread``, ``truth``."""
+        from pandas import DataFrame
+
+        columns = {run["path"]: run["values"] for run in self.content["runs"]}
+        columns |= {n: self.content[n] for n in ("mean", "spread") if n in self.content}
+        if "truth" in self.content:
+            columns["truth"] = self.content["truth"]["values"]
+        return DataFrame(columns).reindex(_names(self.content))
+
+    def plot(self) -> Figure:
+        """Step and impulse response, tail and noise."""
+        first = self.runs[0]
+        tail_ns = first.recipe.preparation.samples_after * first.dt_ns
+        return response_figure(list(map(chain_of, self.runs)), self.truth, tail_ns=tail_ns)
+
+    def save(self, path: str | Path, force: bool = False) -> None:
+        """Make a folder of ``response.json`` and ``response.png``.
+
+        Raises
+        ------
+        CpunetError
+            If the folder exists and `force` is off, or is of something else.
+        """
+        folders = [run.folder for run in self.runs]
+        with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
+            text = json.dumps(self.content, indent=1, ensure_ascii=False)
+            (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+            self.plot().savefig(folder / "response.png", dpi=_DPI)
+
+    def __str__(self) -> str:
+        head = ["", *(Path(run["path"]).name for run in self.content["runs"])]
+        if "mean" in self.content:
+            head.append("mean ± spread")
+        if "truth" in self.content:
+            head += [self.content["truth"]["name"], "difference", "σ"]
+        rows = []
+        for name in _names(self.content):
+            label, unit = _label(name)
+            text = f"{label} [{unit}]" if unit else label
+            rows.append([text, *_cells(self.content, name, unit)])
+        return text_table(head, rows, title="Readout response")
+
+    def __repr__(self) -> str:
+        truth = "" if self.truth is None else f", beside {self.content['truth']['name']}"
+        names = ", ".join(Path(run.name).name for run in self.runs)
+        return f"<{type(self).__name__} of {names}{truth}>"
+
+
+def response(
+    *runs: RunLike,
+    truth: str | Path | Electronics | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+) -> Response:
+    """Say in terms of physics what readout was learned, beside the truth if it is known.
+
+    Parameters
+    ----------
+    runs
+        Runs of a readout chain, as of several seeds, with the same sampling and preparation.
+    truth
+        True readout: folder of a test stand, ornl, legend200, ringing, or a YAML file.
+    out
+        Folder for response.json and response.png.
+    force
+        Replace existing output.
+
+    Returns
+    -------
+    Response
+        Numbers of each run, which prints them side by side.
+
+    Raises
+    ------
+    CpunetError
+        If a run has no readout chain, or runs or truth are incompatible.
+
+    Examples
+    --------
+    ``cpunet response run1 run2 --truth stand --out response``
+    """
+    known = [as_run(run) for run in runs]
+    if not known:
+        raise CpunetError("no run was given", "give the folder of one")
+    if out is not None:
+        place = str(truth) if isinstance(truth, str | Path) else None
+        refuse_existing(Path(out), place, *(run.folder for run in known), force=force)
+    electronics = _electronics(truth)
+    first, preparation = known[0], known[0].recipe.preparation
+    told = [describe_chain(run) for run in known]
+    _require_alike([(run.name, run.dt_ns, run.recipe.preparation) for run in known])
+    content: dict[str, Any] = {"cpunet": cpunet.__version__, "dt_ns": first.dt_ns}
+    content |= {"runs": told} | _summary(told)
+    true_chain = None
+    if electronics is not None:
+        _require_sampling(first, electronics)
+        true_chain = true_chain_of(electronics)
+        values = true_parameters(electronics)
+        values |= chain_numbers(true_chain, preparation, first.dt_ns)
+        content["truth"] = {"name": electronics.name} | _compared(content, values)
+    result = Response(content, known, true_chain)
+    for run in told:
+        for doubt in run["doubts"]:
+            log.warning(f"{Path(run['path']).name}: {doubt}")
+    if out is not None:
+        result.save(out, force)
+    return result
+
+
+def _electronics(truth: str | Path | Electronics | None) -> Electronics | None:
+    """The true readout, if given, of a stand from its ``stand.json``."""
+    if truth is None or isinstance(truth, Electronics):
+        return truth
+    if not Path(truth).is_dir():
+        return read_electronics(truth)
+    path = Path(truth) / "stand.json"
+    content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
+    return checked(Electronics, content.get("electronics"), f"{path}: electronics")
+
+
+def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
+    """Mean and spread of several runs."""
+    if len(runs) < 2:
+        return {}
+    names = [name for name in runs[0]["values"] if all(name in r["values"] for r in runs)]
+    columns = {name: [run["values"][name] for run in runs] for name in names}
+    return {
+        "mean": {name: float(np.mean(column)) for name, column in columns.items()},
+        "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
+    }
+
+
+def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
+    """Truth, and the difference of the run or of the mean of the runs from it."""
+    runs = told["runs"]
+    found: Numbers = told.get("mean", runs[0]["values"])
+    spread: Numbers = told.get("spread", {})
+    difference = {n: found[n] - true for n, true in values.items() if n in found}
+    sigma = {}
+    for name, apart in difference.items():
+        errors = [run["errors"][name] for run in runs if name in run["errors"]]
+        if len(errors) == len(runs) and any(errors):
+            sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
+    return {"values": values, "difference": difference, "sigma": sigma}
+
+
+def _require_alike(runs: Sequence[tuple[str, float, PreparationConfig]]) -> None:
+    """Raise a `CpunetError` unless all runs have the first's period (ns) and preparation."""
+    (first, first_ns, preparation), *others = runs
+    for run, dt_ns, other in others:
+        if not np.isclose(dt_ns, first_ns):
+            raise CpunetError(
+                f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
+                f"{first_ns:g} ns; describe them one by one"
+            )
+        if other != preparation:
+            raise CpunetError(
+                f"{run}: trained with another preparation than {first}; describe them one by "
+                "one"
+            )
+
+
+def _require_sampling(first: Run, truth: Electronics) -> None:
+    if not np.isclose(truth.dt_ns, first.dt_ns):
+        raise CpunetError(
+            f"{first.name}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
+            f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
+        )
+
+
+def _names(told: dict[str, Any]) -> list[str]:
+    """Quantities that any run or the truth has, in the order of `ROWS`."""
+    sources = [run["values"] for run in told["runs"]]
+    if "truth" in told:
+        sources.append(told["truth"]["values"])
+    names = {name: None for source in sources for name in source}
+    patterns = list(ROWS)
+    return sorted(names, key=lambda name: patterns.index(_pattern(name)))
+
+
+def _pattern(name: str) -> str:
+    return next(pattern for pattern in ROWS if re.fullmatch(pattern, name))
+
+
+def _label(name: str) -> tuple[str, str]:
+    pattern = _pattern(name)
+    text, unit = ROWS[pattern]
+    return re.sub(pattern, text, name), unit
+
+
+def _cells(told: dict[str, Any], name: str, unit: str) -> list[str]:
+    """A row of the table."""
+    runs, truth = told["runs"], told.get("truth")
+    scale = 100.0 if unit == "%" else 1.0
+    # beside several runs there is no room for errors, and the spread says more
+    errors = runs[0]["errors"] if len(runs) == 1 else {}
+    cells = [_number(run["values"].get(name), scale, errors.get(name)) for run in runs]
+    if "mean" in told:
+        cells.append(_number(told["mean"].get(name), scale, told["spread"].get(name)))
+    if truth is not None:
+        true, apart = truth["values"].get(name), truth["difference"].get(name)
+        cells += [_number(true, scale), _difference(apart, true, unit)]
+        sigma = truth["sigma"].get(name)
+        cells.append("" if sigma is None else f"{sigma:+.1f}")
+    return cells
+
+
+def _number(value: float | None, scale: float, error: float | None = None) -> str:
+    if value is None:
+        return "–"
+    text = f"{scale * value:.4g}" if abs(scale * value) >= 0.005 else f"{scale * value:.2f}"
+    if error is None:
+        return text
+    return f"{text} ± {scale * error:{'.2g' if scale * error < 99 else '.0f'}}"
+
+
+def _difference(apart: float | None, true: float | None, unit: str) -> str:
+    """Relative, but of shares in percentage points."""
+    if apart is None or (not true and unit != "%"):
+        return ""
+    if unit == "%":
+        return f"{100 * apart:+.2f} pp"
+    return f"{100 * apart / true:+.1f} %" if true else ""
