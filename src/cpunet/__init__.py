@@ -29,12 +29,14 @@ __all__ = [
     "Report",
     "Run",
     "Simulation",
+    "Stand",
     "Translation",
     "__version__",
     "calibrate",
     "import_weights",
     "info",
     "load",
+    "make_stand",
     "open_pulses",
     "simulate",
     "subtract_tails",
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
     from cpunet.calls.reports import Report, validate
     from cpunet.electronics.flattening import subtract_tails
+    from cpunet.electronics.stand import Stand, make_stand
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
     from cpunet.pulses.container import Pulses
@@ -68,6 +71,7 @@ _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
     "calls.reports": ("Report", "validate"),
     "electronics.flattening": ("subtract_tails",),
+    "electronics.stand": ("Stand", "make_stand"),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
     "jobs.simulation.hit_sources": ("HitFile",),

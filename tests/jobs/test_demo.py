@@ -111,7 +111,7 @@ def test_finished_parts_are_kept_and_a_whole_one_is_refused(
     ("changed", "said"),
     [
         ({"seed": 1}, "stand: made with seed = 0, not 1"),
-        ({"kind": "shifted"}, 'stand: made with kind = "matched", not "shifted"'),
+        ({"kind": "shifted"}, "stand: made with shift.temperature_K = none, not 2.0"),
         (
             {"electronics": read_electronics("ornl")},
             'stand: made with electronics.name = "legend200", not "ornl"',

@@ -19,7 +19,7 @@ from cpunet.translation.options import Adc
 for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
-_SHORT = {"settings": "set", "settings_file": "settings"}
+_SHORT = {"electronics": "preset", "settings": "set", "settings_file": "settings"}
 
 
 # Where the function of a command is, and what it does.
@@ -32,6 +32,10 @@ COMMANDS = {
     "simulate": (
         "cpunet.simulation.simulate:simulate",
         "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
+    ),
+    "stand": (
+        "cpunet.electronics.stand:make_stand",
+        "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
     ),
     "train": (
         "cpunet.training.train:train",

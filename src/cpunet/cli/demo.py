@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +11,24 @@ import typer
 from cpunet.cli import options
 from cpunet.cli.messages import tell
 from cpunet.cli.scores import print_scores
-from cpunet.cli.stand import Kind, KindOption, Preset
 from cpunet.outputs import refuse_inputs
 
 EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
+
+
+class Kind(StrEnum):
+    """Whether the data's detector is the simulated one."""
+
+    matched = "matched"
+    shifted = "shifted"
+
+
+Preset = Annotated[
+    str, typer.Option("--preset", help="Readout: ornl, legend200, ringing, or a YAML file.")
+]
+KindOption = Annotated[
+    Kind, typer.Option("--kind", help="shifted: the data's detector differs a little.")
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder of stand, run and report.")]
 RecipeName = Annotated[
     str, typer.Option("--recipe", help="fast, paper, or a YAML file of your own.")

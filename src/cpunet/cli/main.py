@@ -22,7 +22,6 @@ from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
-from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
 from cpunet.cli.validate import validate
 from cpunet.installation import other_package
@@ -63,7 +62,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 
 for command in (
     demo,
-    stand,
     check,
     calibrate,
     tune,

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from cpunet.electronics.chain import Electronics
+from cpunet.electronics.stand import write_stand
+from cpunet.electronics.stand_plan import StandPlan
 from cpunet.errors import CpunetError
 from cpunet.jobs.demo_parts import PARTS, is_there, remove_parts, require_same_parts
-from cpunet.jobs.simulation.stand import write_stand
-from cpunet.jobs.simulation.stand_plan import Kind, StandPlan
 from cpunet.jobs.validation.evaluation import ValidateOptions
 from cpunet.jobs.validation.validate import validate_run
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
-from cpunet.simulation.energy_windows import energy_windows
+from cpunet.simulation.energy_windows import wanted_events
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.shifted import Shift
 from cpunet.training.train import train
 
 _PEAK = "FEP"  # peak of the training
@@ -30,7 +31,7 @@ def demonstrate(
     events: dict[str, int],
     out: Path,
     *,
-    kind: Kind = "matched",
+    kind: Literal["matched", "shifted"] = "matched",
     seed: int = 0,
     device: str = "auto",
     force: bool = False,
@@ -40,8 +41,10 @@ def demonstrate(
 
     Parameters
     ----------
-    electronics, detector, kind
-        See `cpunet.jobs.simulation.stand.make_stand`.
+    electronics, detector
+        See `cpunet.make_stand`.
+    kind
+        Whether the data's detector is the simulated one, or differs a little.
     recipe
         Recipe of the training.
     events
@@ -72,10 +75,9 @@ def demonstrate(
     stand, run, report = (out / part for part in PARTS)
     if is_there(out, "report"):
         refuse_existing(report, force=force)
-    windows = tuple(energy_windows(",".join(events), recipe.peaks, _HALF_WINDOW_KEV))
-    plan = StandPlan.of(
-        electronics, detector, windows, tuple(events.values()), kind=kind, seed=seed
-    )
+    wanted = wanted_events(events, recipe.peaks, _HALF_WINDOW_KEV)
+    shift = Shift.of(["default"]) if kind == "shifted" else None
+    plan = StandPlan.of(electronics, detector, wanted, shift=shift, seed=seed)
     if force:
         remove_parts(out)
     require_same_parts(out, plan, recipe, _PEAK)

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from cpunet.electronics.stand import MARKER, STAND
+from cpunet.electronics.stand_plan import StandPlan
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.stand import MARKER, STAND
-from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.outputs import require_replaceable
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import read_json
